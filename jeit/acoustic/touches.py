@@ -23,7 +23,7 @@ from jeit.acoustic.localisation.locations import MAX_NUMPY_FRAMES, Locations
 from jeit.acoustic.signal.intensity import IntensitySettings
 from jeit.acoustic.signal.recording import Intensities, Recording
 from jeit.arguments import check_kind
-from jeit_solvers.engines import at_once, namespace, scan
+from jeit_solvers.engines import evaluate_in_numpy, namespace, scan
 from jeit_solvers.module import Module
 
 # Candidate spectral densities of acceleration in m²/s³, from a finger at rest to a finger that moves violently.
@@ -140,7 +140,7 @@ def _smooth_touch(time_steps, measured, covariances, has_position, densities) ->
     of frames padded to a power of two."""
     num_frames, dimension = measured.shape
     if num_frames <= MAX_NUMPY_FRAMES:
-        return at_once(_smooth_positions, time_steps, measured, covariances, has_position, densities)
+        return evaluate_in_numpy(_smooth_positions, time_steps, measured, covariances, has_position, densities)
     padding = (1 << (num_frames - 1).bit_length()) - num_frames
     arrays = (
         np.pad(time_steps, (0, padding)),

@@ -122,7 +122,7 @@ def interval_text(interval: Interval, format_end: Callable[[float], str]) -> str
 _MAX_READING = 1e12
 
 
-def readings(values: np.ndarray) -> np.ndarray:
+def measurable_values(values: np.ndarray) -> np.ndarray:
     """Replace values that no instrument can measure by NaN: infinite values, and absolute values above 1e12."""
     with np.errstate(invalid="ignore", over="ignore"):
         return np.where(np.abs(values) <= _MAX_READING, values, np.nan)
@@ -184,7 +184,7 @@ def did_you_mean(value: Any, names: Iterable[str]) -> str:
     return f" (did you mean {matches[0]!r}?)" if matches else ""
 
 
-def listed(names: Iterable[Any], max_names: int = 8) -> str:
+def names_text(names: Iterable[Any], max_names: int = 8) -> str:
     """One short line of text with the first `max_names` names, such as those of arrays in a file, and the number of
     remaining names."""
     texts = [str(name) for name in names]
@@ -203,7 +203,7 @@ def check_has_values(name: str, tree: Any, purpose: str, instead: str) -> None:
         )
 
 
-def brief(describe_object: Callable[[], str], instance: Any) -> str:
+def object_text(describe_object: Callable[[], str], instance: Any) -> str:
     """Text of an object from `describe_object`; only the name of its class if `describe_object` fails, because JAX
     temporarily replaces arrays by other objects."""
     try:
@@ -220,7 +220,7 @@ def picture(instance: Any) -> bytes | None:
     return importlib.import_module("jeit.report.notebook").picture(instance)
 
 
-def page(instance: Any) -> str | None:
+def object_html(instance: Any) -> str | None:
     """HTML of an object for a notebook (`_repr_html_`): its text and its picture; None for an object without a
     picture."""
     return importlib.import_module("jeit.report.notebook").page(instance)

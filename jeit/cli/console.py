@@ -90,20 +90,20 @@ class Steps:
 
 @dataclass(frozen=True)
 class _StepLine:
-    """Line beside the spinner: the step, the time since its `start`, unless it is short, and, if `num_done` of its
+    """Line beside the spinner: the step, the time since its `start_time`, unless it is short, and, if `num_done` of its
     `num_parts` parts are completed, an estimate of the remaining time."""
 
     step: str
-    start: float
+    start_time: float
     num_done: int = 0
     num_parts: int = 0
     reported: float = 0.0
 
     def __rich__(self) -> Text:
-        seconds = time.perf_counter() - self.start
+        seconds = time.perf_counter() - self.start_time
         text = f"{self.step}  {seconds:.0f} s" if seconds >= _MIN_SHOWN_SECONDS else self.step
         if seconds >= _MIN_SHOWN_SECONDS and _MIN_SHARE * self.num_parts <= self.num_done < self.num_parts:
-            elapsed = self.reported - self.start
+            elapsed = self.reported - self.start_time
             seconds_left = max(elapsed * self.num_parts / self.num_done - seconds, 0)
             text += f", about {_rounded_duration(seconds_left)} left"
         return Text(text)
@@ -116,7 +116,7 @@ def _rounded_duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def pairs(title: str, rows: list[tuple[str, str]]) -> Table:
+def name_value_table(title: str, rows: list[tuple[str, str]]) -> Table:
     """Create a table with the `title`, and a name and a value in each row."""
     table = Table(title=title, title_justify="left", title_style="bold", show_header=False, box=None, padding=(0, 2))
     table.add_column(style="dim")
@@ -131,7 +131,7 @@ def say_written(console: Console, first: Path, *others: str) -> None:
     console.print(Text("Written:", "dim"), ", ".join([str(first), *others]), soft_wrap=True)
 
 
-def scaled(value: float | None, unit: str) -> str:
+def with_unit(value: float | None, unit: str) -> str:
     """Format a value with three digits and an SI prefix, such as "1.32 mS" for 0.00132 S."""
     if value is None:
         return "not known"

@@ -53,7 +53,7 @@ class LiveFrames:
         seconds = [second for second, _ in self.read_frames]
         return (len(seconds) - 1) / seconds[-1] if len(seconds) > 1 and seconds[-1] > 0 else self.usual_rate
 
-    def untouched(self, span: float) -> Float[np.ndarray, "u M"]:
+    def initial_frames(self, span: float) -> Float[np.ndarray, "u M"]:
         """Read the frames (frames, channels) of the first `span` seconds; iteration returns these frames again. Raises
         `ValueError` if there are none."""
         self._catch_up()
@@ -145,7 +145,7 @@ class Stopping:
         finally:
             self._waiting = False
 
-    def before(self, pictures: Sequence[str], step: Steps) -> Callable[[str], None]:
+    def drawing_reporter(self, pictures: Sequence[str], step: Steps) -> Callable[[str], None]:
         """Create a function that reports writing and drawing as steps, and raises `_StoppedError` before drawing if a
         signal has arrived."""
 
@@ -160,7 +160,7 @@ class Stopping:
         return report
 
     @contextmanager
-    def ending(self, frame_counter: "FrameCounter", *files: str) -> Iterator[None]:
+    def exit_after_signal(self, frame_counter: "FrameCounter", *files: str) -> Iterator[None]:
         """Context manager that, if a signal has arrived, prints the number of frames received and the `files` that
         contain them, and exits the command."""
         try:

@@ -18,7 +18,7 @@ from jeit.files import check_electrodes
 from jeit.layout import perimeter, ring
 from jeit.mesh import Body, Disk, Domain, OwnMesh, Rectangle, Solid
 from jeit.mesh import read as read_mesh
-from jeit.mesh.checks import LARGE, size_checked
+from jeit.mesh.checks import MAX_PLAUSIBLE_SIZE, size_checked
 from jeit.mesh.outline import OUTLINES
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def warn_large_body(table: GeometryTable, body: Body, origin: str) -> None:
     from jeit.data.description_tables import PolygonTable  # already imported when the table was read
 
     lengths = {key: float(getattr(table, key, None) or 0) for key in _SIZE_FACTORS}
-    large_lengths = {key: length for key, length in lengths.items() if _SIZE_FACTORS[key] * length > LARGE}
+    large_lengths = {key: length for key, length in lengths.items() if _SIZE_FACTORS[key] * length > MAX_PLAUSIBLE_SIZE}
     if isinstance(body, OwnMesh):
         key_names, size = "mesh", _extent(body.given.points)
         suggestions = {unit: f"scale = {factor * getattr(table, 'scale', 1.0):g}" for unit, factor in _UNITS.items()}
@@ -51,7 +51,7 @@ def warn_large_body(table: GeometryTable, body: Body, origin: str) -> None:
             unit: " and ".join(f"{factor * length:g}" for length in large_lengths.values())
             for unit, factor in _UNITS.items()
         }
-    if not size > LARGE:
+    if not size > MAX_PLAUSIBLE_SIZE:
         return
     length_text = " and ".join(f"{length:g} m" for length in large_lengths.values()) or f"{size:.3g} m"
     warnings.warn(
@@ -167,21 +167,25 @@ def _body(table: GeometryTable, folder: Path, origin: str) -> Body:
         thickness = getattr(table, "thickness", None)
         return Solid(body, thickness) if isinstance(body, Domain) and thickness is not None else body
     except ValueError as error:
-        raise located(error, origin, "geometry") from None
+        raise error_with_location(error, origin, "geometry") from None
 
 
 def _mesh_from_file(table: MeshTable, folder: Path, origin: str) -> OwnMesh:
     file = folder / table.mesh
     if Path(table.mesh).name != table.mesh or ":" in table.mesh:
-        raise located(f"must be the name of a file beside {origin}, without folders.", origin, "geometry.mesh")
+        raise error_with_location(
+            f"must be the name of a file beside {origin}, without folders.", origin, "geometry.mesh"
+        )
     if not file.is_file():
-        raise located(f"there is no file {table.mesh[:80]}; put it beside {origin}.", origin, "geometry.mesh")
+        raise error_with_location(
+            f"there is no file {table.mesh[:80]}; put it beside {origin}.", origin, "geometry.mesh"
+        )
     if file.resolve().parent != folder.resolve():
-        raise located(f"is a link to another place; put the file beside {origin}.", origin, "geometry.mesh")
+        raise error_with_location(f"is a link to another place; put the file beside {origin}.", origin, "geometry.mesh")
     try:
         return OwnMesh(read_mesh(file, scale=table.scale))
     except (ValueError, OSError) as error:
-        raise located(str(error).removeprefix("path: "), origin, "geometry.mesh") from None
+        raise error_with_location(str(error).removeprefix("path: "), origin, "geometry.mesh") from None
 
 
 def described_electrodes(table: ElectrodesTable, body: Body | None, origin: str) -> AbstractElectrodes:
@@ -212,7 +216,7 @@ def described_electrodes(table: ElectrodesTable, body: Body | None, origin: str)
             electrodes.check(body.given)
         return electrodes
     except ValueError as error:
-        raise located(_with_description_key(str(error)), origin, "electrodes") from None
+        raise error_with_location(_with_description_key(str(error)), origin, "electrodes") from None
 
 
 def _with_description_key(message: str) -> str:
@@ -272,7 +276,7 @@ def _edge_positions(table: PlacedTable, outline: Domain, num_electrodes: int) ->
     )
 
 
-def located(error: Exception | str, origin: str, key: str) -> ValueError:
+def error_with_location(error: Exception | str, origin: str, key: str) -> ValueError:
     """Return a `ValueError` with the text of `error`, preceded by the file `origin` and the `key`, cut to 400
     characters."""
     text = str(error).removeprefix(f"{origin}: ")

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jeit import protocol as protocols
-from jeit.arguments import listed
-from jeit.data.described_body import located
+from jeit.arguments import names_text
+from jeit.data.described_body import error_with_location
 from jeit.files import check_electrodes, check_memory, matlab, npz_arrays
 from jeit.protocol import Protocol, from_matrices, measurement_patterns
 
@@ -50,10 +50,10 @@ def described_protocol(table: ProtocolTable, num_electrodes: int | None, path: P
         if table.kind == "measured":
             return protocol_of_file(table, path)
         if table.kind == "optimal":
-            return _optimal(table, origin)
+            return _optimal_protocol(table, origin)
         return _construct(table, num_electrodes, path, origin)
     except ValueError as error:
-        raise located(error, origin, "protocol") from None
+        raise error_with_location(error, origin, "protocol") from None
 
 
 # Options of protocols that a description may omit, and their possible values; the constructor's default is first.
@@ -61,7 +61,7 @@ _OPTION_VALUES = {"driven_electrodes": (False, True), "order": ("rotating", "fix
          "drives": ("distinct", "all")}  # fmt: skip
 
 
-def variants(table: ProtocolTable) -> list[tuple[ProtocolTable, str]]:
+def protocol_table_variants(table: ProtocolTable) -> list[tuple[ProtocolTable, str]]:
     """Return `table`, then copies of it with different values of the options that `table` does not state. Each table is
     paired with the text that states these options in a description."""
     fields = type(table).model_fields
@@ -102,7 +102,7 @@ def _construct(table: ConstructedTable, num_electrodes: int | None, path: Path, 
     return protocol if table.name is None else replace(protocol, name=table.name)
 
 
-def _optimal(table: OptimalTable, origin: str) -> Protocol:
+def _optimal_protocol(table: OptimalTable, origin: str) -> Protocol:
     num_electrodes = len(table.transfer)
     _check_size(num_electrodes, num_electrodes, num_electrodes, num_electrodes**2, origin)
     current = 1e-3 if table.current is None else table.current * _CURRENT_UNITS[table.current_unit]
@@ -216,7 +216,7 @@ def protocol_of_file(table: MeasuredTable, path: Path) -> Protocol:
     )
     check_memory(f"{path.name}: the protocol", 64 * len(drive) * len(measurement))
     # Currents measured by an instrument sum to zero only within measurement errors.
-    drive = _balanced(drive, table.drive_key, path) * _CURRENT_UNITS[table.current_unit]
+    drive = _subtract_mean_currents(drive, table.drive_key, path) * _CURRENT_UNITS[table.current_unit]
     measurement_name = table.measurement_key or table.measurement
     name = table.name or f"{len(drive)} measured currents, {measurement_name}, {drive.shape[1]} electrodes"
     return from_matrices(drive, measurement, name=name)
@@ -231,7 +231,9 @@ def _read_matrices(path: Path, keys: tuple[str, ...]) -> list[np.ndarray]:
     arrays = npz_arrays(path, *keys)
     missing_keys = [key for key in keys if key not in arrays]
     if missing_keys:
-        raise ValueError(f"{path.name}: there is no array '{missing_keys[0][:60]}'; the file has {listed(arrays[''])}.")
+        raise ValueError(
+            f"{path.name}: there is no array '{missing_keys[0][:60]}'; the file has {names_text(arrays[''])}."
+        )
     return [arrays[key] for key in keys]
 
 
@@ -244,7 +246,7 @@ def _checked_matrix(values: np.ndarray, key: str, path: Path) -> np.ndarray:
     return values.astype(float)
 
 
-def _balanced(drive: np.ndarray, key: str, path: Path) -> np.ndarray:
+def _subtract_mean_currents(drive: np.ndarray, key: str, path: Path) -> np.ndarray:
     """Currents of each drive minus their mean over the electrodes; raises `ValueError` if a mean is not small."""
     net_currents, largest_currents = np.abs(drive.sum(axis=1)), np.abs(drive).max(axis=1)
     worst_index = int(np.argmax(net_currents - 0.05 * largest_currents))

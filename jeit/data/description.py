@@ -47,7 +47,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jeit.data.described_body import described_body, described_electrodes
-from jeit.data.described_protocol import described_protocol, variants
+from jeit.data.described_protocol import described_protocol, protocol_table_variants
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.face_patches import body_mesh
 from jeit.files import read_toml
@@ -124,7 +124,7 @@ class Description:
             None if self.electrodes is None else self.electrodes.num_electrodes,
             [(default_protocol, "")],
         )
-        for table, options in variants(self.protocol_section)[1:]:
+        for table, options in protocol_table_variants(self.protocol_section)[1:]:
             with suppress(ValueError):  # no channel is left
                 candidates.append((described_protocol(table, num_electrodes, Path(path), self.origin), options))
         return candidates

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.io
 
-from jeit.arguments import check_kind, listed
+from jeit.arguments import check_kind, names_text
 from jeit.data.described_body import ELECTRODES
 from jeit.data.described_protocol import PROTOCOL_ARRAYS
 from jeit.data.measurement import Measurement
@@ -191,11 +191,13 @@ def from_eidors(path: str | Path, variable: str | None = None) -> ForwardModel:
         variables = scipy.io.loadmat(str(file), simplify_cells=True, spmatrix=False)
     models = {name: model for name, value in variables.items() if (model := _forward_model(value)) is not None}
     if variable is None and len(models) != 1:
-        problem = f"has the models {listed(sorted(models))}; name one" if models else "has no model; save a fwd_model"
+        problem = (
+            f"has the models {names_text(sorted(models))}; name one" if models else "has no model; save a fwd_model"
+        )
         raise ValueError(f"variable: {file.name} {problem}.")
     name = next(iter(models)) if variable is None else variable
     if name not in models:
-        raise ValueError(f"variable: {file.name} has no model {name!r}; it has {listed(sorted(models)) or 'none'}.")
+        raise ValueError(f"variable: {file.name} has no model {name!r}; it has {names_text(sorted(models)) or 'none'}.")
     fwd_model = models[name]
     mesh = Mesh.create(np.asarray(fwd_model["nodes"], float), np.asarray(fwd_model["elems"], int) - 1)
     electrode_tables = (

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jeit.arguments import readings
+from jeit.arguments import measurable_values
 from jeit.data.description import Description, TableLayout
 from jeit.data.formats import table
 from jeit.data.formats.text import frames_in_table
 from jeit.data.measurement import Measurement
-from jeit.files import need, npz_arrays, written_whole
+from jeit.files import npz_arrays, require_arrays, written_whole
 
 
 def join(measurements: Sequence[Measurement]) -> Measurement:
@@ -127,7 +127,7 @@ def read_frame_recording(path: str | Path, description: Description | None = Non
         seconds = next((_times(arrays[key], key, len(frames)) for key in _TIME_KEYS if key in arrays), seconds)
         reference = None
         if "reference" in arrays:
-            reference = _checked("reference", np.atleast_2d(arrays["reference"]) * layout.scale, frames.shape[1])
+            reference = _check_frames("reference", np.atleast_2d(arrays["reference"]) * layout.scale, frames.shape[1])
         elif "reference" in layout.frame_names and len(layout.frame_names) == len(frames):
             is_reference = np.array(layout.frame_names) == "reference"
             frames, reference = frames[~is_reference], frames[is_reference]
@@ -154,17 +154,17 @@ def _frames(values: np.ndarray, layout: TableLayout, name: str, num_channels: in
     frames = table.frames_from(values, layout, name)
     if np.iscomplexobj(frames):
         raise ValueError("frames are complex; choose a part with [data] component: real, imaginary or magnitude.")
-    return _checked(
-        "frames", readings(frames) * layout.scale, frames.shape[-1] if num_channels is None else num_channels
+    return _check_frames(
+        "frames", measurable_values(frames) * layout.scale, frames.shape[-1] if num_channels is None else num_channels
     )
 
 
-def _checked(name: str, values: np.ndarray, num_channels: int) -> Float[np.ndarray, "F M"]:
+def _check_frames(name: str, values: np.ndarray, num_channels: int) -> Float[np.ndarray, "F M"]:
     if values.dtype.kind not in "iuf" or values.ndim != 2 or values.shape[1] != num_channels:
         raise ValueError(f"{name} have shape {values.shape}; give one row for each frame, of {num_channels} channels.")
     if not len(values):
         raise ValueError(f"{name}: there is none.")
-    return readings(values.astype(float))
+    return measurable_values(values.astype(float))
 
 
 def _times(values: np.ndarray, name: str, num_frames: int) -> Float[np.ndarray, " F"]:
@@ -286,7 +286,7 @@ class GestureSet:
             arrays = npz_arrays(Path(path), *_ARRAY_NAMES, otherwise="not a set of gestures")
             if "gesture" in arrays:
                 arrays.setdefault("person", np.zeros(arrays["gesture"].shape, int))
-            need(arrays, *_ARRAY_NAMES)
+            require_arrays(arrays, *_ARRAY_NAMES)
             return cls(**{name: arrays[name] for name in _ARRAY_NAMES})
         except ValueError as error:
             raise ValueError(f"'{path}': {error}") from None

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Inexact
 from numpy.typing import ArrayLike
 
-from jeit.arguments import brief, check_kind, counted, describe, did_you_mean, is_number, page, picture
+from jeit.arguments import check_kind, counted, describe, did_you_mean, is_number, object_html, object_text, picture
 from jeit.electrodes import AbstractElectrodes
 from jeit.inverse.placement import Uncertainty
 from jeit.mesh import Body, Mesh
@@ -116,7 +116,7 @@ class Measurement(Module):
             _check_times(np.asarray(self.times), self.voltages.shape[0])
 
     def __repr__(self) -> str:
-        return brief(
+        return object_text(
             lambda: (
                 f"Measurement({self.name!r}: {self.num_frames} frames, {np.sum(~self.mask)} voltages masked,\n"
                 f"  {self.protocol!r}, {self.domain!r})"
@@ -128,7 +128,7 @@ class Measurement(Module):
         return picture(self)
 
     def _repr_html_(self) -> str | None:
-        return page(self)
+        return object_html(self)
 
     @property
     def num_frames(self) -> int:

@@ -320,7 +320,7 @@ def order_note(measurement: Measurement) -> str | None:
     """A sentence that reports that electrodes are not numbered in their order along the edge; None if they are, or if
     they do not lie on an edge."""
     order = boundary_order(measurement)
-    if order is None or len(order) < 4 or follows(order):
+    if order is None or len(order) < 4 or is_cyclic_sequence(order):
         return None
     electrode_list = ", ".join(str(number + 1) for number in _starting_at_first(order)[:_MAX_LISTED])
     ellipsis = " …" if len(order) > _MAX_LISTED else ""
@@ -343,7 +343,7 @@ def order_note(measurement: Measurement) -> str | None:
     )
 
 
-def follows(order: Int[np.ndarray, " L"]) -> bool:
+def is_cyclic_sequence(order: Int[np.ndarray, " L"]) -> bool:
     """Whether the electrode numbers in the cyclic `order` increase by one at every step, or decrease by one."""
     steps = (np.roll(order, -1) - order) % len(order)
     return bool((steps == 1).all() or (steps == len(order) - 1).all())

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from jeit.arguments import check_name, listed
+from jeit.arguments import check_name, names_text
 from jeit.data.measurement import Measurement
 from jeit.files import check_memory
 
@@ -172,7 +172,7 @@ def _recognise(file: Path, description: str | Path | None, like: Measurement | N
                     f"{file.name} looks like {reader.DESCRIPTION}, but lacks the variable {missing_variables[0]}: add "
                     "it, or put a description beside the file."
                 )
-        listed_names = listed(sorted(names))
+        listed_names = names_text(sorted(names))
         raise ValueError(
             f"{file.name} is a .mat file of no known kind; it holds {listed_names}. `jeit describe {file.name}` finds "
             f"out what it can, and writes a description. Known: {Kit4.DESCRIPTION}; {Ktc2023.DESCRIPTION}; "
@@ -233,8 +233,8 @@ def _check_mark(file: Path) -> None:
             ) from None
         if file.suffix.lower() not in endings:
             raise ValueError(
-                f"{file.name} is a file of {name} ({reader.DESCRIPTION}), which end in {listed(endings)}: rename it, "
-                f"or give format='{name}' (--format {name})."
+                f"{file.name} is a file of {name} ({reader.DESCRIPTION}), which end in {names_text(endings)}: rename "
+                f"it, or give format='{name}' (--format {name})."
             )
 
 

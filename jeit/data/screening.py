@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool
 from numpy.typing import ArrayLike
 
-from jeit.arguments import readings
+from jeit.arguments import measurable_values
 from jeit.data.measurement import Measurement
 from jeit.data.quality import order_note
 from jeit.electrodes import AbstractElectrodes
@@ -81,7 +81,7 @@ def screen(
         if given_mask.dtype != bool:
             raise ValueError(f"mask is {given_mask.dtype}; give booleans, True where a voltage is usable.")
         exclude(~given_mask, "excluded by the mask given.")
-    values = readings(values)
+    values = measurable_values(values)
     exclude(np.isnan(values), "NaN, infinite or beyond any instrument (an electrode missing or not connected).")
     is_dead = ~np.any(np.where(usable, values, 0) != 0, axis=1)
     if is_dead.all():
@@ -92,7 +92,7 @@ def screen(
     exclude(
         np.broadcast_to(is_dead[:, None], values.shape), f"all zero: {int(is_dead.sum())} of {len(is_dead)} frames."
     )
-    exclude(_saturated(values, usable, saturation), "saturated (stuck at an end of the instrument's range).")
+    exclude(_find_saturated(values, usable, saturation), "saturated (stuck at an end of the instrument's range).")
     is_dead, is_alive = _current_flow(values, usable, protocol)
     exclude(is_dead[:, np.asarray(protocol.drive_index)], "their drive's current did not flow.")
     driven, reads = (np.asarray(patterns) != 0 for patterns in (protocol.drive, protocol.channel_measurement))
@@ -148,7 +148,7 @@ def _as_frames(voltages, protocol: Protocol, name: str) -> np.ndarray:
     return values
 
 
-def _saturated(values: np.ndarray, usable: np.ndarray, saturation: float | None) -> Bool[np.ndarray, "F M"]:
+def _find_saturated(values: np.ndarray, usable: np.ndarray, saturation: float | None) -> Bool[np.ndarray, "F M"]:
     if saturation is not None:
         if not np.isfinite(saturation) or saturation <= 0:
             raise ValueError(f"saturation must be a positive voltage in volts; got {saturation!r}.")

@@ -76,7 +76,7 @@ def as_driven(reference: Measurement, measurement: Measurement) -> Measurement:
     unchanged if only the amplitude of the currents differs, or if its patterns do not determine the voltages of that
     protocol."""
     ours, theirs = measurement.protocol, reference.protocol
-    if ours.num_electrodes != theirs.num_electrodes or ours.same_patterns(theirs) or _proportional(ours, theirs):
+    if ours.num_electrodes != theirs.num_electrodes or ours.same_patterns(theirs) or _are_proportional(ours, theirs):
         return reference
     try:
         return driven_by(reference, ours)
@@ -84,7 +84,7 @@ def as_driven(reference: Measurement, measurement: Measurement) -> Measurement:
         return reference
 
 
-def _proportional(ours: Protocol, theirs: Protocol) -> bool:
+def _are_proportional(ours: Protocol, theirs: Protocol) -> bool:
     """Whether two protocols have the same measurement patterns, and drive patterns that differ by a common factor."""
     if ours.num_measurements != theirs.num_measurements:
         return False

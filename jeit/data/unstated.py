@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Inexact
 
-from jeit.arguments import counted, percent, readings
+from jeit.arguments import counted, measurable_values, percent
 from jeit.data.measurement import Measurement
 from jeit.data.quality import boundary_order, expected_signs, reciprocity_error
 from jeit.mesh import Solid
@@ -62,7 +62,7 @@ def fitting_protocol(
 
 def _mean_frame_error(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) -> float:
     """Reciprocity error of the mean of the frames; infinite if it cannot be computed."""
-    values = readings(np.atleast_2d(frames))
+    values = measurable_values(np.atleast_2d(frames))
     is_known = np.isfinite(values).all(axis=0)
     mean = np.where(is_known, np.where(np.isfinite(values), values, 0).mean(axis=0), 0)
     error = (
@@ -71,7 +71,7 @@ def _mean_frame_error(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) ->
     return np.inf if error is None else error
 
 
-def driven_zeros(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) -> Bool[np.ndarray, " M"]:
+def unmeasured_driven_channels(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) -> Bool[np.ndarray, " M"]:
     """Mask (channels,) of the channels on driven electrodes that are zero in every frame, i.e. were not measured."""
     shared = shares_electrode(np.asarray(protocol.drive), np.asarray(protocol.measurement))
     driven = shared[np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)]

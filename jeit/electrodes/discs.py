@@ -98,7 +98,7 @@ class AbstractDiscs(AbstractPlacedElectrodes):
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Draw each electrode as a disc, or as a dot if it is on a wall."""
-        flat_flags = seen_flat(mesh, self.position)
+        flat_flags = is_undistorted_from_above(mesh, self.position)
         for position, radius, is_flat in zip(
             np.asarray(self.position), np.asarray(self.radius), flat_flags, strict=True
         ):
@@ -260,7 +260,7 @@ def facet_normals(mesh: Mesh) -> Float[Array, "b 3"]:
     return normal / xp.linalg.norm(normal, axis=1, keepdims=True)
 
 
-def seen_flat(mesh: Mesh, position: Float[Array, "L d"]) -> Bool[np.ndarray, " L"]:
+def is_undistorted_from_above(mesh: Mesh, position: Float[Array, "L d"]) -> Bool[np.ndarray, " L"]:
     """Whether the surface at each position appears undistorted from above: in a sheet, and on horizontal faces."""
     if mesh.dimension == 2:
         return np.ones(len(position), bool)

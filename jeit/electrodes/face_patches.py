@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.arguments import IN_MILLIMETRES
-from jeit.electrodes.discs import facet_normals, seen_flat, tangent_frames
+from jeit.electrodes.discs import facet_normals, is_undistorted_from_above, tangent_frames
 from jeit.electrodes.electrodes import (
     AbstractElectrodes,
     AbstractMovableElectrodes,
@@ -244,7 +244,7 @@ class FacePatches(AbstractMovableElectrodes):
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Draw electrodes on horizontal faces as rectangles, all others as dots."""
-        positions, is_flat = np.asarray(self.position), seen_flat(mesh, self.position)
+        positions, is_flat = np.asarray(self.position), is_undistorted_from_above(mesh, self.position)
         sizes = np.asarray(self.width), np.asarray(self.height)
         for position, width, height, is_undistorted in zip(positions, *sizes, is_flat, strict=True):
             if is_undistorted:

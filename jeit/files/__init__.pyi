@@ -3,14 +3,14 @@ from .limits import (
     check_electrodes,
     check_memory,
     check_size,
+    error_text,
     parsed_toml,
     read_as,
     read_json,
     read_text,
     read_toml,
-    reason,
 )
-from .npz_file import check_archive, need, npy_array, npz_arrays
+from .npz_file import check_archive, npy_array, npz_arrays, require_arrays
 from .whole import clear_unfinished, whole_files, written_whole
 
 __all__ = [
@@ -20,7 +20,7 @@ __all__ = [
     "check_memory",
     "check_size",
     "clear_unfinished",
-    "need",
+    "error_text",
     "npy_array",
     "npz_arrays",
     "parsed_toml",
@@ -28,7 +28,7 @@ __all__ = [
     "read_json",
     "read_text",
     "read_toml",
-    "reason",
+    "require_arrays",
     "whole_files",
     "written_whole",
 ]

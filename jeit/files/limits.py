@@ -65,24 +65,24 @@ def _max_gigabytes() -> float:
     return gigabytes
 
 
-KEY = 40
+MAX_KEY_LENGTH = 40
 """Maximum number of characters of a key in a message."""
 # Maximum number of characters of a message; of faults that are described in sentences; and of further faults that are
 # listed by their keys.
 _MAX_MESSAGE, _MAX_SENTENCES, _MAX_KEYS = 390, 4, 10
-ALL = "; there are "
+WORD_LIST_PREFIX = "; there are "
 """Text that precedes a list of all valid words in a message."""
 
 
 def faults_message(origin: str, sentences: list[str], keys: Sequence[str] = ()) -> str:
     """Combine several faults in the file `origin` into one error message. It contains the first of the `sentences`, as
     many of the following sentences as fit, and the `keys` of up to ten of the remaining faults."""
-    first_sentence = cut(f"{cut(origin, 2 * KEY)}: {sentences[0]}", _MAX_MESSAGE - 20)
+    first_sentence = shorten(f"{shorten(origin, 2 * MAX_KEY_LENGTH)}: {sentences[0]}", _MAX_MESSAGE - 20)
     num_shown = 1
     for num_sentences in range(min(len(sentences), _MAX_SENTENCES), 0, -1):
         # If a message proposes a valid word, its list of all valid words is omitted first to save room.
         short_sentences = [
-            f"{sentence.split(ALL)[0]}." if "?)" + ALL in sentence else sentence
+            f"{sentence.split(WORD_LIST_PREFIX)[0]}." if "?)" + WORD_LIST_PREFIX in sentence else sentence
             for sentence in sentences[1:num_sentences]
         ]
         for later_sentences in (sentences[1:num_sentences], short_sentences):
@@ -111,7 +111,7 @@ def _further_faults(keys: Sequence[str], num_faults: int, max_keys: int) -> list
     return [*sentences, f"And {num_faults - len(named_keys)} more."] if num_faults > len(named_keys) else sentences
 
 
-def cut(text: str, max_length: int) -> str:
+def shorten(text: str, max_length: int) -> str:
     """Shorten a text to at most `max_length` characters; a shortened text ends with an ellipsis."""
     return text if len(text) <= max_length else f"{text[: max_length - 1]}…"
 
@@ -134,10 +134,10 @@ def read_as(message: str) -> Iterator[None]:
     except Exception as error:  # of any type, since the readers of other packages do not check the content
         if isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError):
             raise
-        raise ValueError(f"{message} ({reason(error)}).") from None
+        raise ValueError(f"{message} ({error_text(error)}).") from None
 
 
-def reason(error: Exception) -> str:
+def error_text(error: Exception) -> str:
     """Message of an error in one short line; the type of the error if it has no message."""
     text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
     return text if len(text) <= _MAX_REASON else f"{text[: _MAX_REASON - 1]}…"
@@ -191,7 +191,7 @@ def parsed_toml(text: str, name: str) -> dict[str, Any]:
     except RecursionError:
         raise ValueError(f"{name} is nested too deep.") from None
     except ValueError as error:  # TOMLDecodeError, and numbers of too many digits
-        raise ValueError(f"{name} is no TOML file: {reason(error)}.") from None
+        raise ValueError(f"{name} is no TOML file: {error_text(error)}.") from None
 
 
 def _max_dots(line: str) -> int:
@@ -211,4 +211,4 @@ def read_json(path: str | Path, *, max_bytes: int = 2**26) -> Any:
     except RecursionError:
         raise ValueError(f"{path.name} is nested too deep.") from None
     except json.JSONDecodeError as error:
-        raise ValueError(f"{path.name} is no JSON file: {reason(error)}.") from None
+        raise ValueError(f"{path.name} is no JSON file: {error_text(error)}.") from None

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.io
 
-from jeit.arguments import listed
+from jeit.arguments import names_text
 from jeit.files.limits import check_memory, read_as
 
 # Length in bytes of the file header, and of the beginning of an element, which contains flags, shape and name; then the
@@ -98,7 +98,7 @@ def numbers(content: dict[str, np.ndarray], key: str, path: Path) -> np.ndarray:
     if key not in content and key in content[""]:
         raise ValueError(f"{path.name}: variable '{key}' holds other things, not numbers.")
     if key not in content:
-        raise ValueError(f"{path.name}: there is no variable '{key}'; the file has {listed(content[''])}.")
+        raise ValueError(f"{path.name}: there is no variable '{key}'; the file has {names_text(content[''])}.")
     value = content[key]
     if value.dtype.kind not in "fiuc" or value.size == 0:
         raise ValueError(f"{path.name}: variable '{key}' holds {value.dtype} of shape {value.shape}, not numbers.")

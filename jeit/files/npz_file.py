@@ -14,7 +14,7 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from jeit.files.limits import TooLarge, check_memory, reason
+from jeit.files.limits import TooLarge, check_memory, error_text
 
 _NUM_COPIES = 2
 # Maximum size in bytes of a file in an NPZ archive that is not an array, such as a JSON header.
@@ -108,7 +108,7 @@ def check_archive(path: Path) -> None:
         raise _unreadable_error("archive", error) from None
 
 
-def need(arrays: dict[str, np.ndarray], *keys: str) -> None:
+def require_arrays(arrays: dict[str, np.ndarray], *keys: str) -> None:
     """Raise `ValueError` if one of the arrays `keys` is missing in `arrays`; the message lists the arrays of the
     file."""
     missing_keys = [key for key in keys if key not in arrays]
@@ -172,4 +172,4 @@ def _read_array(file: IO[bytes]) -> np.ndarray:
 
 def _unreadable_error(kind: str, error: Exception) -> ValueError:
     hint = "" if "object" not in str(error).lower() else " as numbers and text, not objects"
-    return ValueError(f"not a readable {kind} ({reason(error)}); write it again{hint}.")
+    return ValueError(f"not a readable {kind} ({error_text(error)}); write it again{hint}.")

@@ -28,7 +28,7 @@ from pydantic import BaseModel, ConfigDict, FailFast, Field, GetCoreSchemaHandle
 from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError, core_schema
 
 from jeit.arguments import IN_MILLIMETRES, describe, did_you_mean
-from jeit.files.limits import ALL, KEY, cut, faults_message
+from jeit.files.limits import MAX_KEY_LENGTH, WORD_LIST_PREFIX, faults_message, shorten
 
 # Maximum number of characters of a list of names in a message.
 _MAX_LIST_LENGTH = 160
@@ -88,8 +88,8 @@ class Table(BaseModel):
                 return f"is missing; give it{cls.hints.get(str(details['loc'][-1]), '')}."
             case "extra_forbidden":
                 known_keys = [*cls.model_fields]
-                suggestion = did_you_mean(str(details["loc"][-1])[:KEY], known_keys)
-                return f"is no key of {cls.subject}{suggestion}{ALL}{_list_names(known_keys)}."
+                suggestion = did_you_mean(str(details["loc"][-1])[:MAX_KEY_LENGTH], known_keys)
+                return f"is no key of {cls.subject}{suggestion}{WORD_LIST_PREFIX}{_list_names(known_keys)}."
             case "literal_error":
                 return not_among(value, re.findall("'([^']+)'", context["expected"]))
             case "bool_type" if not isinstance(value, list):
@@ -370,7 +370,9 @@ def validated(table: type[T], content: Any, origin: str) -> T:
 def not_among(value: Any, words: Iterable[str], suggestion_text: str = "") -> str:
     """Error message for a value that is not one of `words`; `suggestion_text`: text that proposes a word."""
     known_words = [*words]
-    suggestion = suggestion_text or did_you_mean(value[:KEY] if isinstance(value, str) else value, known_words)
+    suggestion = suggestion_text or did_you_mean(
+        value[:MAX_KEY_LENGTH] if isinstance(value, str) else value, known_words
+    )
     return f"must be one of {_list_names(known_words)}; it is {describe(value)}{suggestion}."
 
 
@@ -389,7 +391,7 @@ def _full_key_name(path: tuple[int | str, ...]) -> str:
 
 
 def _short_key(name: str) -> str:
-    shortened = cut(name, KEY)
+    shortened = shorten(name, MAX_KEY_LENGTH)
     return shortened if re.fullmatch(r"[\w.-]+…?", shortened) else repr(shortened)
 
 
@@ -416,4 +418,4 @@ def _number_text(number: float) -> str:
 
 
 def _list_names(names: Iterable[str]) -> str:
-    return cut(", ".join(names), _MAX_LIST_LENGTH)
+    return shorten(", ".join(names), _MAX_LIST_LENGTH)

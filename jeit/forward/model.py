@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Inexact
 from numpy.typing import ArrayLike
 
-from jeit.arguments import brief, check_kind
+from jeit.arguments import check_kind, object_text
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.point import IntegratedElectrodes
 from jeit.forward.system import System, check_conductivity, field_gradients
@@ -138,7 +138,7 @@ class ForwardModel(Module):
         self.at_once = self.system.at_once
 
     def __repr__(self) -> str:
-        return brief(
+        return object_text(
             lambda: (
                 f"ForwardModel({self.mesh!r},\n  {type(self.electrodes).__name__}, {self.protocol!r}, "
                 f"{type(self.system.solver).__name__})"

@@ -219,10 +219,10 @@ def terminal_impedance(product: Inexact[Array, "c c"]) -> Inexact[Array, "c c"]:
     scale = scale * scale[:, None]
     matrix = (xp.diag(xp.where(is_not_reference, diagonal, 1)) - pairs * coupling) * scale
     impedance = symmetric_inverse(matrix) * scale * pairs
-    return impedance + undifferentiated(_mean_current_correction(coupling, impedance, xp.diag(is_not_reference)))
+    return impedance + undifferentiated(_refinement_correction(coupling, impedance, xp.diag(is_not_reference)))
 
 
-def _mean_current_correction(
+def _refinement_correction(
     others: Inexact[Array, "c c"], impedance: Inexact[Array, "c c"], current: Inexact[Array, "c c"]
 ):
     """Correction of the impedance of terminals by one step of iterative refinement; needed if two terminals are nearly

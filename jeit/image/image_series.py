@@ -22,7 +22,7 @@ import scipy.optimize
 from jaxtyping import Bool, Float, Real
 from numpy.typing import ArrayLike
 
-from jeit.arguments import brief, check_name, describe, is_number, page, picture
+from jeit.arguments import check_name, describe, is_number, object_html, object_text, picture
 from jeit.mesh import Mesh, measures
 
 
@@ -65,7 +65,7 @@ class ImageSeries:
             raise ValueError("changes: no frame has an image.")
 
     def __repr__(self) -> str:
-        return brief(
+        return object_text(
             lambda: f"ImageSeries({len(self.times)} frames, {self.mesh!r})",
             self,
         )
@@ -74,7 +74,7 @@ class ImageSeries:
         return picture(self)
 
     def _repr_html_(self) -> str | None:
-        return page(self)
+        return object_html(self)
 
     @property
     def imaged(self) -> Bool[np.ndarray, " F"]:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Inexact, Int
 from scipy.spatial import KDTree
 
-from jeit.arguments import brief, page, picture
+from jeit.arguments import object_html, object_text, picture
 from jeit.mesh import Mesh, check_flat
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace
 from jeit_solvers.module import Module
@@ -183,7 +183,7 @@ class FiguresOfMerit(Module):
     body_radius: Float[Array, "*targets"]
 
     def __repr__(self) -> str:
-        return brief(self._in_words, self)
+        return object_text(self._in_words, self)
 
     def _in_words(self) -> str:
         middle = {name: float(np.median(np.asarray(value))) for name, value in vars(self).items()}
@@ -198,7 +198,7 @@ class FiguresOfMerit(Module):
         return picture(self)
 
     def _repr_html_(self) -> str | None:
-        return page(self)
+        return object_html(self)
 
 
 def figures_of_merit(

@@ -12,7 +12,7 @@ from jeit.arguments import percent
 from jeit.imaging.method import METHODS, Imaged, MethodOptions, of_shapes, shapes_in
 from jeit.imaging.preparation import PreparedDifference
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
-from jeit.inverse.prior.matern import MEASURED
+from jeit.inverse.prior.matern import MEASURED_DATA_PRIOR
 from jeit.inverse.shapes import ShapeReconstruction
 
 # Changes of conductivity relative to the background above which voltages are not linear in conductivity: in general,
@@ -55,7 +55,7 @@ def image_automatically(prepared: PreparedDifference, options: MethodOptions, se
         return ChosenMethod("one-step", "images of complex voltages are linear.", imaged)
     fault, uses_own_prior = (
         linear_image_fault(prepared, imaged[1]),
-        prepared.mesh.dimension == 3 and options.prior != MEASURED,
+        prepared.mesh.dimension == 3 and options.prior != MEASURED_DATA_PRIOR,
     )
     if fault:
         try:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from jeit.arguments import counted, did_you_mean, listed, percent
+from jeit.arguments import counted, did_you_mean, names_text, percent
 from jeit.data import Measurement, read
 from jeit.data.description import Description, TableLayout, parse_description
 from jeit.data.exchange import assignments
@@ -34,10 +34,10 @@ from jeit.protocol import Protocol
 
 # Minimum and maximum number of electrodes of the protocols that are tried; number of nodes of the mesh on which the
 # protocols are compared, for a sheet and for a solid.
-_FEWEST, _MOST, _NODES = 4, 64, {2: 700, 3: 4000}
+_MIN_ELECTRODES, _MAX_ELECTRODES, _NODES = 4, 64, {2: 700, 3: 4000}
 # Unexplained share of the empty body's voltages above which the best protocol is refused: in general; and if its kind
-# is known, or if the channels in a different order would leave `_ORDERED` times as much unexplained.
-_HOPELESS, _HOPELESS_EVEN_SO, _ORDERED = 0.25, 0.5, 2.0
+# is known, or if the channels in a different order would leave `_MIN_ORDER_RATIO` times as much unexplained.
+_MAX_UNEXPLAINED, _MAX_UNEXPLAINED_KNOWN, _MIN_ORDER_RATIO = 0.25, 0.5, 2.0
 # Maximum spread of the frames of an empty body; minimum number of channels for each electrode.
 _MAX_SPREAD, _MIN_CHANNELS = 0.2, 2
 # Maximum number of candidate protocols whose misfit is computed. A candidate is ruled out if its unexplained share is
@@ -93,7 +93,7 @@ class Candidate:
         their mean square."""
         values = np.asarray(self.measurement.voltages)[np.asarray(self.measurement.mask)]
         mean_ratio = abs(values.mean()) ** 2 / np.mean(np.abs(values) ** 2)
-        return bool(_ORDERED * self.unexplained < np.sqrt(1 - mean_ratio**2))
+        return bool(_MIN_ORDER_RATIO * self.unexplained < np.sqrt(1 - mean_ratio**2))
 
     @property
     def name(self) -> str:
@@ -119,7 +119,7 @@ class Findings:
         """Reason why the best protocol explains the file too poorly to be used; empty if it explains the file well
         enough."""
         best = self.candidates[0]
-        limit = _HOPELESS_EVEN_SO if self.known or best.ordered else _HOPELESS
+        limit = _MAX_UNEXPLAINED_KNOWN if self.known or best.ordered else _MAX_UNEXPLAINED
         if best.unexplained < limit and best.spread < _MAX_SPREAD:
             return ""
         if best.spread >= _MAX_SPREAD:
@@ -176,8 +176,8 @@ def find_description(
     if not known and OpenEit.recognises(path):
         known = OpenEit.protocol_table(path)
     number = (known or {}).get("number")
-    if number is not None and not _FEWEST <= number <= _MOST:
-        raise ValueError(f"number must be from {_FEWEST} to {_MOST} electrodes; it is {number}.")
+    if number is not None and not _MIN_ELECTRODES <= number <= _MAX_ELECTRODES:
+        raise ValueError(f"number must be from {_MIN_ELECTRODES} to {_MAX_ELECTRODES} electrodes; it is {number}.")
     progress("read")
     numbers = _Numbers.read(path, keys[0], excluded=keys[1] if reference is None else None)
     base_numbers = numbers if reference is None and keys[1] is None else _Numbers.read(reference or path, keys[1])
@@ -185,7 +185,7 @@ def find_description(
     candidates = list(_fitting(numbers, base_numbers, geometry, electrodes, known or {}, current))
     if not candidates:
         counts = _channel_counts(known or {})
-        count_text = f" (of what is known: {listed(counts)})" if counts else ""
+        count_text = f" (of what is known: {names_text(counts)})" if counts else ""
         raise ValueError(
             f"{path.name}: no protocol of common kinds has as many channels{count_text} as there are numbers: "
             f"{numbers.shape}. Are there columns of other things? Otherwise write a description with your own "
@@ -302,11 +302,15 @@ def _array(path: Path, key: str | None, excluded: str | None) -> tuple[np.ndarra
     if name is None:
         tables = [item for item, shape in sizes.items() if item != excluded and int(np.prod(shape)) > 3]
         if len(tables) != 1:
-            names = listed([f"{item} ({' × '.join(map(str, sizes[item]))})" for item in tables]) if tables else "none"
+            names = (
+                names_text([f"{item} ({' × '.join(map(str, sizes[item]))})" for item in tables]) if tables else "none"
+            )
             raise ValueError(f"{path.name}: arrays of numbers are {names}. Name that of the frames by key=.")
         name = tables[0]
     if name not in sizes:
-        raise ValueError(f"key: {path.name} has no array {name!r}{did_you_mean(name, sizes)}; it has {listed(sizes)}.")
+        raise ValueError(
+            f"key: {path.name} has no array {name!r}{did_you_mean(name, sizes)}; it has {names_text(sizes)}."
+        )
     if path.suffix.lower() == ".npz":
         return np.atleast_2d(npz_arrays(path, name)[name]), axis
     table = matlab.numbers(matlab.load(path, name), name, path)
@@ -333,7 +337,7 @@ def _fitting(
 ) -> Iterator[Candidate]:
     """Yield candidates whose number of channels fits the file and its reference; of equal protocols, only the first."""
     counts, found_protocols = set(numbers.sizes), set()
-    for number in [known["number"]] if "number" in known else range(_FEWEST, _MOST + 1):
+    for number in [known["number"]] if "number" in known else range(_MIN_ELECTRODES, _MAX_ELECTRODES + 1):
         if not any(number * (number - 4) / 4 <= count <= number**2 for count in counts):
             continue
         for table in _protocols(number):

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Array, Float, Inexact, UInt8
 
-from jeit.arguments import brief, page, percent, picture
+from jeit.arguments import object_html, object_text, percent, picture
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality
 from jeit.electrodes import AbstractElectrodes, BoundaryElectrodes
@@ -34,7 +34,7 @@ from jeit.mesh import Domain, Mesh
 from jeit_solvers import Status
 from jeit_solvers.engines import as_array
 
-_MIDDLE = 0.5
+_SEGMENTATION_LEVEL = 0.5
 # Minimum width of electrodes relative to their distance that raises no doubt. Misfit of the reference above which frame
 # and reference may be exchanged, and ratio of the frame's misfit to the reference's misfit below which an exchange is
 # likely.
@@ -103,7 +103,7 @@ class ImagedDifference:
     num_frames: int = 1
 
     def __repr__(self) -> str:
-        return brief(
+        return object_text(
             lambda: (
                 f"ImagedDifference({self.measurement.name!r}, by {self.settings.method}: "
                 f"{len(self.inclusions)} inclusions in {self.mesh.num_cells} cells,\n"
@@ -117,7 +117,7 @@ class ImagedDifference:
         return picture(self)
 
     def _repr_html_(self) -> str | None:
-        return page(self)
+        return object_html(self)
 
     @property
     def lowest(self) -> float:
@@ -187,7 +187,7 @@ class ImagedDifference:
     def level(self) -> float:
         """Level at which an inclusion ends, as a share of its peak: 0.5, the middle of its blurred edge, in segmented
         images, otherwise the level of the settings."""
-        return _MIDDLE if self.settings.segment else self.settings.level
+        return _SEGMENTATION_LEVEL if self.settings.segment else self.settings.level
 
     @property
     def is_complex(self) -> bool:
@@ -369,7 +369,7 @@ def image_difference(
             calibration=calibration,
             reconstruction=reconstruction,
             change=change,
-            raster=_sampled(grid, change),
+            raster=_sample_on_raster(grid, change),
             extent=grid.extent,
             inclusions=(),
             wiring=prepared.wiring,
@@ -410,18 +410,18 @@ def _body_inclusion(body: Star | Ellipsoid, background: float) -> Inclusion:
             centroid,
             quantities.measure,
             background * quantities.change,
-            form=_form(body),
+            form=_solid_form(body),
             contrast_interval=quantities.change_interval,
             area_interval=quantities.measure_interval,
             strength=quantities.strength,
             strength_interval=quantities.strength_interval,
             centroid_radius=quantities.centroid_radius,
         )
-    inclusion = Inclusion(body.sign, centroid, body.measure, body.sign * body.contrast, form=_form(body))
+    inclusion = Inclusion(body.sign, centroid, body.measure, body.sign * body.contrast, form=_solid_form(body))
     return _with_change(inclusion, background)
 
 
-def _form(body: Star | Ellipsoid) -> SolidForm | None:
+def _solid_form(body: Star | Ellipsoid) -> SolidForm | None:
     """Form of a body in a solid, for drawing; None for star shapes."""
     if isinstance(body, Star):
         return None
@@ -451,7 +451,7 @@ def _labels(mesh: Mesh, bodies: Sequence[Star | Ellipsoid], grid: Raster) -> UIn
     return labels
 
 
-def _sampled(grid: Raster, change) -> Inexact[Array, "rows columns"]:
+def _sample_on_raster(grid: Raster, change) -> Inexact[Array, "rows columns"]:
     """Sample an image on a raster, real and imaginary part separately for complex images."""
     if not np.iscomplexobj(change):
         return grid.sample(change)

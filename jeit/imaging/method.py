@@ -15,13 +15,13 @@ from jeit.arguments import check_kind, check_name, describe, is_number
 from jeit.image import find_inclusions
 from jeit.imaging.preparation import PreparedDifference
 from jeit.inverse import RULES, TotalVariation, back_projection, one_step, reconstruct
-from jeit.inverse.hyperparameter.choice import EDGE_PRICE, ITERATED, RULE
+from jeit.inverse.hyperparameter.choice import DEFAULT_RULE, EDGE_PRICE, GAUSS_NEWTON_HYPERPARAMETER
 from jeit.inverse.hyperparameter.rules import Rule, discrepancy
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.nonlinear import GaussNewton, LevenbergMarquardt
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.nonlinear.solvers import AbstractSolver
-from jeit.inverse.prior.matern import MEASURED, PRIORS
+from jeit.inverse.prior.matern import MEASURED_DATA_PRIOR, PRIORS
 from jeit.inverse.prior.priors import AbstractPrior
 from jeit.inverse.shapes import KINDS, LEAST_RISE, EllipsoidPrior, ShapeReconstruction, reconstruct_shapes
 from jeit.mesh import Body
@@ -70,7 +70,7 @@ class ImagingSettings:
     """
 
     method: str = AUTO
-    prior: str | AbstractPrior = MEASURED
+    prior: str | AbstractPrior = MEASURED_DATA_PRIOR
     hyperparameter: float | str | None = None
     contact: str | None = None
     num_points: int | None = None
@@ -97,7 +97,7 @@ class ImagingSettings:
             if isinstance(self.hyperparameter, str) and (number := METHODS[self.method].number) is not None:
                 name = self.method.replace("-", " ").replace("back ", "back-")
                 raise ValueError(f"hyperparameter: {name} takes a number such as {number:g}, not a rule.")
-        if self.bodies != KINDS[0] and (self.method not in (AUTO, "shapes") or self.prior != MEASURED):
+        if self.bodies != KINDS[0] and (self.method not in (AUTO, "shapes") or self.prior != MEASURED_DATA_PRIOR):
             raise ValueError(
                 "bodies: only methods 'auto' and 'shapes' with the default prior look for any; leave it out."
             )
@@ -293,7 +293,9 @@ def shapes_in(prepared: PreparedDifference, smooth: Reconstruction, options: Met
 
 
 def _shapes(prepared: PreparedDifference, options: MethodOptions) -> Imaged:
-    smooth, _ = _iterative_image(prepared, MethodOptions(MEASURED, ITERATED), solver=_GAUSS_NEWTON)
+    smooth, _ = _iterative_image(
+        prepared, MethodOptions(MEASURED_DATA_PRIOR, GAUSS_NEWTON_HYPERPARAMETER), solver=_GAUSS_NEWTON
+    )
     assert isinstance(smooth, Reconstruction)
     return of_shapes(prepared, shapes_in(prepared, smooth, options))
 
@@ -306,12 +308,16 @@ def of_shapes(prepared: PreparedDifference, shapes: ShapeReconstruction) -> Imag
 
 _GAUSS_NEWTON, _LEVENBERG_MARQUARDT = GaussNewton(100, 1e-4), LevenbergMarquardt(100, 1e-4)
 METHODS: dict[str, Method] = {
-    "one-step": Method(_one_step, takes_prior=True, hyperparameter=RULE),
+    "one-step": Method(_one_step, takes_prior=True, hyperparameter=DEFAULT_RULE),
     "back-projection": Method(partial(_back_projection, filtered=False), takes_hyperparameter=False),
     "filtered-back-projection": Method(partial(_back_projection, filtered=True), number=0.05),
-    "gauss-newton": Method(partial(_iterative_image, solver=_GAUSS_NEWTON), takes_prior=True, hyperparameter=ITERATED),
+    "gauss-newton": Method(
+        partial(_iterative_image, solver=_GAUSS_NEWTON), takes_prior=True, hyperparameter=GAUSS_NEWTON_HYPERPARAMETER
+    ),
     "levenberg-marquardt": Method(
-        partial(_iterative_image, solver=_LEVENBERG_MARQUARDT), takes_prior=True, hyperparameter=ITERATED
+        partial(_iterative_image, solver=_LEVENBERG_MARQUARDT),
+        takes_prior=True,
+        hyperparameter=GAUSS_NEWTON_HYPERPARAMETER,
     ),
     "total-variation": Method(
         partial(_iterative_image, solver=_GAUSS_NEWTON, own_prior=TotalVariation()),

@@ -27,7 +27,7 @@ from jeit.inverse import Imager
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.nonlinear import GaussNewton
 from jeit.inverse.nonlinear.solvers import AbstractSolver, as_solver
-from jeit.inverse.prior.matern import MEASURED
+from jeit.inverse.prior.matern import MEASURED_DATA_PRIOR
 from jeit.inverse.streaming.imager import check_memory
 
 # Default number of mesh nodes for bodies without a mesh of their own.
@@ -62,7 +62,7 @@ class StreamSettings:
 
     solver: AbstractSolver | str = field(default_factory=GaussNewton)
     max_steps: int | None = None
-    prior: NamedPrior = MEASURED
+    prior: NamedPrior = MEASURED_DATA_PRIOR
     hyperparameter: float | str | None = None
     memory: float = 0.0
     contact: str | None = None

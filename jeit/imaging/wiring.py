@@ -35,7 +35,7 @@ def exchanges_message(frame: Measurement, reference: Measurement) -> str:
     """Describe in a sentence which drives, or which measurements of every drive, seem exchanged in a frame, numbered
     from 1. The sentence is empty if no exchanges halve the frame's difference from the reference, or if not all drives
     have the same measurements."""
-    order = _order(frame)
+    order = _channel_index(frame)
     if order is None:
         return ""
     usable = (np.asarray(frame.mask)[0] & np.asarray(reference.mask)[0])[order]
@@ -59,7 +59,7 @@ def exchanges_message(frame: Measurement, reference: Measurement) -> str:
     )
 
 
-def _order(frame: Measurement) -> np.ndarray | None:
+def _channel_index(frame: Measurement) -> np.ndarray | None:
     """Index of the channel of each drive and measurement, (drives, measurements); None if a drive lacks a
     measurement."""
     drive, measurement = (np.asarray(index) for index in (frame.protocol.drive_index, frame.protocol.measurement_index))
@@ -97,7 +97,7 @@ MOST_MISFIT = 0.15
 _MAX_STEP_RATIO, _MAX_WIRING_RATIO = 0.85, 0.6
 _MAX_ELECTRODE_EXCHANGES = 4
 # Relative misfit of the empty body above which imaging is refused even if no other wiring explains the frame.
-_HOPELESS = 0.5
+_MAX_MISFIT = 0.5
 # Trial contact impedances, multiplied by the conductivity and divided by the size of the body: from negligible to
 # dominant.
 _RELATIVE_CONTACTS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
@@ -131,7 +131,7 @@ class Wiring:
     @property
     def fault(self) -> str:
         """The fault of the wiring, in a sentence; empty if the wiring has no fault that prevents imaging."""
-        if self.explanation or self.described < _HOPELESS:
+        if self.explanation or self.described < _MAX_MISFIT:
             return self.explanation
         return (
             f"the model misses {percent(self.described)} of it, and no order of channels, sign, or exchange of a few "
@@ -186,10 +186,10 @@ def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
     described_misfit = 1.0 if compared.reversed_signs else compared.misfit
     if compared.misfit < MOST_MISFIT:  # as described, except possibly for the sign
         return replace(compared, described=described_misfit)
-    best_wiring = _explained(misfit_of, described_wiring, compared, orders)
+    best_wiring = _better_wiring(misfit_of, described_wiring, compared, orders)
     if (has_one_sign := _has_one_sign(model, measurement)) is not None:
         misfit_of = _comparison(model, measurement, orders, signs=False)
-        unsigned_wiring = _explained(misfit_of, described_wiring, misfit_of(described_wiring), orders)
+        unsigned_wiring = _better_wiring(misfit_of, described_wiring, misfit_of(described_wiring), orders)
         if unsigned_wiring.misfit < _MAX_STEP_RATIO * best_wiring.misfit:
             best_wiring = replace(unsigned_wiring, magnitudes=has_one_sign)
     best_wiring = (
@@ -200,7 +200,7 @@ def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
     return replace(best_wiring, described=described_misfit)
 
 
-def _explained(
+def _better_wiring(
     misfit_of: Callable[[Wiring], Wiring], described_wiring: Wiring, best_wiring: Wiring, orders: Iterable[str]
 ) -> Wiring:
     """Return the wiring that explains a frame far better than `best_wiring`, the described wiring with its misfit, or
@@ -226,7 +226,7 @@ def _explained(
         return best_wiring
 
     best_wiring = with_exchanges(best_of([replace(described_wiring, order=order) for order in orders], best_wiring))
-    turned_wirings = [Wiring(places, order) for places in _turns(num_electrodes) for order in orders]
+    turned_wirings = [Wiring(places, order) for places in _rotated_places(num_electrodes) for order in orders]
     return best_of([with_exchanges(best_of(turned_wirings, misfit_of(described_wiring)))], best_wiring)
 
 
@@ -311,7 +311,7 @@ def _impedances(model: ForwardModel) -> list[Float[np.ndarray, "L L"]]:
     return [np.asarray(model.transfer_impedance(1.0)) for model in models]
 
 
-def _turns(num_electrodes: int) -> Iterator[tuple[int, ...]]:
+def _rotated_places(num_electrodes: int) -> Iterator[tuple[int, ...]]:
     """Yield the places of electrodes that are counted from any first electrode in either direction, except in the
     described order."""
     for shift in range(num_electrodes):
@@ -328,7 +328,7 @@ def _exchange_places(places: tuple[int, ...], first: int, second: int) -> tuple[
 
 def _exchange_text(places: tuple[int, ...], cycles: list[list[int]]) -> str:
     """Description of exchanged electrodes, in words."""
-    if cycles and places in _turns(len(places)):
+    if cycles and places in _rotated_places(len(places)):
         direction = "from another one" if (places[1] - places[0]) % len(places) == 1 else "the other way round"
         first = f", electrode 1 standing where {places[0] + 1} should" if places[0] else ""
         return f"the electrodes look counted {direction}{first}"

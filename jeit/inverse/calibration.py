@@ -13,7 +13,7 @@ import optimistix as optx
 import scipy
 from jaxtyping import Array, Bool, Float, Inexact, Int
 
-from jeit.arguments import brief, check_name, percent
+from jeit.arguments import check_name, object_text, percent
 from jeit.forward import ForwardModel
 from jeit.forward.changes import ContactSensitivity
 from jeit.forward.model import check_model, select_channels
@@ -25,7 +25,7 @@ from jeit_solvers.module import Module
 
 # Logarithm of the ratio of a contact impedance to the model's, beyond which the impedance no longer changes the
 # voltages.
-FARTHEST = 50.0
+MAX_LOG_RATIO = 50.0
 # Tolerance of the parameters and the misfit in a fit inside jax.jit, jax.grad or jax.vmap: as small as double precision
 # allows.
 _TRACED_TOLERANCE = 1e-12
@@ -78,7 +78,7 @@ def _fitted_model(contact: str, parameters, model: ForwardModel) -> tuple[Forwar
     conductivity = jnp.exp(parameters[0])
     if contact == "fixed":
         return model, conductivity
-    factor = jnp.exp(jnp.clip(parameters[1:] - parameters[0], -FARTHEST, FARTHEST))
+    factor = jnp.exp(jnp.clip(parameters[1:] - parameters[0], -MAX_LOG_RATIO, MAX_LOG_RATIO))
     impedance = model.electrodes.contact_impedance * factor
     return model.with_electrodes(model.electrodes.with_contact_impedance(impedance)), conductivity
 
@@ -159,7 +159,7 @@ class Calibration(Module):
     model_error: Any = None
 
     def __repr__(self) -> str:
-        return brief(
+        return object_text(
             lambda: (
                 f"Calibration({self.status}: conductivity {complex(self.conductivity).real:.3g}, "
                 f"misfit {percent(float(self.misfit))},\n  {type(self.model.electrodes).__name__}, {self.model.mesh!r})"
@@ -374,7 +374,7 @@ class _CalibrationProblem:
         if self.contact == "fixed":
             return self.initial_model, conductivity
         electrodes = self.initial_model.electrodes
-        factor = np.exp(np.clip(parameters[self.first_contact :] - parameters[0], -FARTHEST, FARTHEST))
+        factor = np.exp(np.clip(parameters[self.first_contact :] - parameters[0], -MAX_LOG_RATIO, MAX_LOG_RATIO))
         impedance = np.asarray(electrodes.contact_impedance) * factor
         return self.initial_model.with_electrodes(electrodes.with_contact_impedance(impedance)), conductivity
 

@@ -23,7 +23,7 @@ from jeit.arguments import check_has_values
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model, evaluate, field_products, fields_and_impedance_of, jacobian_blocks
 from jeit.forward.system import check_conductivity
-from jeit.inverse.prior.matern import PRIOR
+from jeit.inverse.prior.matern import DEFAULT_PRIOR
 from jeit.inverse.prior.priors import AbstractPrior, check_prior
 from jeit.inverse.spectrum import Spectrum
 from jeit.protocol import Protocol
@@ -103,7 +103,7 @@ class Linearisation(Module):
     ) -> "Linearisation":
         """Linearise the problem at `conductivity`, S/m (2-D: S); arguments as in `one_step`. Raises `ValueError` for
         invalid or inconsistent arguments."""
-        prior = PRIOR if prior is None else prior
+        prior = DEFAULT_PRIOR if prior is None else prior
         check_model(model)
         check_prior(prior)
         if not prior.is_quadratic:

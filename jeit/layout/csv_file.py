@@ -13,9 +13,9 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import describe, listed
+from jeit.arguments import describe, names_text
 from jeit.files import check_electrodes, read_as, read_text
-from jeit.layout.layout import LARGEST, SMALLEST, Layout, bounds, check_discs_fit
+from jeit.layout.layout import MAX_SKIN_SIZE, MIN_SKIN_SIZE, Layout, bounds, check_discs_fit
 from jeit.layout.surface_layout import SurfaceLayout
 from jeit.mesh import Domain, Mesh
 
@@ -123,14 +123,14 @@ def _check_unit(centres: np.ndarray, diameters: np.ndarray, titles: list[str]) -
     """Raise `ValueError` for lengths that are implausible in the unit that the titles of the columns state."""
     x_min, x_max, y_min, y_max = bounds(centres, diameters)
     size = max(x_max - x_min, y_max - y_min)
-    if size < SMALLEST:
+    if size < MIN_SKIN_SIZE:
         raise ValueError(
-            f"the electrodes would span {1e3 * size:.3g} mm under the columns {listed(titles)}; if the values are "
+            f"the electrodes would span {1e3 * size:.3g} mm under the columns {names_text(titles)}; if the values are "
             "in metres, multiply them by 1000 and call the columns x_mm, y_mm, diameter_mm."
         )
-    if size > LARGEST:
+    if size > MAX_SKIN_SIZE:
         raise ValueError(
-            f"the electrodes would span {size:.3g} m under the columns {listed(titles)}; if the values are in "
+            f"the electrodes would span {size:.3g} m under the columns {names_text(titles)}; if the values are in "
             "millimetres, call the columns x_mm, y_mm, diameter_mm."
         )
 

@@ -9,7 +9,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from jeit.arguments import listed
+from jeit.arguments import names_text
 from jeit.arguments.extras import optional
 from jeit.files import check_electrodes, check_size, read_as
 from jeit.layout.csv_file import MOST_BYTES
@@ -90,7 +90,7 @@ def read_dxf(path: Path, outline: Domain | None) -> Layout:
     if not layer_entities[_ELECTRODE_LAYER]:
         raise ValueError(
             f"nothing is drawn on the layer {_ELECTRODE_LAYER}, where electrodes are circles; "
-            f"the layers in use are {listed(sorted({layer for layer, _ in model_space}))}."
+            f"the layers in use are {names_text(sorted({layer for layer, _ in model_space}))}."
         )
     check_electrodes("the drawing", len(layer_entities[_ELECTRODE_LAYER]))
     with read_as("this is not a DXF drawing that is read"):
@@ -108,7 +108,7 @@ def read_dxf(path: Path, outline: Domain | None) -> Layout:
         inside = np.linalg.norm(centre - text_positions, axis=-1) <= radius
         electrode_labels = [texts[index].text for index in np.flatnonzero(inside)]
         if len(electrode_labels) > 1:
-            raise ValueError(f"electrode {electrode} has several labels: {listed(map(repr, electrode_labels))}.")
+            raise ValueError(f"electrode {electrode} has several labels: {names_text(map(repr, electrode_labels))}.")
         labels += electrode_labels or [str(electrode)]
     drawn_outline = _outline_of_entities(entities[_OUTLINE_LAYER], unit)
     return Layout(centres, 2 * radii, outline=drawn_outline or outline, labels=labels, name=path.stem)

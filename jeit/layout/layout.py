@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import brief, page, picture
+from jeit.arguments import object_html, object_text, picture
 from jeit.electrodes.discs import SheetDiscs
 from jeit.electrodes.electrodes import as_electrode_values, as_positions
 from jeit.mesh import Domain
@@ -38,7 +38,7 @@ def check_labels(labels: Sequence[str] | None, num_electrodes: int) -> tuple[str
 
 # Minimum and maximum size of a skin: outside this range, lengths are probably in millimetres, or have been divided by
 # 1000 twice.
-SMALLEST, LARGEST = 1e-3, 5.0  # m
+MIN_SKIN_SIZE, MAX_SKIN_SIZE = 1e-3, 5.0  # m
 # Tolerance for discs that overlap or extend beyond the outline, since lengths are rounded to decimal millimetres in
 # files.
 _ROUNDING = 1e-9  # m
@@ -73,7 +73,7 @@ class Layout(Module):
     name: str = eqx.field(static=True)
 
     def __repr__(self) -> str:
-        return brief(
+        return object_text(
             lambda: f"Layout({self.name!r}: {len(self.centres)} electrodes)",
             self,
         )
@@ -82,7 +82,7 @@ class Layout(Module):
         return picture(self)
 
     def _repr_html_(self) -> str | None:
-        return page(self)
+        return object_html(self)
 
     def __init__(
         self,
@@ -177,7 +177,7 @@ def check_discs_fit(
     index = int(clearances.argmin())
     if clearances[index] < -_ROUNDING:
         hint = ""
-        if (np.abs(centres) > LARGEST).any() and bool((outline.signed_distance(centres / 1000) > 0).all()):
+        if (np.abs(centres) > MAX_SKIN_SIZE).any() and bool((outline.signed_distance(centres / 1000) > 0).all()):
             hint = " Are they in millimetres? Divide by 1000."
         elif diameters[index] > size:
             hint = " Is its diameter in metres?"
@@ -191,7 +191,7 @@ def check_discs_fit(
 
 def check_size(size: float) -> None:
     """Raise `ValueError` for an implausible `size` of a skin, metres."""
-    if not SMALLEST - _ROUNDING <= size <= LARGEST + _ROUNDING:
+    if not MIN_SKIN_SIZE - _ROUNDING <= size <= MAX_SKIN_SIZE + _ROUNDING:
         raise ValueError(
             f"centres: the skin would be {_length_text(size)} across; are millimetres taken for metres, or metres for "
             "millimetres? Lengths differ by a factor of 1000."
@@ -199,7 +199,7 @@ def check_size(size: float) -> None:
 
 
 def _length_text(length: float) -> str:
-    return f"{length:.3g} m" if length > LARGEST else f"{1e3 * length:.3g} mm"
+    return f"{length:.3g} m" if length > MAX_SKIN_SIZE else f"{1e3 * length:.3g} mm"
 
 
 def bounds(centres: np.ndarray, diameters: np.ndarray) -> tuple[float, float, float, float]:

@@ -21,8 +21,8 @@ from jeit.mesh import Disk, Domain, Polygon
 # however long it is.
 NUMBER = r"[-+]?+(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?+\d++)?+"
 # Maximum number in a drawing, so that its square can still be computed after transforms.
-LARGEST = 1e30
-ROUND = ("circle", "ellipse")
+MAX_NUMBER = 1e30
+ROUND_TAGS = ("circle", "ellipse")
 
 
 def transform_of(element: ElementTree.Element) -> np.ndarray:
@@ -53,7 +53,7 @@ def transform_of(element: ElementTree.Element) -> np.ndarray:
                     "translate, scale and rotate."
                 )
         matrix = compose_transforms(matrix, step)
-    if not (np.abs(matrix) < LARGEST).all():
+    if not (np.abs(matrix) < MAX_NUMBER).all():
         raise ValueError(f"transform of {describe_element(element)} is too large for a drawing.")
     return matrix
 
@@ -87,7 +87,7 @@ def number_of(element: ElementTree.Element, name: str, text: str | None) -> floa
     if text is None or re.fullmatch(NUMBER, text.strip()) is None:
         raise ValueError(f"{name} of {describe_element(element)} is {describe(text)}, not a number.")
     value = float(text)
-    if not abs(value) < LARGEST:
+    if not abs(value) < MAX_NUMBER:
         raise ValueError(f"{name} of {describe_element(element)} is {describe(text)}, too large for a drawing.")
     return value
 
@@ -95,7 +95,7 @@ def number_of(element: ElementTree.Element, name: str, text: str | None) -> floa
 def disc_of(element: ElementTree.Element, matrix: np.ndarray) -> tuple[float, float, float]:
     """Centre and radius of a circle in metres, with y up. `matrix`: matrix (2, 3) to metres. Raises `ValueError` if the
     element is not a circle."""
-    if tag_of(element) not in ROUND:
+    if tag_of(element) not in ROUND_TAGS:
         raise ValueError(f"{describe_element(element)} stands where a circle should: electrodes are circles.")
     x, y = (number_of(element, name, element.get(name, "0")) for name in ("cx", "cy"))
     names = ("r", "r") if tag_of(element) == "circle" else ("rx", "ry")
@@ -224,7 +224,7 @@ def read_svg(path: Path, outline: Domain | None) -> Layout:
     electrodes = [
         (element, matrix)
         for element, role, matrix in shapes
-        if role == electrode_role and (electrode_role or tag_of(element) in ROUND)
+        if role == electrode_role and (electrode_role or tag_of(element) in ROUND_TAGS)
     ]
     if not electrodes:
         raise ValueError("there is no circle in the drawing; electrodes are circles, in a group ELECTRODES or all.")
@@ -293,7 +293,7 @@ def _drawn_shapes(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Eleme
         role = next((name for name in _GROUP_NAMES if name in {text.upper() for text in names}), role)
         if "transform" in element.attrib:
             matrix = compose_transforms(matrix, transform_of(element))
-            if not (np.abs(matrix) < LARGEST).all():
+            if not (np.abs(matrix) < MAX_NUMBER).all():
                 raise ValueError(f"transforms about {describe_element(element)} are too large for a drawing.")
         if tag in _GROUP_TAGS:
             stack += [(child, role, matrix) for child in reversed(element)]
@@ -335,7 +335,7 @@ def _style(element: ElementTree.Element) -> str:
 def _outline_of_shapes(drawn: list[tuple[ElementTree.Element, np.ndarray]]) -> Domain:
     """Outline from the content of the group OUTLINE: a single circle, or shapes with straight sides, of which the
     largest is the skin and others are holes."""
-    if len(drawn) == 1 and tag_of(drawn[0][0]) in ROUND:
+    if len(drawn) == 1 and tag_of(drawn[0][0]) in ROUND_TAGS:
         x, y, radius = disc_of(*drawn[0])
         return Disk(radius, (x, y))
     loops = [transform_points(loop, to) for one, to in drawn for loop in loops_of(one)]

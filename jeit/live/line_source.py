@@ -31,7 +31,7 @@ _DEFAULT_BAUD, _MAX_BAUD = 115_200, 20_000_000
 # reported comments of a device.
 _READ_TIMEOUT, _INITIAL_DELAY, _MAX_DELAY, _SILENCE_TIMEOUT, _MIN_NOTE_INTERVAL = 0.2, 0.25, 2.0, 3.0, 2.0
 # Maximum number of frames that wait until the program reads them.
-_MAX_AHEAD = 20_000
+_MAX_WAITING_FRAMES = 20_000
 
 
 class AbstractConnection(abc.ABC):
@@ -323,7 +323,7 @@ class ReadAhead(AbstractSource):
 
         try:
             for frame in self._source:
-                if self._queue.qsize() >= _MAX_AHEAD:
+                if self._queue.qsize() >= _MAX_WAITING_FRAMES:
                     num_lost += 1
                     continue
                 report_loss()

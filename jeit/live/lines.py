@@ -22,12 +22,12 @@ MAX_LINE_BYTES = 2**18
 _LINE_ENDS = re.compile(rb"[\r\n]")
 # Some OpenEIT devices send no line ends, so a frame begins at the word "magnitudes".
 _FRAME_WORD = re.compile(rb"magnitudes\s{0,40}:", re.IGNORECASE)
-_COMMENTS = ("#", "%", "//")
+_COMMENT_PREFIXES = ("#", "%", "//")
 # Maximum number of characters that are stored of a line that is not a frame.
 _MAX_TEXT_LENGTH = 400
 # Maximum relative difference from the reference for which a number is considered complete, and for which a frame is
 # used to determine the factors from numbers to volts; maximum number of frames from which the factors are determined.
-_MAX_DIFFERENCE, _MAX_TRIES = 0.5, 20
+_MAX_DIFFERENCE, _MAX_FACTOR_FRAMES = 0.5, 20
 
 
 class LineBuffer:
@@ -99,7 +99,7 @@ class LineReading:
         self.has_times = layout is None or layout.time_column is not False
         self.note = ""
         self._parse_numbers = LineNumbers()
-        self._channel_factors, self._num_tries = np.ones(self.channels or 1), 0
+        self._channel_factors, self._num_factor_frames = np.ones(self.channels or 1), 0
         self._known_factors: np.ndarray | None = None
 
     def begins_whole(self, values: np.ndarray) -> bool:
@@ -115,7 +115,7 @@ class LineReading:
     def __call__(self, line: bytes) -> Float[np.ndarray, " M"] | str | None:
         """Return the frame in a line; the text of the line, shortened, if it is not a frame; None for a comment."""
         text = line.decode("utf-8", "replace").replace("\x00", "\ufffd").strip()
-        if text.startswith(_COMMENTS):
+        if text.startswith(_COMMENT_PREFIXES):
             self.note = text[:_MAX_TEXT_LENGTH]
             return None
         word = _FRAME_WORD.match(line.strip())
@@ -134,9 +134,9 @@ class LineReading:
     def _volts_per_number(self, row: np.ndarray, word: str) -> Float[np.ndarray, " M"]:
         """Return the factor from number to volts of each channel. Each frame `row` determines the factors of the
         channels that the reader of files does not mask, until all factors are known."""
-        if self._num_tries >= _MAX_TRIES:
+        if self._num_factor_frames >= _MAX_FACTOR_FRAMES:
             return self._channel_factors
-        self._num_tries += 1
+        self._num_factor_frames += 1
         is_nonzero, volts = np.isfinite(row) & (row != 0), row
         if not is_nonzero.any():
             return self._channel_factors
@@ -144,9 +144,9 @@ class LineReading:
             volts = self._read_volts(row, word)
         except (ValueError, OSError) as error:  # for example a full disk
             self.note = f"The numbers of a line are taken for volts, for as a file they cannot be read: {error}"
-            self._num_tries = _MAX_TRIES
+            self._num_factor_frames = _MAX_FACTOR_FRAMES
         factors = np.where(is_nonzero, volts / np.where(is_nonzero, row, 1.0), np.nan)
-        if self._resembles_reference(volts) or self._num_tries >= _MAX_TRIES:
+        if self._resembles_reference(volts) or self._num_factor_frames >= _MAX_FACTOR_FRAMES:
             self._known_factors = (
                 factors
                 if self._known_factors is None
@@ -154,7 +154,7 @@ class LineReading:
             )
             factors = self._known_factors
         if np.isfinite(factors).all() and self._known_factors is not None:
-            self._num_tries = _MAX_TRIES
+            self._num_factor_frames = _MAX_FACTOR_FRAMES
         self._channel_factors = self._fill_factors(factors, row)
         return self._channel_factors
 

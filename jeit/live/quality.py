@@ -127,7 +127,7 @@ class QualityWatch:
             past_medians = np.array(self._medians)
         is_readable = np.isfinite(expected) & (expected != 0)
         change = np.abs(medians - expected) / np.abs(np.where(is_readable, expected, 1.0))
-        dead_electrodes = _find_dead(~is_known | (change > _LOST_DIFFERENCE), is_readable, self.touching)
+        dead_electrodes = _find_dead_electrodes(~is_known | (change > _LOST_DIFFERENCE), is_readable, self.touching)
         if len(past_medians) < _NUM_MEDIANS // 2:
             return Quality(noise, reciprocity, dead_electrodes)
         has_drift_data = (
@@ -137,7 +137,9 @@ class QualityWatch:
         drift[has_drift_data] = np.median(
             np.abs(past_medians[:, has_drift_data] / expected[has_drift_data] - 1), axis=0
         )
-        return Quality(noise, reciprocity, dead_electrodes, _find_drifting(drift, has_drift_data, self.touching))
+        return Quality(
+            noise, reciprocity, dead_electrodes, _find_drifting_electrodes(drift, has_drift_data, self.touching)
+        )
 
 
 class RateWatch:
@@ -175,7 +177,7 @@ def _relative_noise(frames: Float[np.ndarray, "F M"]) -> float | None:
     return float(1.4826 * np.median(np.abs(second_differences)) / np.sqrt(6) / rms)
 
 
-def _find_dead(
+def _find_dead_electrodes(
     is_lost: Bool[np.ndarray, " M"], is_readable: Bool[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
 ) -> list[int]:
     """Find the electrodes most of whose readings are lost. The electrode with the largest fraction of lost readings is
@@ -196,7 +198,7 @@ def _find_dead(
     return sorted(dead_electrodes)
 
 
-def _find_drifting(
+def _find_drifting_electrodes(
     drift: Float[np.ndarray, " M"], has_drift_data: Bool[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
 ) -> list[int]:
     """Find the electrodes whose readings have a large `drift`, much larger than that of the readings of other

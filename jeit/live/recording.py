@@ -63,7 +63,7 @@ class Recorder:
 
     def __init__(self, folder: str | Path, *, reference: Measurement | None = None):
         self.folder, self.reference = Path(folder), reference
-        self._changed = threading.Condition()
+        self._condition = threading.Condition()
         self._lines: deque[tuple[str, bytes]] = deque()
         self._waiting_bytes = self._num_lost = 0
         self._problem = ""
@@ -82,7 +82,7 @@ class Recorder:
         folder = _new_folder(self.folder)
         if self.reference is not None:
             _write_reference(self.reference, folder)
-        with self._changed:
+        with self._condition:
             self._files, self._ending, self._problem = _RecordingFiles(folder), False, ""
             self._num_lost = 0
             self._last_microsecond, self._frame_length = -1, self._num_channels
@@ -98,13 +98,13 @@ class Recorder:
     def stop(self) -> str:
         """End the recording, and wait until all frames are written, for at most ten seconds. Returns a sentence for the
         user; an empty string if no recording was in progress."""
-        with self._changed:
+        with self._condition:
             thread, files, self._ending = self._thread, self._files, True
-            self._changed.notify_all()
+            self._condition.notify_all()
         if thread is None or files is None:
             return ""
         thread.join(_END_TIMEOUT)
-        with self._changed:
+        with self._condition:
             self._files = self._thread = None
             num_lost = self._num_lost + len(self._lines)
             self._lines.clear()
@@ -171,7 +171,7 @@ class Recorder:
     def state(self) -> dict[str, Any] | None:
         """Folder of the recording in progress, numbers of frames and bytes written, and problem, if any; None if no
         recording is in progress."""
-        with self._changed:
+        with self._condition:
             files = self._files
             if files is None:
                 return None
@@ -183,7 +183,7 @@ class Recorder:
             }
 
     def _queue_line(self, name: str, line: bytes) -> None:
-        with self._changed:
+        with self._condition:
             if self._waiting_bytes + len(line) > _MAX_WAITING_BYTES:
                 self._num_lost += 1
                 self._problem = (
@@ -192,7 +192,7 @@ class Recorder:
                 return
             self._lines.append((name, line))
             self._waiting_bytes += len(line)
-            self._changed.notify_all()
+            self._condition.notify_all()
 
     def _write_lines(self, files: _RecordingFiles) -> None:
         sync_time = time.monotonic()
@@ -200,13 +200,13 @@ class Recorder:
             try:
                 files.write(*queued_line)
             except OSError as error:
-                with self._changed:
+                with self._condition:
                     if self._is_ending(files):
                         break
                     self._problem = _describe_error(error)
-                    self._changed.wait_for(lambda: self._is_ending(files), _RETRY_PERIOD)
+                    self._condition.wait_for(lambda: self._is_ending(files), _RETRY_PERIOD)
                 continue
-            with self._changed:
+            with self._condition:
                 if self._files is not files:  # the recording was ended before the line was written
                     break
                 self._lines.popleft()
@@ -221,11 +221,11 @@ class Recorder:
     def _next_line(self, files: _RecordingFiles) -> tuple[str, bytes] | None:
         """Wait for a line to write, and return the line without removing it from the queue; None when the recording
         ends."""
-        with self._changed:
+        with self._condition:
             while not self._lines or self._files is not files:
                 if self._is_ending(files):
                     return None
-                self._changed.wait(_SYNC_PERIOD)
+                self._condition.wait(_SYNC_PERIOD)
             return self._lines[0]
 
     def _is_ending(self, files: _RecordingFiles) -> bool:

@@ -96,7 +96,7 @@ class Session:
         self._num_channels = None if reference is None else reference.num_channels
         self._frame_length = self._num_channels or 0
         self._num_other_lengths = 0
-        self._changed = threading.Condition()
+        self._condition = threading.Condition()
         self._waiting_frames: deque[LiveFrame] = deque()
         self._results: deque[Result] = deque()
         self._num_bytes = 0
@@ -142,34 +142,34 @@ class Session:
     def stop(self) -> None:
         """Close the source, and end the recording and the threads."""
         self.source.close()
-        with self._changed:
+        with self._condition:
             self._ended = True
-            self._changed.notify_all()
+            self._condition.notify_all()
         for thread in self._threads:
             thread.join(5.0)
         self.record(False)
 
     def wait(self) -> None:
         """Wait until the source has ended and its last frame is imaged."""
-        with self._changed:
+        with self._condition:
             while not self._finished:
-                self._changed.wait(0.5)
+                self._condition.wait(0.5)
 
     def newest(self, after: int, timeout: float) -> Result | None:
         """Return the newest result if its frame number is above `after`; otherwise wait for a newer result, at most
         `timeout` seconds. Returns None if no newer result arrives, or if the session has ended."""
         end = time.monotonic() + timeout
-        with self._changed:
+        with self._condition:
             while not (self._results and self._results[-1].frame.number > after):
                 remaining_time = end - time.monotonic()
                 if self._finished or remaining_time <= 0:
                     return None
-                self._changed.wait(min(remaining_time, 0.5))
+                self._condition.wait(min(remaining_time, 0.5))
             return self._results[-1]
 
     def result(self, number: int) -> Result | None:
         """Return the last stored result whose frame number is at most `number`; None if there is no such result."""
-        with self._changed:
+        with self._condition:
             for result in reversed(self._results):
                 if result.frame.number <= number:
                     return result
@@ -177,7 +177,7 @@ class Session:
 
     def with_events(self, result: Result, after: int) -> Result:
         """Add to `result` the events of earlier stored results whose frame number is above `after`."""
-        with self._changed:
+        with self._condition:
             skipped_results = [
                 skipped_result
                 for skipped_result in self._results
@@ -193,7 +193,7 @@ class Session:
             raise ValueError(
                 f"count must be a number of frames between 1 and {_MAX_REFERENCE_FRAMES:,}; it is {count}."
             )
-        with self._changed:
+        with self._condition:
             self._num_requested, self._collected_frames = count, []
 
     def mark(self, label: str) -> None:
@@ -228,7 +228,7 @@ class Session:
 
     def state(self) -> dict[str, Any]:
         """Counters, frame rate, latency, quality, connection, recording and messages, in types of JSON."""
-        with self._changed:
+        with self._condition:
             latencies = np.array(self._latencies)
             counters = {
                 "read": self._num_read,
@@ -263,7 +263,7 @@ class Session:
     def _frame_rate(self) -> float:
         """Frames/s in the last two seconds."""
         now = time.monotonic()
-        with self._changed:
+        with self._condition:
             recent = [arrival for arrival in self._arrivals if arrival > now - _RATE_SPAN]
         time_span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
         return (len(recent) - 1) / time_span if time_span > 0 else 0.0
@@ -277,7 +277,7 @@ class Session:
             for frame in self.source:
                 if self.recorder is not None:
                     self.recorder.add(frame)
-                with self._changed:
+                with self._condition:
                     self._num_read += 1
                     self._arrivals.append(frame.arrived)
                     self._waiting_frames.append(frame)
@@ -286,14 +286,14 @@ class Session:
                         self._num_dropped += 1
                     self._quality_watch.add(frame)
                     self._collect_reference_frame(frame)
-                    self._changed.notify_all()
+                    self._condition.notify_all()
                 self._compare_length(frame)
         except Exception as error:  # devices and files raise errors of many types; the page reports the errors
             self.say(f"The source failed: {error}")
         finally:
-            with self._changed:
+            with self._condition:
                 self._ended = True
-                self._changed.notify_all()
+                self._condition.notify_all()
 
     def _compare_length(self, frame: LiveFrame) -> None:
         """Report a lasting change of the number of channels of the frames."""
@@ -313,7 +313,7 @@ class Session:
             except Exception as error:  # an error here must not end the session
                 self.say(f"Noise and electrodes are no longer judged: {type(error).__name__}: {error}")
                 return
-            with self._changed:
+            with self._condition:
                 self._quality = quality
             if sentence := self._rate_watch(self._frame_rate()):
                 self.say(sentence)
@@ -332,11 +332,11 @@ class Session:
 
     def _next_frame(self) -> LiveFrame | None:
         """Wait for the next frame to image, and return it; None at the end."""
-        with self._changed:
+        with self._condition:
             while not self._waiting_frames:
                 if self._ended:
                     return None
-                self._changed.wait(0.5)
+                self._condition.wait(0.5)
             oldest_arrival = time.monotonic() - _MAX_WAIT
             while len(self._waiting_frames) > 1 and self._waiting_frames[0].arrived < oldest_arrival:
                 self._waiting_frames.popleft()
@@ -352,16 +352,16 @@ class Session:
                 picture = Picture(None, status=FrameStatus.REFUSED, reason=f"{type(error).__name__}: {error}"[:300])
             self._publish_result(Result(frame, picture, time.monotonic() - frame.arrived))
         self._closed.set()
-        with self._changed:
+        with self._condition:
             if self._num_requested:
                 self._messages.append(
                     (time.monotonic() - self.source.begun, "The source ended before a new reference.")
                 )
             self._finished = True
-            self._changed.notify_all()
+            self._condition.notify_all()
 
     def _set_reference(self) -> None:
-        with self._changed:
+        with self._condition:
             frames, self._reference = self._reference, None
         if frames is None:
             return
@@ -382,7 +382,7 @@ class Session:
         self.say(f"New reference: mean of {counted(len(frames), 'frame')}.")
 
     def _publish_result(self, result: Result) -> None:
-        with self._changed:
+        with self._condition:
             self._results.append(result)
             self._num_bytes += _result_size(result)
             oldest_arrival = result.frame.arrived - self.history
@@ -399,7 +399,7 @@ class Session:
                 self._count_reason(result.picture.reason)
             else:
                 self._statuses[result.picture.status] += 1
-            self._changed.notify_all()
+            self._condition.notify_all()
         for event in result.picture.events:
             self.say(event)
 

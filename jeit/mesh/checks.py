@@ -186,7 +186,7 @@ def _match_facets(name: str, nodes: np.ndarray, facets: np.ndarray) -> np.ndarra
     return order[facet_positions]
 
 
-LARGE = 10.0
+MAX_PLAUSIBLE_SIZE = 10.0
 """Size in metres above which a warning is issued: no tank or skin is larger."""
 _SIZE_CHECKED: ContextVar[bool] = ContextVar("size_checked", default=False)
 
@@ -208,7 +208,7 @@ def warn_large(extent: float, name: str, size_factor: float = 1.0, *, of_file: b
     `size_factor`: size of the object divided by `extent`; `of_file`: whether the length may come from a file; if so,
     the message suggests a scale. No warning is issued inside `size_checked`.
     """
-    if not size_factor * extent > LARGE or _SIZE_CHECKED.get():
+    if not size_factor * extent > MAX_PLAUSIBLE_SIZE or _SIZE_CHECKED.get():
         return
     scale_hints = [
         f" (a file is read with scale={unit_scale})" if of_file else "" for unit_scale in ("1e-3", "1e-2", "0.0254")

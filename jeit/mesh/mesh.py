@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import brief, page, picture
+from jeit.arguments import object_html, object_text, picture
 from jeit.mesh import checks, topology
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace
 from jeit_solvers.module import Module
@@ -46,7 +46,7 @@ class Mesh(Module):
     tags: dict[str, Int[Array, " t"]]
 
     def __repr__(self) -> str:
-        return brief(
+        return object_text(
             lambda: (
                 f"Mesh({self.num_points} nodes, {self.num_cells} cells, {self.dimension}-D"
                 + (f", {len(self.tags)} groups of facets)" if self.tags else ")")
@@ -58,7 +58,7 @@ class Mesh(Module):
         return picture(self)
 
     def _repr_html_(self) -> str | None:
-        return page(self)
+        return object_html(self)
 
     @property
     def dimension(self) -> int:

@@ -153,14 +153,18 @@ def check_loop(vertices: ArrayLike, name: str, *, clockwise: bool) -> np.ndarray
 def check_apart(outer: np.ndarray, holes: Sequence[np.ndarray]) -> None:
     """Raise `ValueError` unless every hole lies inside the outline and is separate from the other holes."""
     for k, hole in enumerate(holes):
-        if not inside(hole, [outer]).all() or _touches(hole, outer):
+        if not is_inside_loops(hole, [outer]).all() or _touches(hole, outer):
             raise ValueError(f"holes[{k}]: does not lie strictly inside the outline. Move or shrink it.")
         for j, other_hole in enumerate(holes[:k]):
-            if _touches(hole, other_hole) or inside(hole[:1], [other_hole])[0] or inside(other_hole[:1], [hole])[0]:
+            if (
+                _touches(hole, other_hole)
+                or is_inside_loops(hole[:1], [other_hole])[0]
+                or is_inside_loops(other_hole[:1], [hole])[0]
+            ):
                 raise ValueError(f"holes[{k}]: overlaps or touches holes[{j}]. Merge them into one hole.")
 
 
-def inside(points: np.ndarray, loops: Sequence[np.ndarray]) -> np.ndarray:
+def is_inside_loops(points: np.ndarray, loops: Sequence[np.ndarray]) -> np.ndarray:
     """Whether points (p, 2) lie inside an odd number of loops (even-odd rule), as booleans (p,)."""
     result = np.zeros(len(points), bool)
     x, y = points.T

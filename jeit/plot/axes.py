@@ -14,8 +14,8 @@ from matplotlib.transforms import ScaledTranslation
 from jeit.arguments import check_kind, describe, is_number
 from jeit_solvers.module import Module
 
-INK = "#26292e"
-SOFT = "#8b9098"
+DARK_GREY = "#26292e"
+LIGHT_GREY = "#8b9098"
 # Colour map of changes: red is more conductive, blue more resistive, and white no change.
 DIVERGING = "RdBu_r"
 SEQUENTIAL = "viridis"
@@ -69,8 +69,8 @@ def extent_of(points: np.ndarray) -> tuple[float, float, float, float]:
 def soften_axes(ax: Axes) -> None:
     """Style the axes of a graph: spines only at the left and at the bottom, in grey, and dark tick labels."""
     ax.spines[["top", "right"]].set_visible(False)
-    ax.spines[["left", "bottom"]].set_color(SOFT)
-    ax.tick_params(color=SOFT, labelcolor=INK, which="both")
+    ax.spines[["left", "bottom"]].set_color(LIGHT_GREY)
+    ax.tick_params(color=LIGHT_GREY, labelcolor=DARK_GREY, which="both")
 
 
 def draw_horizontal_grid(ax: Axes) -> None:
@@ -84,7 +84,7 @@ def draw_legend_above(ax: Axes) -> None:
     num_entries = len(ax.get_legend_handles_labels()[1])
     ax.autoscale_view()
     ax.set_ylim(0, ax.get_ylim()[1] * (1.02 + 0.08 * num_entries))
-    ax.legend(loc="upper right", frameon=False, labelcolor=INK, borderaxespad=0)
+    ax.legend(loc="upper right", frameon=False, labelcolor=DARK_GREY, borderaxespad=0)
 
 
 def draw_scale_bar(ax: Axes, extent: tuple[float, float, float, float]) -> None:
@@ -93,10 +93,10 @@ def draw_scale_bar(ax: Axes, extent: tuple[float, float, float, float]) -> None:
     size = max(x_max - x_min, y_max - y_min)
     length = _round_down(0.27 * (x_max - x_min))
     x, y = x_min - 0.06 * size, y_min - 0.125 * size
-    ax.plot([x, x + length], [y, y], color=INK, linewidth=2.5, solid_capstyle="butt")
+    ax.plot([x, x + length], [y, y], color=DARK_GREY, linewidth=2.5, solid_capstyle="butt")
     millimetres = 1e3 * length
     text_transform = ax.transData + ScaledTranslation(0, -3 / 72, ax.figure.dpi_scale_trans)
-    ax.text(x, y, f"{millimetres:g} mm", transform=text_transform, ha="left", va="top", color=INK, fontsize=9)
+    ax.text(x, y, f"{millimetres:g} mm", transform=text_transform, ha="left", va="top", color=DARK_GREY, fontsize=9)
 
 
 def draw_colour_bar(
@@ -121,9 +121,9 @@ def draw_colour_bar(
         bar.ax.yaxis.set_major_formatter(
             lambda value, _: "0" if abs(value) < 1e-12 else f"{value:+g}".replace("-", "−")
         )
-    bar.set_label(label, color=INK)
+    bar.set_label(label, color=DARK_GREY)
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
-    bar.ax.tick_params(length=2, color=SOFT, labelcolor=INK)
+    bar.ax.tick_params(length=2, color=LIGHT_GREY, labelcolor=DARK_GREY)
 
 
 def _factor_ticks(limit: float) -> dict[float, str]:
@@ -246,5 +246,5 @@ def check_scale(scale: ColourScale) -> None:
     check_kind("scale", scale, ColourScale, "a ColourScale, such as ColourScale(colour_map='viridis')")
 
 
-CHANGE = ColourScale()
-FACTOR = ColourScale(quantity="Conductivity over background", unit="", logarithmic=True)
+CHANGE_SCALE = ColourScale()
+FACTOR_SCALE = ColourScale(quantity="Conductivity over background", unit="", logarithmic=True)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import brief, did_you_mean
+from jeit.arguments import did_you_mean, object_text
 from jeit.protocol.reciprocity import reciprocal_channel_pairs
 from jeit_solvers.engines import as_array, either_engine, has_values
 from jeit_solvers.module import Module
@@ -214,7 +214,7 @@ class Protocol(Module):
             )
 
     def __repr__(self) -> str:
-        return brief(
+        return object_text(
             lambda: (
                 f"Protocol({self.name!r}: {self.num_electrodes} electrodes, {self.num_drives} drives, "
                 f"{self.num_measurements} channels)"

@@ -145,19 +145,21 @@ def _draw_outcome(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
     """Draw the image of one rule with its own colour scale; inclusions are marked unless there are more than
     `_MAX_MARKED`."""
     from jeit.plot import ColourScale, plot_image
-    from jeit.plot.axes import INK
+    from jeit.plot.axes import DARK_GREY
     from jeit.plot.imaging.judgement import COLOURS
 
     num_inclusions = len(outcome.inclusions)
     marked_inclusions = outcome.inclusions if num_inclusions <= _MAX_MARKED else ()
     plot_image(mesh, outcome.change, inclusions=marked_inclusions, scale=ColourScale(bar=False), ax=ax)
     _draw_scale(ax, float(jnp.abs(outcome.change).max()), "S" if mesh.dimension == 2 else "S/m")
-    ax.set_title(f"{name}\n{counted(num_inclusions, 'inclusion')}", color=COLOURS.get(name, INK), fontsize=11, pad=0)
+    ax.set_title(
+        f"{name}\n{counted(num_inclusions, 'inclusion')}", color=COLOURS.get(name, DARK_GREY), fontsize=11, pad=0
+    )
 
 
 def _draw_scale(ax, largest: float, unit: str) -> None:
     """Draw a small colour bar below an image, with labels at its ends and at zero."""
-    from jeit.plot.axes import INK, SOFT, with_si_prefix
+    from jeit.plot.axes import DARK_GREY, LIGHT_GREY, with_si_prefix
 
     factor, unit = with_si_prefix(largest, unit)
     limit = factor * largest
@@ -165,7 +167,7 @@ def _draw_scale(ax, largest: float, unit: str) -> None:
     bar = ax.figure.colorbar(mappable, ax=ax, orientation="horizontal", shrink=0.62, aspect=18, pad=0.01)
     bar.set_ticks([-limit, 0, limit], labels=[f"−{limit:.3g}", "0", f"+{limit:.3g} {unit}"])
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
-    bar.ax.tick_params(length=2, color=SOFT, labelcolor=INK, labelsize=8)
+    bar.ax.tick_params(length=2, color=LIGHT_GREY, labelcolor=DARK_GREY, labelsize=8)
 
 
 def report_choice(result: ComparedRules) -> dict[str, Any]:

@@ -114,7 +114,7 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     """
     from matplotlib.figure import Figure
 
-    from jeit.plot.axes import CHANGE, FACTOR
+    from jeit.plot.axes import CHANGE_SCALE, FACTOR_SCALE
     from jeit.plot.imaging.electrodes import draw_labels, draw_outlines
     from jeit.plot.imaging.image import plot_image
 
@@ -126,7 +126,7 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
         electrodes = result.electrodes
         plot_admittivity(result.mesh, np.asarray(result.change), electrodes, figure=figure)
         return figure
-    scale = FACTOR if result.iterative else CHANGE
+    scale = FACTOR_SCALE if result.iterative else CHANGE_SCALE
     electrodes = result.electrodes
     if result.mesh.dimension == 3:
         from jeit.plot.solid.slices import plot_solid

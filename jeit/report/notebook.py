@@ -57,16 +57,16 @@ def _draw_mesh(mesh: Any) -> Figure:
 def _draw_layout(layout: Any) -> Figure:
     from matplotlib.patches import Circle
 
-    from jeit.plot.axes import INK, SOFT, draw_scale_bar, hide_axes
+    from jeit.plot.axes import DARK_GREY, LIGHT_GREY, draw_scale_bar, hide_axes
 
     figure = Figure(figsize=(5.0, 4.6), layout="constrained")
     ax = figure.subplots()
     centres, radii = np.asarray(layout.centres), np.asarray(layout.diameters) / 2
     if layout.outline is not None:
         for loop in layout.outline.loops():
-            ax.plot(*np.concatenate([loop, loop[:1]]).T, color=INK, linewidth=1)
+            ax.plot(*np.concatenate([loop, loop[:1]]).T, color=DARK_GREY, linewidth=1)
     for centre, radius, label in zip(centres, radii, layout.labels, strict=True):
-        ax.add_patch(Circle(tuple(centre), float(radius), facecolor="none", edgecolor=SOFT))
+        ax.add_patch(Circle(tuple(centre), float(radius), facecolor="none", edgecolor=LIGHT_GREY))
         ax.annotate(label, tuple(centre), ha="center", va="center", fontsize=7)
     x, y = np.asarray(ax.dataLim.intervalx), np.asarray(ax.dataLim.intervaly)
     extent = (x[0], x[1], y[0], y[1])

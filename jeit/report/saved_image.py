@@ -14,7 +14,7 @@ from jaxtyping import Float, Inexact
 from jeit.arguments import counted, describe
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
-from jeit.files import need, npz_arrays
+from jeit.files import npz_arrays, require_arrays
 from jeit.image import Inclusion, Plane, SolidForm
 from jeit.mesh import Mesh
 from jeit.mesh.checks import size_checked
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from jeit.plot import Camera, ColourScale
 
-_REMEDY = "give the image.npz that jeit reconstruct writes"
+_VALID_FILE_HINT = "give the image.npz that jeit reconstruct writes"
 # Descriptions of files that are not images, with the suffixes of their names.
 _OTHER_FILES = {
     "a table of data, which is to be imaged first": (".csv", ".txt", ".mat", ".eit", ".get", ".npy"),
@@ -142,10 +142,10 @@ def read_image(path: str | Path) -> SavedImage:
     try:
         with path.open("rb") as file:
             if file.read(2) != b"PK":
-                raise ValueError(f"not an image that jeit wrote{_other_file_hint(path)}; {_REMEDY}.")
+                raise ValueError(f"not an image that jeit wrote{_other_file_hint(path)}; {_VALID_FILE_HINT}.")
         arrays = npz_arrays(path, *_READ_ARRAYS)
         _check_kind(arrays)
-        need(arrays, *_REQUIRED_ARRAYS)
+        require_arrays(arrays, *_REQUIRED_ARRAYS)
         if arrays["points"].dtype.kind not in "fiu":
             raise ValueError(f"'points' is {describe(arrays['points'])}; real numbers are wanted, metres.")
         with size_checked():  # the command that wrote the file checked the size of the mesh
@@ -162,7 +162,7 @@ def _check_kind(arrays: dict[str, np.ndarray]) -> None:
         raise ValueError("it holds many frames; give the image.npz of one, of jeit reconstruct.")
     if not array_names & {*_REQUIRED_ARRAYS}:
         first_names = ", ".join(name[:40] for name in sorted(array_names)[:6])
-        raise ValueError(f"it holds {first_names or 'nothing'}, and no image; {_REMEDY}.")
+        raise ValueError(f"it holds {first_names or 'nothing'}, and no image; {_VALID_FILE_HINT}.")
 
 
 def _other_file_hint(path: Path) -> str:
@@ -199,7 +199,7 @@ def _to_saved_image(mesh: Mesh, arrays: dict[str, np.ndarray]) -> SavedImage:
 def _read_electrodes(mesh: Mesh, arrays: dict[str, np.ndarray]) -> ElectrodeShapes | None:
     if "electrode_corners" not in arrays:
         return None
-    need(arrays, "electrode_sizes", "electrode_numbers")
+    require_arrays(arrays, "electrode_sizes", "electrode_numbers")
     corners, sizes, numbers = (arrays[f"electrode_{name}"] for name in ("corners", "sizes", "numbers"))
     if corners.ndim != 2 or corners.shape[1] != mesh.points.shape[1] or corners.dtype.kind not in "fiu":
         raise ValueError("'electrode_corners' are no places in the mesh's space; write it again.")
@@ -217,7 +217,7 @@ def _read_electrodes(mesh: Mesh, arrays: dict[str, np.ndarray]) -> ElectrodeShap
 def _read_inclusions(mesh: Mesh, arrays: dict[str, np.ndarray]) -> tuple[Inclusion, ...]:
     if "inclusion_centroids" not in arrays:
         return ()
-    need(arrays, "inclusion_sizes", "inclusion_peaks")
+    require_arrays(arrays, "inclusion_sizes", "inclusion_peaks")
     centroids, sizes, peaks = (arrays[f"inclusion_{name}"] for name in ("centroids", "sizes", "peaks"))
     num_inclusions = peaks.size
     if centroids.shape != (num_inclusions, mesh.points.shape[1]) or not sizes.shape == peaks.shape == (num_inclusions,):
@@ -234,7 +234,7 @@ def _read_inclusions(mesh: Mesh, arrays: dict[str, np.ndarray]) -> tuple[Inclusi
 def _read_forms(arrays: dict[str, np.ndarray], num_inclusions: int) -> list[SolidForm | None]:
     if "inclusion_axes" not in arrays:
         return [None] * num_inclusions
-    need(arrays, "inclusion_centres", "inclusion_columns")
+    require_arrays(arrays, "inclusion_centres", "inclusion_columns")
     centres, axes, columns = (arrays[f"inclusion_{name}"] for name in ("centres", "axes", "columns"))
     if not (
         centres.shape == (num_inclusions, 3)
@@ -305,13 +305,13 @@ def write_views(
 def drawn_values(image: SavedImage) -> tuple[np.ndarray, "ColourScale"]:
     """Values per cell to draw, and their colour scale: `departure` for iterative images, the real part of the change
     for complex images, otherwise the change of conductivity."""
-    from jeit.plot.axes import CHANGE, FACTOR, ColourScale
+    from jeit.plot.axes import CHANGE_SCALE, FACTOR_SCALE, ColourScale
 
     if image.departure is not None:
-        return image.departure, FACTOR
+        return image.departure, FACTOR_SCALE
     if np.iscomplexobj(image.change):
         return np.real(image.change), ColourScale(quantity="Change of conductivity σ")
-    return np.asarray(image.change), CHANGE
+    return np.asarray(image.change), CHANGE_SCALE
 
 
 def _draw_figures(image: SavedImage, camera, levels, planes, axis: str, slices: int) -> dict[str, "Figure"]:

@@ -70,7 +70,7 @@ def write_film(
     from matplotlib.animation import FFMpegWriter, PillowWriter
     from matplotlib.figure import Figure
 
-    from jeit.plot.axes import SOFT, ColourScale
+    from jeit.plot.axes import LIGHT_GREY, ColourScale
     from jeit.plot.imaging.image import slice_text
     from jeit.plot.imaging.series import FramePicture, fit_scale, select_frames
 
@@ -83,7 +83,7 @@ def write_film(
     fitted_scale.draw_bar(picture.ax, picture.mappable)
     picture.show(values[selected[0]], frame_titles[selected[0]])
     if text := slice_text(mesh):
-        figure.supxlabel(text, fontsize=9, color=SOFT)
+        figure.supxlabel(text, fontsize=9, color=LIGHT_GREY)
     figure.canvas.draw()
     figure.set_layout_engine("none")  # prevents a different layout in each frame
     frame_rate = min(_DEFAULT_RATE if rate is None else rate * len(selected) / len(values), _MAX_RATE)

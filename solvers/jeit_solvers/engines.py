@@ -204,7 +204,7 @@ def as_array(values: Any, dtype: Any = None) -> Array:
     return jnp.asarray(values, dtype)
 
 
-def at_once(function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+def evaluate_in_numpy(function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
     """Return the result of `function` for arrays with known values, computed in NumPy."""
     arguments, named = on_host((arguments, named))
     with np.errstate(all="ignore"):  # JAX does not warn of floating-point errors either
@@ -223,7 +223,7 @@ def either_engine(function: _Function) -> _Function:
         leaves = jax.tree.leaves((arguments, named))
         if not has_values(leaves):
             return compiled(*arguments, **named)
-        result = at_once(function, *arguments, **named)
+        result = evaluate_in_numpy(function, *arguments, **named)
         return result if namespace(leaves) is np else on_device(result)
 
     return call  # pyright: ignore[reportReturnType]
@@ -242,7 +242,7 @@ def values_at_once(function: _Function) -> _Function:
         arguments_and_keywords = arguments, named
         if namespace(arguments_and_keywords) is np or not has_values(arguments_and_keywords):
             return function(*arguments, **named)
-        return on_device(at_once(function, *arguments, **named))
+        return on_device(evaluate_in_numpy(function, *arguments, **named))
 
     return call  # pyright: ignore[reportReturnType]
 
@@ -279,7 +279,7 @@ def undifferentiated(values: Any) -> Any:
     return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if isinstance(leaf, jax.Array) else leaf, values)
 
 
-def kept(values: Any) -> Any:
+def computed_once(values: Any) -> Any:
     """Return the same arrays, which XLA then computes only once, instead of again in every place where they are
     used."""
     return values if namespace(values) is np else jax.lax.optimization_barrier(values)

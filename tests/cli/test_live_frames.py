@@ -40,7 +40,7 @@ def backlog(clock, before, number, period=0.01):
 
 def test_no_frame_is_skipped_with_a_given_rate(clock):
     live = LiveFrames(backlog(clock, 20, 30), 100.0, 60.0)
-    still = live.untouched(0.095)
+    still = live.initial_frames(0.095)
     assert still[:, 0].tolist() == list(range(10))
     seconds, values = zip(*live, strict=True)
     np.testing.assert_allclose(seconds, np.arange(50) / 100)
@@ -50,7 +50,7 @@ def test_no_frame_is_skipped_with_a_given_rate(clock):
 
 def test_old_frames_are_skipped(clock):
     live = LiveFrames(backlog(clock, 20, 300), None, 100.0)
-    still = live.untouched(0.1)
+    still = live.initial_frames(0.1)
     assert live.left_out == 22  # and two of the three delayed frames
     assert still[0, 0] == 22
     assert live.rate_seen == pytest.approx(100, rel=1e-2)
@@ -65,7 +65,7 @@ def test_old_frames_are_skipped(clock):
 
 def test_a_file_without_a_rate_has_the_default_one(clock):
     live = LiveFrames(backlog(clock, 50, 0), None, 25.0)
-    assert len(live.untouched(0.4)) == 11
+    assert len(live.initial_frames(0.4)) == 11
     seconds, values = zip(*live, strict=True)
     np.testing.assert_allclose(seconds, np.arange(50) / 25)
     assert len(values) == 50
@@ -74,7 +74,7 @@ def test_a_file_without_a_rate_has_the_default_one(clock):
 
 def test_a_source_that_never_waits_is_read_all_the_same(clock):
     live = LiveFrames(frames(clock, 20_000, 1e-3), None, 60.0)
-    assert len(live.untouched(1.0)) == pytest.approx(1000, abs=3)
+    assert len(live.initial_frames(1.0)) == pytest.approx(1000, abs=3)
     assert live.left_out == pytest.approx(5000, rel=0.05)
 
 
@@ -86,10 +86,10 @@ def test_lines_without_numbers_are_not_taken_for_the_reference(clock):
         yield from frames(clock, 30)
 
     live = LiveFrames(lines(), 100.0, 60.0)
-    assert live.untouched(0.2).shape[1] == 2
+    assert live.initial_frames(0.2).shape[1] == 2
     assert sum(frame == "no numbers" for _, frame in live) == 1
     with pytest.raises(ValueError, match="no frame of numbers"):
-        LiveFrames(iter(["a", "b"]), None, 60.0).untouched(1.0)
+        LiveFrames(iter(["a", "b"]), None, 60.0).initial_frames(1.0)
 
 
 def test_ctrl_c_ends_the_stream(clock):

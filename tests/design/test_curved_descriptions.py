@@ -227,7 +227,9 @@ def test_a_study_is_run_and_drawn_unrolled(described, tmp_path, exact):
         assert ((radius > 27) & (radius < 30.1)).all()
         assert float(data.z_mm.min()) > 0
     layout = study.points[0].layout
-    skin = Skin.create(layout, thickness=5e-3, num_layers=0, protocol=study.points[0].measured(study.current))
+    skin = Skin.create(
+        layout, thickness=5e-3, num_layers=0, protocol=study.points[0].measurement_protocol(study.current)
+    )
     changes = skin.voltage_changes(skin.touched_cells(touch_grid(skin.outline, 4, 4).places), linear=not exact)
     with open_results(study, tmp_path / "study.zarr") as data:
         np.testing.assert_allclose(data.sensitivity[0], np.linalg.norm(changes, axis=1), rtol=1e-9)

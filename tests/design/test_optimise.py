@@ -19,8 +19,8 @@ from jeit.design import (
     touch_grid,
     touches_away_from_the_edge,
 )
-from jeit.design.optimisation.design_space import Constraints, descend
-from jeit.design.optimisation.variables import Variables, Varied, balanced_score
+from jeit.design.optimisation.design_space import Constraints, minimise_from_starts
+from jeit.design.optimisation.variables import LayoutParameters, Variables, balanced_score
 from jeit.design.skin.sheet_touches import sheet_touches
 from jeit.electrodes import PointElectrodes
 from jeit.forward import ForwardModel
@@ -81,11 +81,11 @@ def test_the_minimised_costs_have_their_gradients(monkeypatch):
 
     def stay(cost, variables, steps, record, **options):
         if options:  # up to where the constraints are satisfied
-            return descend(cost, variables, steps, record, **options)
+            return minimise_from_starts(cost, variables, steps, record, **options)
         asked.append((cost, np.asarray(variables)))
         return variables, "step limit"
 
-    monkeypatch.setattr("jeit.design.optimisation.optimise.descend", stay)
+    monkeypatch.setattr("jeit.design.optimisation.optimise.minimise_from_starts", stay)
     optimise_from_three()
     cost, variables = asked[0]
     direction = np.random.default_rng(0).normal(size=variables.shape)
@@ -129,11 +129,11 @@ def test_the_search_is_over_symmetric_layouts_with_sizes_within_limits():
     skin = Skin(ring, MODEL, thickness=0.01, conductivity=0.2)
     space = DesignSpace(symmetry="rotate-4", sizes=(6e-3, 12e-3))
     variables = space.variables(skin, space.constraints(skin), TOUCHES.depth)
-    start = variables.varied(jnp.asarray(variables.start))
+    start = variables.parameters(jnp.asarray(variables.start))
     np.testing.assert_allclose(nearest(start.centres, ring.centres), 0, atol=1e-9)
     np.testing.assert_allclose(start.radii, 4e-3, rtol=1e-9)
     for values in np.random.default_rng(0).uniform(size=(3, len(variables.start))):
-        centres, radii, *_ = (np.asarray(part) for part in variables.varied(jnp.asarray(values)))
+        centres, radii, *_ = (np.asarray(part) for part in variables.parameters(jnp.asarray(values)))
         assert np.abs(centres).max() <= 0.05
         match = np.linalg.norm(centres[:, None] - centres @ np.array([[0, 1], [-1, 0]]), axis=-1)
         np.testing.assert_allclose(match.min(axis=1), 0, atol=1e-9)
@@ -189,7 +189,7 @@ def test_shortfall_is_the_missing_distance():
     corners = 0.05 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     hexagon = Polygon(corners, [[[0, 0], [0, 0.01], [0.01, 0]]])
     points = 0.06 * np.random.default_rng(0).uniform(-1, 1, (200, 2))
-    shortfall = eqx.filter_jit(Constraints(hexagon, 0.0).shortfall)
+    shortfall = eqx.filter_jit(Constraints(hexagon, 0.0).violations)
     lacking = shortfall(jnp.asarray(points), jnp.full(200, 1e-9))[-200:]
     loops = [np.asarray(loop) for loop in (hexagon.vertices, *hexagon.holes)]
     inside = Path(loops[0]).contains_points(points) & ~Path(loops[1]).contains_points(points)
@@ -286,7 +286,7 @@ def test_error_messages():
         optimise(Layout(START.centres, 8e-3))
     with pytest.raises(ValueError, match="the model 8; their number cannot change"):
         optimise(Layout(START.centres[:6], 8e-3, outline=SKIN))
-    five = Varied(START.centres[:5], START.diameters[:5] / 2, jnp.ones(5), jnp.ones(()))
+    five = LayoutParameters(START.centres[:5], START.diameters[:5] / 2, jnp.ones(5), jnp.ones(()))
     with pytest.raises(ValueError, match="add or remove 1, or choose another symmetry"):
         Variables.create(SKIN, five, symmetry="mirror-x")
     with pytest.raises(ValueError, match="contact_impedance must be two values"):

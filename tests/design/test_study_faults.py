@@ -89,7 +89,7 @@ def test_stopped_before_or_during_the_completion_mark(study, whole_store, store_
 
     with monkeypatch.context() as patch:
         if where == "before the mark":
-            patch.setattr(Store, "_mark", stop)
+            patch.setattr(Store, "_mark_finished", stop)
         else:
             patch.setattr(store_module.os, "fsync", stop)
         with pytest.raises(KeyboardInterrupt):

@@ -128,7 +128,7 @@ def test_conducting_touches_of_a_sheet(results, exact):
 
 def test_the_error_at_a_place_that_is_not_determined_is_infinite_and_counted(study, store_path, monkeypatch):
     """Two voltages, measured repeatedly, for a place and an amplitude."""
-    measured = Point.measured
+    measured = Point.measurement_protocol
 
     def two(point, current):
         protocol = measured(point, current)
@@ -136,7 +136,7 @@ def test_the_error_at_a_place_that_is_not_determined_is_infinite_and_counted(stu
         parts = protocol.drive_index[rows], protocol.measurement_index[rows]
         return eqx.tree_at(lambda one: (one.drive_index, one.measurement_index), protocol, parts)
 
-    monkeypatch.setattr(Point, "measured", two)
+    monkeypatch.setattr(Point, "measurement_protocol", two)
     data = run_study(study, store_path)
     assert np.isposinf(data.localisation_error_mean).all()
     assert np.isposinf(data.localisation_error_max).all()

@@ -59,7 +59,7 @@ def test_exact_maps_are_reported_one_by_one_and_resumed_to_the_same_store(tmp_pa
     study, reports = read_study(tmp_path / "exact.toml"), []
     found = run_study(study, store_path, progress=reports.append)
     point, plane = study.points[1], rectangle(0.1, 0.08, cell_size=8e-3)
-    model = ForwardModel(plane, SheetDiscs(point.layout.centres, 5e-3, 1e-3), point.measured(study.current))
+    model = ForwardModel(plane, SheetDiscs(point.layout.centres, 5e-3, 1e-3), point.measurement_protocol(study.current))
     places = touch_grid(Rectangle(0.1, 0.08), 6, 5).places
     touched = touched_cells(plane, Bell(), places, thickness=point.thickness, contrast=5.0)
     exact = touch_changes(model, 0.5 * point.thickness, touched)

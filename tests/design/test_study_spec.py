@@ -107,7 +107,7 @@ def test_a_study_s_defaults_are_those_of_a_skin(read):
         np.testing.assert_array_equal(point.layout.contact_impedance, defaults.CONTACT_IMPEDANCE)
         protocol = skin_protocol(point.layout)
         assert protocol.num_measurements == pairs
-        np.testing.assert_array_equal(point.measured(defaults.CURRENT).drive, protocol.drive)
+        np.testing.assert_array_equal(point.measurement_protocol(defaults.CURRENT).drive, protocol.drive)
 
 
 def test_a_fingerprint_depends_on_everything_that_determines_the_results(read, tmp_path):

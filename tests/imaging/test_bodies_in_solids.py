@@ -303,7 +303,7 @@ def test_a_column_of_another_volume_keeps_its_height_and_a_ball_grows_in_all_dir
 
 def test_the_last_axis_of_a_drawn_column_is_vertical():
     axes = np.array([[0.0, 0.0, 0.05], [0.03, 0.0, 0.0], [0.0, 0.01, 0.0]])
-    form = difference._form(Ellipsoid(1, BALL, axes, 3e-5, BALL, 1.0, True, False, 2.0))  # pyright: ignore
+    form = difference._solid_form(Ellipsoid(1, BALL, axes, 3e-5, BALL, 1.0, True, False, 2.0))  # pyright: ignore
     assert form is not None
     assert form.column
     np.testing.assert_allclose(np.ptp(form.surface().points, axis=0), [0.06, 0.02, 0.1])

@@ -51,7 +51,7 @@ class StandIn:
         self.scene, self.rate, self.period = round_scene(), rate, period
         self.asked: list[tuple] = []
         self.extra: dict = {}
-        self._changed = threading.Condition()
+        self._condition = threading.Condition()
         self._results: deque[StandInResult] = deque(maxlen=3600)
         self._ended = False
         self._begun = time.monotonic()
@@ -69,9 +69,9 @@ class StandIn:
         self.stop()
 
     def stop(self):
-        with self._changed:
+        with self._condition:
             self._ended = True
-            self._changed.notify_all()
+            self._condition.notify_all()
 
     def place(self, second: float) -> tuple[float, float]:
         """Where the Gaussian is, metres."""
@@ -88,24 +88,24 @@ class StandIn:
         if refused:
             picture = Picture(None, status=FrameStatus.REFUSED, reason=refused)
         voltages = 1 + 0.1 * np.sin(second + np.arange(40)) if values is None else values
-        with self._changed:
+        with self._condition:
             frame = LiveFrame(number, second, arrived, voltages)
             self._results.append(StandInResult(frame, picture, time.monotonic() - arrived))
-            self._changed.notify_all()
+            self._condition.notify_all()
 
     @property
     def last(self) -> int:
         """Number of the newest frame, or -1."""
-        with self._changed:
+        with self._condition:
             return self._results[-1].frame.number if self._results else -1
 
     def newest(self, after: int, timeout: float):
-        with self._changed:
-            self._changed.wait_for(lambda: self._ended or self._has(after), timeout)
+        with self._condition:
+            self._condition.wait_for(lambda: self._ended or self._has(after), timeout)
             return self._results[-1] if self._has(after) else None
 
     def result(self, number: int):
-        with self._changed:
+        with self._condition:
             return next((one for one in self._results if one.frame.number == number), None)
 
     def state(self) -> dict:

@@ -160,7 +160,7 @@ def test_a_source_is_closed_if_what_is_prepared_for_it_fails(monkeypatch):
 
 @posix
 def test_frames_beyond_those_that_can_wait_are_counted(monkeypatch):
-    monkeypatch.setattr(line_source, "_MAX_AHEAD", 4)
+    monkeypatch.setattr(line_source, "_MAX_WAITING_FRAMES", 4)
     read, write = os.pipe()
     os.write(write, b"".join(map(line, FRAMES)))
     lines = LineSource("-", StandardInput(read), LineReading())
@@ -179,7 +179,7 @@ def test_frames_beyond_those_that_can_wait_are_counted(monkeypatch):
 
 @posix
 def test_a_loss_at_the_end_is_reported_too(monkeypatch):
-    monkeypatch.setattr(line_source, "_MAX_AHEAD", 4)
+    monkeypatch.setattr(line_source, "_MAX_WAITING_FRAMES", 4)
     read, write = os.pipe()
     os.write(write, b"".join(map(line, FRAMES)))
     os.close(write)

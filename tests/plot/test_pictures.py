@@ -22,7 +22,7 @@ from jeit.inverse.shapes import Quantities, Star
 from jeit.layout import perimeter, ring
 from jeit.mesh import Disk, Polygon, Rectangle, Solid, centroids, disk, layer, rectangle
 from jeit.plot import ColourScale, plot_image, plot_mesh
-from jeit.plot.axes import FACTOR, extent_of, hide_axes
+from jeit.plot.axes import FACTOR_SCALE, extent_of, hide_axes
 from jeit.plot.imaging.electrodes import draw_electrodes, draw_inclusions, draw_outlines
 from jeit.plot.imaging.image import plot_raster, plot_sensitivity
 from jeit.plot.imaging.judgement import plot_voltages
@@ -85,7 +85,7 @@ def test_conductivity_is_sequential_and_spans_its_range(mesh, ax):
 )
 def test_ticks_of_logarithms_are_factors(mesh, ax, limit, labels):
     values = np.linspace(-limit / 2, limit, mesh.num_cells)
-    plot_image(mesh, values, scale=FACTOR, ax=ax)
+    plot_image(mesh, values, scale=FACTOR_SCALE, ax=ax)
     ticks = ax.figure.axes[-1].yaxis.get_ticklabels()
     assert [tick.get_text() for tick in sorted(ticks, key=lambda tick: tick.get_position()[1])] == labels
     factors = [float(label.replace("÷", "1/").split("/")[-1].strip("×")) for label in labels]

@@ -179,8 +179,8 @@ def test_more_programs_than_cores_may_call_numpy_at_once(monkeypatch):
     chain, vectors = find_fronts(pattern, np.arange(size)[:, None]), np.random.default_rng(0).normal(size=(size, 20))
     twice = jax.jit(
         lambda given, b: (
-            exact_fronts_numpy.solve_at_once(chain, given, b).sum(),
-            exact_fronts_numpy.solve_at_once(chain, 2 * given, jnp.sin(b)).sum(),
+            exact_fronts_numpy.solve_with_cached_factor(chain, given, b).sum(),
+            exact_fronts_numpy.solve_with_cached_factor(chain, 2 * given, jnp.sin(b)).sum(),
         )
     )
     found = np.full((12, 2), np.nan)
@@ -222,13 +222,13 @@ def test_the_last_factor_is_reused_unless_it_is_large(monkeypatch):
     monkeypatch.setattr(exact_fronts_numpy, "factorise_fronts", lambda *given: made.append(1) or plain(*given))
     given = find_fronts(Compiled.pattern, Compiled.coordinates), Compiled.values, Compiled.vectors
     for _ in range(2):
-        exact_fronts_numpy.solve_at_once(*given)
+        exact_fronts_numpy.solve_with_cached_factor(*given)
     assert len(made) == 1
-    exact_fronts_numpy.solve_at_once(given[0], 2 * Compiled.values, Compiled.vectors)
+    exact_fronts_numpy.solve_with_cached_factor(given[0], 2 * Compiled.values, Compiled.vectors)
     assert len(made) == 2
     monkeypatch.setattr(exact_fronts_numpy, "_MAX_CACHED_ENTRIES", 0)
     for _ in range(2):
-        exact_fronts_numpy.solve_at_once(*given)
+        exact_fronts_numpy.solve_with_cached_factor(*given)
     assert len(made) == 4
 
 

@@ -119,7 +119,7 @@ def _minimise(expand, start, data, bounds) -> np.ndarray:
     return np.asarray(minimum.x)
 
 
-def fit_together(
+def fit_jointly(
     problem: DecayProblem,
     start: Float[np.ndarray, "P M"],
     strength: Float[np.ndarray, " T"],
@@ -151,14 +151,14 @@ def fit_together(
     return unpack_unknowns(_SOLVER.at_once(expand, np.concatenate([start.ravel(), strength]), None, _MAX_STEPS)[0])
 
 
-def fit_within(
+def fit_with_bounds(
     problem: DecayProblem,
     start: Float[np.ndarray, "P M"],
     strength: Float[np.ndarray, " T"],
     received: Bool[np.ndarray, " M"],
     bounds: tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]],
 ) -> tuple[Float[np.ndarray, "P M"], Float[np.ndarray, " T"], Bool[np.ndarray, "P M"]]:
-    """Fit the microphones' values and the taps' strengths as `fit_together` does, with `bounds` on the values.
+    """Fit the microphones' values and the taps' strengths as `fit_jointly` does, with `bounds` on the values.
 
     `received`: mask of the microphones with usable readings, whose parameters are fitted. Also returns the mask of the
     parameters that are fixed at a bound. A fixed parameter is released if the cost decreases from the bound towards the
@@ -171,7 +171,7 @@ def fit_within(
         slope = _normal_equations(problem, values, strength, received & np.ones_like(is_fixed))[1].gradient
         descends_inwards = np.where(values <= lower, slope < 0, slope > 0)
         is_fixed &= ~descends_inwards
-        fitted_values, strength = fit_together(problem, values, strength, ~is_fixed & received)
+        fitted_values, strength = fit_jointly(problem, values, strength, ~is_fixed & received)
         values = np.clip(np.where(np.isfinite(fitted_values), fitted_values, values), lower, upper)
         is_outside = (values != fitted_values) & ~is_fixed & received
         is_fixed |= is_outside

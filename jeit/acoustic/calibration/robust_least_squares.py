@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
-from jeit.acoustic.calibration.decay_fit import DecayProblem, fit_strengths, fit_within, log_covariance
+from jeit.acoustic.calibration.decay_fit import DecayProblem, fit_strengths, fit_with_bounds, log_covariance
 from jeit.acoustic.decay import AbstractDecay
 from jeit.acoustic.microphones import MIN_RELATIVE_ERROR, IntensityNoise, noise_from_negative_powers
 from jeit_solvers.engines import host, on_host, slopes
@@ -310,7 +310,9 @@ def _alternate_fits(fit: TapFit, iterations: int, *, update_spread: bool = False
     `iterations` iterations. If `update_spread`, the `spread` of the parameters is also re-estimated."""
     for _ in range(iterations):
         previous_values, has_readings = fit.values, np.asarray(fit.usable.any(axis=1))
-        values, strength, at_bound = fit_within(fit.problem(), previous_values, fit.strength, has_readings, fit.bounds)
+        values, strength, at_bound = fit_with_bounds(
+            fit.problem(), previous_values, fit.strength, has_readings, fit.bounds
+        )
         fit = replace(fit, values=values, strength=strength, at_bound=at_bound)
         strength = fit_strengths(fit.problem(with_outliers=True), fit.values, fit.strength)
         fit = _update_noise_and_weights(replace(fit, strength=strength))

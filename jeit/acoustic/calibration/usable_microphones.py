@@ -18,7 +18,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jeit.acoustic.calibration.decay_fit import fit_within
+from jeit.acoustic.calibration.decay_fit import fit_with_bounds
 from jeit.acoustic.calibration.robust_least_squares import TapFit, refit_without
 from jeit.acoustic.decay import AbstractDecay
 from jeit.acoustic.localisation.likelihood import Likelihood
@@ -28,7 +28,7 @@ from jeit.acoustic.microphones import MicrophoneArray
 from jeit.acoustic.signal.faults import describe_faults
 from jeit.acoustic.surface import AbstractSurface, bounding_box, longer_side, to_space
 from jeit_solvers import inverse_small, minimise_small
-from jeit_solvers.engines import as_array, at_once, host, namespace, on_device
+from jeit_solvers.engines import as_array, evaluate_in_numpy, host, namespace, on_device
 
 # Minimum fraction of the variance of a microphone's levels that its decay model must explain.
 _MIN_EXPLAINED = 0.3
@@ -193,9 +193,9 @@ def locate_left_out(
         use = fit.usable[:, is_left_out] & has_readings[:, None]
         if not is_left_out.any() or not (use.sum(axis=0) >= 3).any():
             continue
-        values, _, _ = fit_within(training_fit.problem(), fit.values, fit.strength, has_readings, fit.bounds)
+        values, _, _ = fit_with_bounds(training_fit.problem(), fit.values, fit.strength, has_readings, fit.bounds)
         array = _microphone_array(fit, values, microphones, surface)
-        estimated_positions, covariance = at_once(
+        estimated_positions, covariance = evaluate_in_numpy(
             _locate_most_likely, array, raster, np.nan_to_num(fit.power[:, is_left_out]), use
         )
         error_vectors = estimated_positions - tap_positions[is_left_out]

@@ -110,7 +110,7 @@ def calibrate_microphones(
 def _print_summary(console, fit: "CalibrationFit", taps: "Taps") -> None:
     import numpy as np
 
-    from jeit.cli.console import pairs
+    from jeit.cli.console import name_value_table
 
     calibration = fit.calibration
     usable = calibration.usable
@@ -132,7 +132,7 @@ def _print_summary(console, fit: "CalibrationFit", taps: "Taps") -> None:
             ("tap nearer to", f"{numbers}: no tap determines the decay of their response; that of the others is used")
         )
     console.print()
-    console.print(pairs(calibration.name, rows))
+    console.print(name_value_table(calibration.name, rows))
     console.print()
     console.print(_parameter_table(fit))
     unusable_rows = [
@@ -140,7 +140,7 @@ def _print_summary(console, fit: "CalibrationFit", taps: "Taps") -> None:
     ]
     if unusable_rows:
         console.print()
-        console.print(pairs("Left out", unusable_rows))
+        console.print(name_value_table("Left out", unusable_rows))
 
 
 def _location_error(fit: "CalibrationFit", taps: "Taps") -> float:

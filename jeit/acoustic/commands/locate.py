@@ -114,7 +114,7 @@ def _print_summary(console, located: "LocatedTouches") -> None:
     from rich.table import Table
 
     from jeit.acoustic.signal.faults import describe_faults
-    from jeit.cli.console import pairs
+    from jeit.cli.console import name_value_table
 
     locations = located.locations
     counts = ", ".join(f"{number} {status}" for status, number in locations.counts().items())
@@ -122,7 +122,7 @@ def _print_summary(console, located: "LocatedTouches") -> None:
     rows += [("faults", describe_faults(locations.faults))] * any(locations.faults)
     rows += [("note", in_options(note, {"silence": "--silence"})) for note in locations.notes]
     console.print()
-    console.print(pairs(locations.name, rows))
+    console.print(name_value_table(locations.name, rows))
     if located.track.touches:
         console.print()
         names = ("touch", "from / s", "to / s", "x / mm", "y / mm", "± / mm", "path / mm")

@@ -35,7 +35,7 @@ from jeit_solvers import (
     solve_small,
     symmetric_small,
 )
-from jeit_solvers.engines import kept, namespace, set_at, slopes, undifferentiated
+from jeit_solvers.engines import computed_once, namespace, set_at, slopes, undifferentiated
 from jeit_solvers.module import Module
 
 
@@ -84,7 +84,7 @@ class Consistency(Module):
     def expand(self, chart: Float[Array, "2 F"]) -> tuple[Array, Array, Array]:
         """Loss (F,), gradient (2, F) of the loss with respect to the chart coordinates, and Gauss-Newton matrix (2, 2,
         F)."""
-        differences, derivatives = kept(slopes(self.differences, chart))
+        differences, derivatives = computed_once(slopes(self.differences, chart))
         gradient = 2 * namespace(differences).stack(
             [(differences * derivative).sum(axis=0) for derivative in derivatives]
         )

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from jeit.acoustic.microphones import MicrophoneArray, check_array
 from jeit.acoustic.surface import to_space
 from jeit_solvers import inverse_small, symmetric_small
-from jeit_solvers.engines import either_engine, kept, namespace, slopes
+from jeit_solvers.engines import computed_once, either_engine, namespace, slopes
 from jeit_solvers.module import Module
 
 
@@ -72,9 +72,9 @@ class Likelihood(Module):
         """Negative log-likelihood (F,), its gradient (n, F) with respect to the n unknowns, and the Fisher matrix (n,
         n, F)."""
         (mean, variance), derivatives = slopes(self.microphone_array.expected, unknowns)
-        # `kept` makes the compiler compute these arrays once for all sums below. In the sums, `dv` is the derivative of
-        # log v.
-        mean, variance, derivatives = kept((mean, variance, [(dm, dv / variance) for dm, dv in derivatives]))
+        # `computed_once` makes the compiler compute these arrays once for all sums below. In the sums, `dv` is the
+        # derivative of log v.
+        mean, variance, derivatives = computed_once((mean, variance, [(dm, dv / variance) for dm, dv in derivatives]))
         xp = namespace(self, mean)
         used = xp.where(self.use, 1.0, 0.0)
         residual = self.level - mean
@@ -82,7 +82,9 @@ class Likelihood(Module):
         weighted_residual = residual * weight
         cost = 0.5 * xp.sum(weighted_residual * residual + used * xp.log(variance), axis=0)
         variance_terms = 0.5 * (used - weighted_residual * residual)
-        weight, weighted_residual, variance_terms, used = kept((weight, weighted_residual, variance_terms, used))
+        weight, weighted_residual, variance_terms, used = computed_once(
+            (weight, weighted_residual, variance_terms, used)
+        )
         gradient = xp.stack([xp.sum(variance_terms * dv - weighted_residual * dm, axis=0) for dm, dv in derivatives])
         matrix = symmetric_small(
             [

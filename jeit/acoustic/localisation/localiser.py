@@ -23,8 +23,8 @@ from jeit.acoustic.surface import bounding_box, longer_side, to_space
 from jeit.arguments import check_name
 from jeit_solvers import inverse_small
 from jeit_solvers.engines import (
-    at_once,
     either_engine,
+    evaluate_in_numpy,
     has_values,
     namespace,
     on_device,
@@ -162,7 +162,9 @@ class Localiser(Module):
             padded_result = self._call_validated(function, np.full((1, power.shape[1]), np.nan), None)
             return jax.tree.map(lambda array: array[:0], padded_result)
         return (
-            on_device(at_once(function, self, power, use)) if use_numpy else _call_compiled(function, self, power, use)
+            on_device(evaluate_in_numpy(function, self, power, use))
+            if use_numpy
+            else _call_compiled(function, self, power, use)
         )
 
 

@@ -13,7 +13,7 @@ from jeit.acoustic.localisation.pixels import Pixels
 from jeit.acoustic.microphones import MicrophoneArray
 from jeit.acoustic.surface import bounding_box, longer_side, to_space
 from jeit_solvers import inverse_small, minimise_small
-from jeit_solvers.engines import at_once, has_values, namespace, on_device, on_host, scan
+from jeit_solvers.engines import evaluate_in_numpy, has_values, namespace, on_device, on_host, scan
 from jeit_solvers.module import Module
 
 # Approximate number of grid positions, all pairs of which are screened; number of pairs of positions that are refined.
@@ -70,7 +70,7 @@ def locate_two(
     columns, rows = (max(3, round(side / spacing)) for side in high - low)
     pixels = Pixels.create(microphone_array.surface, columns, rows)
     arguments = microphone_array, pixels, power.T, use.T
-    return on_device(at_once(_locate_two, *arguments)) if use_numpy else jax.jit(_locate_two)(*arguments)
+    return on_device(evaluate_in_numpy(_locate_two, *arguments)) if use_numpy else jax.jit(_locate_two)(*arguments)
 
 
 def _locate_two(microphone_array: MicrophoneArray, pixels: Pixels, power, use) -> TwoSources:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from jeit.acoustic.plots.surface_view import ESTIMATE_COLOUR, AnySurface, draw_legend, draw_surface, view_of
 from jeit.arguments import check_kind, check_name
-from jeit.plot.axes import INK, SERIES_COLOURS, SERIES_MARKERS, axes_or_new, draw_horizontal_grid, soften_axes
+from jeit.plot.axes import DARK_GREY, SERIES_COLOURS, SERIES_MARKERS, axes_or_new, draw_horizontal_grid, soften_axes
 
 _STATISTICS = {
     "median": lambda errors: np.nanmedian(errors, axis=1),
@@ -65,16 +65,24 @@ def plot_position_errors(
     handles = draw_surface(ax, view)
     ax.add_collection(
         LineCollection(
-            list(np.stack([true_points, estimated_points], axis=1)[has_estimate]), colors=INK, linewidths=0.9, zorder=3
+            list(np.stack([true_points, estimated_points], axis=1)[has_estimate]),
+            colors=DARK_GREY,
+            linewidths=0.9,
+            zorder=3,
         )
     )
     marker_style = {"marker": "o", "linestyle": "none", "markersize": 4.2}
     handles += ax.plot(
-        *true_points[has_estimate].T, color=INK, markeredgewidth=0, zorder=4, label="true", **marker_style
+        *true_points[has_estimate].T, color=DARK_GREY, markeredgewidth=0, zorder=4, label="true", **marker_style
     )
     if not has_estimate.all():
         handles += ax.plot(
-            *true_points[~has_estimate].T, color=INK, fillstyle="none", zorder=4, label="not found", **marker_style
+            *true_points[~has_estimate].T,
+            color=DARK_GREY,
+            fillstyle="none",
+            zorder=4,
+            label="not found",
+            **marker_style,
         )
     handles += ax.plot(
         *estimated_points[has_estimate].T,
@@ -147,10 +155,10 @@ def plot_error_curve(
             low, high = np.nanquantile(rows, [0.25, 0.75], axis=1)
             ax.fill_between(x[order], low[order], high[order], color=colour, alpha=0.18, linewidth=0, zorder=2)
     if bound_values is not None:
-        style = {"color": INK, "linewidth": 1.4, "linestyle": (0, (4, 3)), "zorder": 4}
+        style = {"color": DARK_GREY, "linewidth": 1.4, "linestyle": (0, (4, 3)), "zorder": 4}
         ax.plot(x[order], bound_values[order], label="Cramér-Rao bound", **style)
-    ax.set_xlabel(quantity, color=INK)
-    ax.set_ylabel({"rms": "RMS error (mm)"}.get(statistic, f"{statistic.capitalize()} error (mm)"), color=INK)
+    ax.set_xlabel(quantity, color=DARK_GREY)
+    ax.set_ylabel({"rms": "RMS error (mm)"}.get(statistic, f"{statistic.capitalize()} error (mm)"), color=DARK_GREY)
     ax.set_title(title or "")
     _mark_axes(ax, x, logarithmic)
     ax.legend(frameon=False)

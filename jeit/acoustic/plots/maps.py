@@ -27,7 +27,7 @@ from jeit.acoustic.plots.surface_view import (
     view_of,
 )
 from jeit.arguments import check_kind, check_name
-from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, draw_colour_bar, soften_axes
+from jeit.plot.axes import DARK_GREY, LIGHT_GREY, SEQUENTIAL, axes_or_new, draw_colour_bar, soften_axes
 from jeit_solvers.engines import on_host
 
 # Dynamic range in decibels of the circles that show the received intensities: the circle of a microphone this far below
@@ -140,7 +140,7 @@ def _draw_marks(ax: Axes, view: View, marks: MapMarks) -> list[Line2D]:
     handles = []
     style: dict[str, Any] = {"linestyle": "none", "zorder": 5, "path_effects": HALO}
     if marks.truth is not None:
-        cross_style: dict[str, Any] = {"marker": "+", "color": INK, "markersize": 13, "markeredgewidth": 1.8}
+        cross_style: dict[str, Any] = {"marker": "+", "color": DARK_GREY, "markersize": 13, "markeredgewidth": 1.8}
         handles += ax.plot(*view.chart_point(marks.truth, "truth"), label="truth", **cross_style, **style)
     if marks.estimate is not None:
         estimate_point, label = view.chart_point(marks.estimate, "estimate"), "estimate"
@@ -258,7 +258,7 @@ def plot_receptive_fields(
 
 def _label_panels(ax: Axes, fit: CalibrationFit, *, noise_shown: bool) -> None:
     """Draw the axis labels shared by all panels, and the legend above the panels."""
-    label_style: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "color": INK}
+    label_style: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "color": DARK_GREY}
     label_style["annotation_clip"] = False
     ax.annotate("Distance (mm)", (0.5, 0), (0, -22), ha="center", va="top", **label_style)
     ax.annotate(
@@ -266,10 +266,12 @@ def _label_panels(ax: Axes, fit: CalibrationFit, *, noise_shown: bool) -> None:
     )
     handles = [
         Line2D([], [], marker="o", linestyle="none", color=_TAP_COLOUR, markersize=4, label="tap"),
-        Line2D([], [], color=INK, linewidth=1.6, label=f"fit, {type(fit.calibration.microphone_array.decay).name}"),
+        Line2D(
+            [], [], color=DARK_GREY, linewidth=1.6, label=f"fit, {type(fit.calibration.microphone_array.decay).name}"
+        ),
     ]
     if noise_shown:
-        handles.append(Line2D([], [], color=SOFT, linewidth=1.0, linestyle=(0, (4, 3)), label="noise, 1 σ"))
+        handles.append(Line2D([], [], color=LIGHT_GREY, linewidth=1.0, linestyle=(0, (4, 3)), label="noise, 1 σ"))
     if fit.outlier.any():
         ring_style: dict[str, Any] = {"marker": "o", "linestyle": "none", "fillstyle": "none", "markersize": 4}
         handles.append(Line2D([], [], color=ESTIMATE_COLOUR, label="left out", **ring_style))
@@ -296,7 +298,7 @@ def _draw_receptive_field(panel: Axes, fit: CalibrationFit, index: int, relative
     is_positive = np.isfinite(relative) & (relative > 0)
     panel.set_yscale("log")
     for mask, style in (
-        (is_positive & ~fit.outlier, {"color": SOFT if reason else _TAP_COLOUR, "alpha": 0.6, "linewidths": 0}),
+        (is_positive & ~fit.outlier, {"color": LIGHT_GREY if reason else _TAP_COLOUR, "alpha": 0.6, "linewidths": 0}),
         (
             is_positive & fit.outlier,
             {"facecolors": "none", "edgecolors": ESTIMATE_COLOUR, "linewidths": 0.7, "zorder": 2.5},
@@ -304,15 +306,19 @@ def _draw_receptive_field(panel: Axes, fit: CalibrationFit, index: int, relative
     ):
         size = 9 if columns <= 2 else 5
         panel.scatter(1e3 * fit.distance[mask, index], relative[mask], s=size, rasterized=True, **style)
-    style = {"color": SOFT, "linewidth": 1.2, "linestyle": (0, (1, 1))} if reason else {"color": INK, "linewidth": 1.6}
+    style = (
+        {"color": LIGHT_GREY, "linewidth": 1.2, "linestyle": (0, (1, 1))}
+        if reason
+        else {"color": DARK_GREY, "linewidth": 1.6}
+    )
     # No curve is drawn for a microphone without positive intensities.
     is_in_range = (distance <= fit.distance[:, index].max()) & is_positive.any()
     panel.plot(1e3 * distance[is_in_range], curve[is_in_range], zorder=3, **style)
     if noise > 0:
-        panel.axhline(noise, color=SOFT, linewidth=1.0, linestyle=(0, (4, 3)), zorder=1)
+        panel.axhline(noise, color=LIGHT_GREY, linewidth=1.0, linestyle=(0, (4, 3)), zorder=1)
     fontsize = 8.5 if columns <= 5 else 7
     text_style: dict[str, Any] = {"transform": panel.transAxes, "va": "top", "path_effects": HALO, "zorder": 4}
-    panel.text(0.05, 0.97, str(index), ha="left", fontsize=fontsize, fontweight="bold", color=INK, **text_style)
+    panel.text(0.05, 0.97, str(index), ha="left", fontsize=fontsize, fontweight="bold", color=DARK_GREY, **text_style)
     if reason:
         short_reason = textwrap.shorten(reason.split(" (")[0], 60, placeholder=" …")
         wrapped_reason = textwrap.fill(short_reason, 24 if columns <= 5 else 18)
@@ -320,7 +326,13 @@ def _draw_receptive_field(panel: Axes, fit: CalibrationFit, index: int, relative
     elif columns <= 6:
         half_distance = distance[np.argmin(np.abs(curve / curve[0] - 0.5))]
         panel.text(
-            0.97, 0.97, f"½ at {1e3 * half_distance:.0f} mm", ha="right", fontsize=fontsize - 1, color=INK, **text_style
+            0.97,
+            0.97,
+            f"½ at {1e3 * half_distance:.0f} mm",
+            ha="right",
+            fontsize=fontsize - 1,
+            color=DARK_GREY,
+            **text_style,
         )
     soften_axes(panel)
     panel.tick_params(length=2.5, labelsize=fontsize - 0.5, which="both")

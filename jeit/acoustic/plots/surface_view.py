@@ -16,7 +16,7 @@ from scipy.special import chdtri
 from jeit.acoustic import Calibration, MicrophoneArray
 from jeit.acoustic.surface import AbstractSurface, bounding_box, make_surface
 from jeit.mesh import Domain
-from jeit.plot.axes import INK, SOFT, draw_scale_bar, extent_of, hide_axes
+from jeit.plot.axes import DARK_GREY, LIGHT_GREY, draw_scale_bar, extent_of, hide_axes
 from jeit_solvers.engines import host, on_host, slopes
 
 MICROPHONE_COLOUR, ESTIMATE_COLOUR = "#1f6fb4", "#c8102e"
@@ -113,7 +113,7 @@ def draw_surface(ax: Axes, view: View, *, microphones: bool = True, faint: bool 
     """Draw the surface's outline, a scale bar and the microphones, with crosses for unusable microphones. Returns the
     legend entries."""
     ax.add_patch(
-        PathPatch(outline_of(view), facecolor="none", edgecolor=INK, linewidth=0.9, joinstyle="round", zorder=2)
+        PathPatch(outline_of(view), facecolor="none", edgecolor=DARK_GREY, linewidth=0.9, joinstyle="round", zorder=2)
     )
     # Microphones may lie outside the outline.
     shown_points = np.concatenate([np.reshape(view.extent, (2, 2)).T, view.microphones])
@@ -129,13 +129,15 @@ def draw_surface(ax: Axes, view: View, *, microphones: bool = True, faint: bool 
     handles = []
     style = {"marker": "o", "linestyle": "none", "markersize": 6.5, "zorder": 2.5, "label": "microphone"}
     style |= {"markerfacecolor": "none", "markeredgewidth": 1.0} if faint else {"markeredgewidth": 0.8}
-    style |= {"markeredgecolor": SOFT} if faint else {"markerfacecolor": MICROPHONE_COLOUR, "markeredgecolor": "white"}
+    style |= (
+        {"markeredgecolor": LIGHT_GREY} if faint else {"markerfacecolor": MICROPHONE_COLOUR, "markeredgecolor": "white"}
+    )
     cross_style = {
         "marker": "x",
         "linestyle": "none",
         "markersize": 7,
         "markeredgewidth": 1.6,
-        "color": INK,
+        "color": DARK_GREY,
         "zorder": 2.6,
     }
     if view.usable.any():
@@ -179,5 +181,5 @@ def draw_legend(ax: Axes, handles: list) -> None:
         handletextpad=0.5,
         columnspacing=1.4,
         fontsize=9,
-        labelcolor=INK,
+        labelcolor=DARK_GREY,
     )

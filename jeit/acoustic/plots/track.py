@@ -17,7 +17,7 @@ from jeit.acoustic.localisation.locations import Locations, LocationStatus
 from jeit.acoustic.plots.surface_view import View, draw_ellipse, draw_legend, draw_surface, outline_of, view_of
 from jeit.acoustic.touches import Touch, Track
 from jeit.arguments import check_kind
-from jeit.plot.axes import INK, SOFT, axes_or_new, draw_colour_bar
+from jeit.plot.axes import DARK_GREY, LIGHT_GREY, axes_or_new, draw_colour_bar
 
 _OVERLAY_COLOURS = LinearSegmentedColormap.from_list("glow", ["#ffffff", "#bccddf", "#6a8aae"])
 _TIME_COLOURS = LinearSegmentedColormap.from_list("time", ["#0d0887", "#7e03a8", "#cc4778", "#f89540", "#fbd724"])
@@ -96,7 +96,9 @@ def plot_track(
     handles = draw_surface(ax, view, faint=True)
     ax.set_title(title or "")
     if true_path is not None:
-        handles += ax.plot(*true_path.T, color=INK, linewidth=0.9, linestyle=(0, (4, 3)), zorder=3.6, label="truth")
+        handles += ax.plot(
+            *true_path.T, color=DARK_GREY, linewidth=0.9, linestyle=(0, (4, 3)), zorder=3.6, label="truth"
+        )
     if not track.touches:
         _label_no_touch(ax, view, locations)
         draw_legend(ax, handles)
@@ -120,7 +122,7 @@ def _label_no_touch(ax: Axes, view: View, locations: Locations) -> None:
     left, right, bottom, top = view.extent
     label = "no touch" if (locations.status != LocationStatus.UNUSABLE).any() else "no usable frame"
     box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
-    text_style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 15, "color": INK, "zorder": 5}
+    text_style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 15, "color": DARK_GREY, "zorder": 5}
     ax.text((left + right) / 2, (bottom + top) / 2, label, bbox=box, **text_style)
 
 
@@ -138,12 +140,19 @@ def _draw_touch(
         _MIN_MOTION_DEVIATIONS * np.sqrt(np.linalg.eigvalsh(covariance)[-1]),
         0.5 * _MIN_MOTION_SHARE * max(right - left, top - bottom),
     )
-    mark_style: dict[str, Any] = {"linestyle": "none", "markeredgecolor": INK, "markeredgewidth": 1.2, "zorder": 5}
+    mark_style: dict[str, Any] = {
+        "linestyle": "none",
+        "markeredgecolor": DARK_GREY,
+        "markeredgewidth": 1.2,
+        "zorder": 5,
+    }
     if max_displacement < min_displacement:
         colour = time_colours.to_rgba(track.times[best_frame])
-        draw_ellipse(ax, path[best_frame], covariance, colour=INK)
+        draw_ellipse(ax, path[best_frame], covariance, colour=DARK_GREY)
         ax.plot(*path[best_frame], marker="o", markersize=5, markerfacecolor=colour, **mark_style)
-        dot_handle = Line2D([], [], marker="o", markersize=5, markerfacecolor=SOFT, label="touch, 95 %", **mark_style)
+        dot_handle = Line2D(
+            [], [], marker="o", markersize=5, markerfacecolor=LIGHT_GREY, label="touch, 95 %", **mark_style
+        )
         return [] if "touch, 95 %" in existing_labels else [dot_handle]
     segments = np.stack([positions[:-1], positions[1:]], axis=1)
     for width, colours, order in (
@@ -177,7 +186,7 @@ def _draw_frames(ax: Axes, view: View, track: Track, locations: Locations, time_
         }
         ring_options |= {"zorder": 3.7, "edgecolors": time_colours.to_rgba(track.times[is_rejected])}
         ax.scatter(*positions[is_rejected].T, **ring_options)
-        ring_style: dict[str, Any] = {"linestyle": "none", "markerfacecolor": "none", "markeredgecolor": SOFT}
+        ring_style: dict[str, Any] = {"linestyle": "none", "markerfacecolor": "none", "markeredgecolor": LIGHT_GREY}
         handles.append(
             Line2D([], [], marker="o", markersize=4, label=f"not believed ({is_rejected.sum()})", **ring_style)
         )
@@ -195,17 +204,17 @@ def _draw_other_frames(
         has_status = (locations.status == status) & locations.has_position
         if not has_status.any():
             continue
-        marker_style = {"marker": marker, "s": 22, "linewidths": 0.8, "edgecolors": INK, "zorder": 4.5}
+        marker_style = {"marker": marker, "s": 22, "linewidths": 0.8, "edgecolors": DARK_GREY, "zorder": 4.5}
         has_second = has_status & np.isfinite(second).all(axis=1)
         if has_second.any():
             pairs = list(np.stack([positions, second], axis=1)[has_second])
-            ax.add_collection(LineCollection(pairs, colors=SOFT, linewidths=0.5, zorder=3))
+            ax.add_collection(LineCollection(pairs, colors=LIGHT_GREY, linewidths=0.5, zorder=3))
             ax.scatter(*second[has_second].T, color=time_colours.to_rgba(locations.times[has_second]), **marker_style)
         ax.scatter(*positions[has_status].T, color=time_colours.to_rgba(locations.times[has_status]), **marker_style)
         legend_style: dict[str, Any] = {
             "markersize": 5,
-            "markerfacecolor": SOFT,
-            "markeredgecolor": INK,
+            "markerfacecolor": LIGHT_GREY,
+            "markeredgecolor": DARK_GREY,
             "linestyle": "none",
         }
         handles.append(Line2D([], [], marker=marker, label=f"{status} ({has_status.sum()})", **legend_style))

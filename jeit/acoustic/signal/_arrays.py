@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
-from jeit.mesh.topology import distance, inside
+from jeit.mesh.topology import distance, is_inside_loops
 
 # Minimum sampling rate with which the vibrations of a touch can be recorded.
 MIN_RATE = 100.0  # Hz
@@ -135,7 +135,7 @@ def check_taps(positions: np.ndarray, outline: np.ndarray) -> None:
     """Raise `ValueError` if one of the taps at `positions` (T, 2) is outside the `outline` (K, 2) by more than 5 % of
     the skin's length."""
     extent = np.ptp(outline, axis=0).max()
-    outside = np.flatnonzero(~inside(positions, [outline]))
+    outside = np.flatnonzero(~is_inside_loops(positions, [outline]))
     distances = distance(positions[outside], outline, np.roll(outline, -1, axis=0)).min(axis=1)
     if outside.size and distances.max() > _MAX_OUTSIDE_SHARE * extent:
         row = int(outside[distances.argmax()])

@@ -29,7 +29,7 @@ from jeit.acoustic.signal._arrays import (
 )
 from jeit.acoustic.signal.faults import intensity_faults
 from jeit.acoustic.signal.sound_file import read_sound
-from jeit.files import need, npz_arrays, written_whole
+from jeit.files import npz_arrays, require_arrays, written_whole
 from jeit.mesh.topology import check_loop
 from jeit_solvers.module import Module
 
@@ -291,9 +291,9 @@ def read_recording(path: str | Path) -> Recording | Intensities:
         if content == "samples":
             if arrays["samples"].ndim == 3:
                 raise ValueError("samples has three axes, as a file of taps has: read that with read_taps.")
-            need(arrays, "rate")
+            require_arrays(arrays, "rate")
             return Recording(arrays["samples"], arrays["rate"], full_scale=arrays.get("full_scale"), name=path.stem)
-        need(arrays, "times")
+        require_arrays(arrays, "times")
         optional_arrays = {key: arrays[key] for key in optional if key in arrays}
         return Intensities(arrays["times"], arrays["intensity"], **optional_arrays, name=path.stem)
     except ValueError as error:
@@ -324,11 +324,11 @@ def read_taps(path: str | Path) -> Taps:
     try:
         keys = (*geometry, "intensity", "samples", "rate", "full_scale")
         arrays = npz_arrays(path, *keys, otherwise=_UNKNOWN_FORMAT)
-        need(arrays, *geometry)
+        require_arrays(arrays, *geometry)
         content = choose_array(arrays, "intensity", "samples")
         arguments = {"power" if content == "intensity" else "samples": arrays[content]}
         if content == "samples":
-            need(arrays, "rate")
+            require_arrays(arrays, "rate")
             arguments |= {"rate": arrays["rate"]}
         full_scale = arrays.get("full_scale")
         return Taps(*(arrays[key] for key in geometry), **arguments, full_scale=full_scale, name=path.stem)

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.io.wavfile
 
 from jeit.arguments.extras import optional
-from jeit.files import check_memory, read_as, reason
+from jeit.files import check_memory, error_text, read_as
 
 # Bytes of memory needed per byte of a sound file with eight bits per sample.
 _MEMORY_FACTOR = 16
@@ -62,7 +62,9 @@ def _read_wav(path: Path) -> tuple[np.ndarray, float, float | None]:
     if "Unknown wave file format" in str(problem):  # A-law or ADPCM, for example
         return _read_with_soundfile(path)
     if problem is not None:
-        raise ValueError(f"not a readable WAV file, or cut off ({reason(problem)}); write it as plain PCM or float.")
+        raise ValueError(
+            f"not a readable WAV file, or cut off ({error_text(problem)}); write it as plain PCM or float."
+        )
     samples = data.T if data.ndim == 2 else data[None]
     if data.dtype == np.uint8:
         return (samples - 128.0) / 128.0, rate, 1.0

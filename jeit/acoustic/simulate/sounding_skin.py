@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import check_key, check_kind, check_metres
 from jeit.arguments.checks import check_not_negative, check_positive
-from jeit.layout.layout import LARGEST
+from jeit.layout.layout import MAX_SKIN_SIZE
 from jeit_solvers.module import Module
 
 # Time between two slots of a multiplexer in seconds, and number of slots per multiplexer. Eight 4:1 multiplexers switch
@@ -53,7 +53,7 @@ class MicrophoneModel(Module):
 
     def __check_init__(self):
         for name in ("depth", "reach"):
-            check_metres(name, getattr(self, name), LARGEST, "the longest skin known")
+            check_metres(name, getattr(self, name), MAX_SKIN_SIZE, "the longest skin known")
         for name in ("gain_spread_db", "depth_spread", "noise_spread_db"):
             check_not_negative(name, getattr(self, name))
         if not np.isfinite(self.snr_db):
@@ -198,7 +198,7 @@ class ElastomerLayer(Module):
 
     def __check_init__(self):
         for name in ("width", "height"):
-            check_metres(name, getattr(self, name), LARGEST, "the longest skin known")
+            check_metres(name, getattr(self, name), MAX_SKIN_SIZE, "the longest skin known")
         check_metres("thickness", self.thickness, max(self.width, self.height), "the layer is wide")
         check_kind("material", self.material, Elastomer, "an Elastomer, such as Elastomer(shear_modulus=1e5)")
         if not -1 <= self.reflection <= 1:

@@ -25,7 +25,7 @@ def demo(
     import jax
     import numpy as np
 
-    from jeit.cli.console import Steps, pairs, plain_console, say_written
+    from jeit.cli.console import Steps, name_value_table, plain_console, say_written
     from jeit.data.round_skin import RoundSkin, simulate_press
     from jeit.imaging import image_difference
     from jeit.report import write_image
@@ -52,6 +52,6 @@ def demo(
         ("error", f"{1e3 * error:.1f} mm, {100 * error / (2 * skin.radius):.1f} % of the diameter"),
     ]
     console.print()
-    console.print(pairs("A simulated press", rows))
+    console.print(name_value_table("A simulated press", rows))
     console.print()
     say_written(console, output / "image.png", "image.npz", "report.json")

@@ -198,7 +198,7 @@ def _body_tables(shape: str, width: float | None, height: float | None) -> tuple
 def _print_findings(console, data: Path, findings: "Findings") -> None:
     """Print the explanations of the file that were found."""
     from jeit.arguments import counted, percent
-    from jeit.cli.console import pairs
+    from jeit.cli.console import name_value_table
 
     rows = []
     for candidate in findings.candidates[:_MAX_LISTED]:
@@ -214,5 +214,5 @@ def _print_findings(console, data: Path, findings: "Findings") -> None:
     if best_candidate.wiring is not None and best_candidate.wiring.explanation and not best_candidate.reversed_signs:
         rows.append(("wiring", best_candidate.wiring.explanation))
     console.print()
-    console.print(pairs(f"{data.name} may be", rows))
+    console.print(name_value_table(f"{data.name} may be", rows))
     console.print()

@@ -174,7 +174,7 @@ def show(console, result: "ImagedDifference", *, frame_given: bool = False) -> N
     import numpy as np
 
     from jeit.arguments import counted, percent
-    from jeit.cli.console import inclusion_table, pairs, quantity_table, scaled
+    from jeit.cli.console import inclusion_table, name_value_table, quantity_table, with_unit
     from jeit.inverse.nonlinear.reconstruct import Reconstruction
     from jeit_solvers import Status
 
@@ -184,9 +184,9 @@ def show(console, result: "ImagedDifference", *, frame_given: bool = False) -> N
     hyperparameter = float(reconstruction.hyperparameter)
     choice_text = "none" if result.chosen_by == "none" else f"{hyperparameter:.3g} ({result.chosen_by})"
     background = np.asarray(calibration.conductivity).item()
-    background_text = scaled(background.real, unit)
+    background_text = with_unit(background.real, unit)
     background_text += (
-        f" and {scaled(background.imag, unit)} of susceptivity" if isinstance(background, complex) else ""
+        f" and {with_unit(background.imag, unit)} of susceptivity" if isinstance(background, complex) else ""
     )
     rows = [
         ("background", f"{background_text}, misfit {percent(float(calibration.misfit))}"),
@@ -227,7 +227,7 @@ def show(console, result: "ImagedDifference", *, frame_given: bool = False) -> N
     console.print()
     if result.num_frames > 1:
         rows.insert(0, ("frame", _frame_text(result, frame_given)))
-    console.print(pairs(result.measurement.name, rows))
+    console.print(name_value_table(result.measurement.name, rows))
     console.print()
     if any(inclusion.contrast_interval is not None for inclusion in result.inclusions):
         table, note = quantity_table(result.inclusions, background.real), ""

@@ -89,7 +89,7 @@ def series(
     import numpy as np
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps, plain_console, say_written, scaled
+    from jeit.cli.console import Steps, plain_console, say_written, with_unit
     from jeit.image import oscillation
     from jeit.imaging import ImagingSettings, image_sequence
     from jeit.report import write_series
@@ -143,7 +143,7 @@ def series(
     for entry in report["oscillations"]:
         console.print(f"{entry['frequency']:.4g} Hz (resolution {entry['resolution']:.2g} Hz):")
         for name, component in entry["regions"].items():
-            sizes = f"{scaled(component['amplitude'], unit)} ± {scaled(component['noise'], unit)}"
+            sizes = f"{with_unit(component['amplitude'], unit)} ± {with_unit(component['noise'], unit)}"
             console.print(f"  {name}: amplitude {sizes}, phase {component['phase_degrees']:.0f}°", markup=False)
     say_written(console, output / "series.png", "series.npz", "regions.csv", "report.json", *films)
 

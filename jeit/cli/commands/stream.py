@@ -118,7 +118,7 @@ def stream(
     import numpy as np
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps, plain_console, say_written, scaled
+    from jeit.cli.console import Steps, plain_console, say_written, with_unit
     from jeit.cli.streams import FrameCounter, Stopping
     from jeit.data.imageable import mask_spikes
     from jeit.imaging.stream_preparation import StreamSettings, frames_of, parse_frames, prepare_imager
@@ -189,9 +189,9 @@ def stream(
                         f"  frame {frame_image.number}: {frame_image.status}. {frame_image.reason}", soft_wrap=True
                     )
 
-            drawing = stopping.before(PICTURES, step)
+            drawing = stopping.drawing_reporter(PICTURES, step)
             images = stream_images(imager, stopping.until(frames))
-            with stopping.ending(frame_counter, "frames.csv", "images.npz"):
+            with stopping.exit_after_signal(frame_counter, "frames.csv", "images.npz"):
                 written = write_stream(
                     images, calibration, output, name=data, film=film_name, rate=rate, progress=show, drawing=drawing
                 )
@@ -202,7 +202,7 @@ def stream(
     if quiet:
         return
     counts_text = ", ".join(f"{count} {status}" for status, count in sorted(written.counts.items()))
-    background = scaled(float(calibration.conductivity), "S" if calibration.model.mesh.dimension == 2 else "S/m")
+    background = with_unit(float(calibration.conductivity), "S" if calibration.model.mesh.dimension == 2 else "S/m")
     console.print(f"\n{counted(written.number, 'frame')}: {counts_text}; background {background}")
     median, upper_quantile = 1e3 * np.quantile(written.latency, (0.5, 0.99))
     console.print(f"latency: median {median:.2f} ms, 99 % within {upper_quantile:.2f} ms")

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from jeit.arguments import counted, listed
+from jeit.arguments import counted, names_text
 from jeit.data.description import Description, parse_description
 from jeit.data.formats.recording import Recording, content_of, description_of, measurement_of
 from jeit.data.formats.table import description_like, find_description
@@ -77,9 +77,13 @@ class Cn0565:
         """
         _check_no_key(path, key)
         values, notes = cls.numbers(path)
-        lender = _lender(path, description, like)
-        sensor_description = description_of(path, description) if lender is None else description_like(lender)
-        protocol, protocol_notes = cls._protocol(path, sensor_description, values.shape[1], lender)
+        described_measurement = _measurement_with_description(path, description, like)
+        sensor_description = (
+            description_of(path, description)
+            if described_measurement is None
+            else description_like(described_measurement)
+        )
+        protocol, protocol_notes = cls._protocol(path, sensor_description, values.shape[1], described_measurement)
         sensor_description = replace(sensor_description, protocol_section=None)
         measurement = measurement_of(
             path, Recording(values, protocol, notes=(*cls._SCALE_NOTES, *protocol_notes, *notes)), sensor_description
@@ -110,7 +114,9 @@ class Cn0565:
             )
         num_electrodes = next((count for count in cls._ELECTRODE_COUNTS if count * (count - 3) == num_voltages), None)
         if num_electrodes is None:
-            usual_counts = listed([f"{count * (count - 3)} ({count} electrodes)" for count in cls._ELECTRODE_COUNTS])
+            usual_counts = names_text(
+                [f"{count * (count - 3)} ({count} electrodes)" for count in cls._ELECTRODE_COUNTS]
+            )
             raise ValueError(
                 f"{path.name}: {num_voltages} voltages in a frame; with force and sense distance 1 they are "
                 f"{usual_counts}. Give a description with [protocol]: {cls._DISTANCE_HINT}."
@@ -226,8 +232,12 @@ class OpenEit:
         """
         _check_no_key(path, key)
         values, notes = cls.numbers(path)
-        lender = _lender(path, description, like)
-        sensor_description = description_of(path, description) if lender is None else description_like(lender)
+        described_measurement = _measurement_with_description(path, description, like)
+        sensor_description = (
+            description_of(path, description)
+            if described_measurement is None
+            else description_like(described_measurement)
+        )
         table = {**cls._PROTOCOL_TABLES[values.shape[1]], "current": _ASSUMED_CURRENT}
         protocol = parse_description({"protocol": table}, path.name).protocol(path)
         assert protocol is not None
@@ -267,7 +277,7 @@ class OpenEit:
         if not frames:
             raise ValueError(f"{path.name}: no frame begins with 'magnitudes:', as those of an OpenEIT device do.")
         if frame_length not in cls._PROTOCOL_TABLES:
-            known_counts = listed(
+            known_counts = names_text(
                 [f"{channels} ({table['number']} electrodes)" for channels, table in cls._PROTOCOL_TABLES.items()]
             )
             raise ValueError(
@@ -322,10 +332,10 @@ class OpenEit:
             cells = [cell for cell in cells if cell]
             while cells and not cells[-1][0][:1].isdigit():
                 cells.pop()
-            yield array("d", (cls._cell_value(cell, is_last=cell is cells[-1]) for cell in cells))
+            yield array("d", (cls._parse_table_cell(cell, is_last=cell is cells[-1]) for cell in cells))
 
     @classmethod
-    def _cell_value(cls, words: list[bytes], *, is_last: bool) -> float:
+    def _parse_table_cell(cls, words: list[bytes], *, is_last: bool) -> float:
         """The number in a cell of `words`, NaN if the cell is not a number; words may follow the last number of a
         frame."""
         is_number = cls._NUMBER.fullmatch(words[0]) and (is_last or len(words) == 1)
@@ -343,7 +353,9 @@ def _check_no_key(path: Path, key: str | None) -> None:
         raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
 
 
-def _lender(path: Path, description: str | Path | None, like: Measurement | None) -> Measurement | None:
+def _measurement_with_description(
+    path: Path, description: str | Path | None, like: Measurement | None
+) -> Measurement | None:
     """The measurement whose description is used for a file: `like` if no description is specified and none lies beside
     the file, otherwise None."""
     return like if description is None and find_description(path) is None else None
@@ -361,4 +373,4 @@ def _cut_off_note(length: int) -> str:
 def _notes_on_damage(is_damaged: Bool[np.ndarray, " F"]) -> list[str]:
     """A note on the frames in which characters were lost; none without such frames."""
     frames = [str(frame_index) for frame_index in np.flatnonzero(is_damaged)]
-    return [f"characters are lost in frame{'s' * (len(frames) > 1)} {listed(frames)}: masked."] if frames else []
+    return [f"characters are lost in frame{'s' * (len(frames) > 1)} {names_text(frames)}: masked."] if frames else []

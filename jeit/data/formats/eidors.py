@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jeit.arguments import listed
+from jeit.arguments import names_text
 from jeit.data.description import Description, load_description, parse_description
 from jeit.data.formats.table import channel_counts, description_like, frames_of, measurement_in
 from jeit.data.formats.text import frames_in_table
@@ -130,7 +130,7 @@ def _keys(
 
 def _list_shapes(shapes: dict[str, tuple[int, ...]]) -> str:
     return (
-        listed([f"{name} ({' × '.join(map(str, shape))})" for name, shape in shapes.items()])
+        names_text([f"{name} ({' × '.join(map(str, shape))})" for name, shape in shapes.items()])
         if shapes
         else "no numbers"
     )

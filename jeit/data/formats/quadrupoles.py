@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Inexact, Int
 
-from jeit.arguments import counted, listed
+from jeit.arguments import counted, names_text
 from jeit.data.description import Description, load_description, parse_description
 from jeit.data.formats.recording import Recording, content_of, measurement_of
 from jeit.data.formats.table import description_like, find_description
@@ -394,7 +394,7 @@ def _frame_of_lines(
     if (channel_of_line == channel_of_line[rows % num_channels]).all():
         num_frames = -(-len(channel_of_line) // num_channels)
         return rows // num_channels, (f"its lines repeat: {counted(num_frames, 'frame')}.",) if num_frames > 1 else ()
-    repeated_measurements = listed(
+    repeated_measurements = names_text(
         [str(row + 1) for row in rows[1:][np.isin(channel_of_line[1:], channel_of_line[:1])][:3]]
     )
     raise ValueError(

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Inexact
 
-from jeit.arguments import listed
+from jeit.arguments import names_text
 from jeit.data.described_protocol import PROTOCOL_ARRAYS
 from jeit.data.description import Description, TableLayout, load_description
 from jeit.data.formats.text import (
@@ -23,7 +23,7 @@ from jeit.data.formats.text import (
 )
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
-from jeit.data.unstated import driven_zeros, fitting_protocol, with_signs
+from jeit.data.unstated import fitting_protocol, unmeasured_driven_channels, with_signs
 from jeit.files import npy_array, npz_arrays
 from jeit.protocol import Protocol
 
@@ -135,7 +135,7 @@ def measurement_in(
     sensor_description = replace(sensor_description, layout=layout, notes=(*notes, *protocol_notes))
     reason = ""
     if protocol is not None and frames.shape[-1] == protocol.num_measurements:
-        unread_channels = driven_zeros(frames, protocol)
+        unread_channels = unmeasured_driven_channels(frames, protocol)
         if unread_channels.any():
             mask = ~unread_channels if mask is None else np.asarray(mask) & ~unread_channels
             reason = "they read driven electrodes, and are zero in every frame."
@@ -290,7 +290,7 @@ def _voltages(arrays: dict[str, np.ndarray], layout: TableLayout, path: Path) ->
     keys = layout.keys if layout.keys and path.suffix.lower() == ".npz" else ("voltages",)
     missing_keys = [key for key in keys if key not in arrays]
     if missing_keys:
-        array_names = listed(sorted(arrays.get("", arrays)))
+        array_names = names_text(sorted(arrays.get("", arrays)))
         raise ValueError(
             f"{path.name}: there is no array '{missing_keys[0]}'; the file has {array_names}. Name the voltages with "
             "[data] keys in the description."

@@ -354,8 +354,8 @@ def _wrapped_frames(text: Text, counts: Sequence[int]) -> tuple[int, int] | None
     return min(candidates, key=lambda candidate: candidate[1] > 0, default=None)
 
 
-def _truncation_notes(num_numbers: int) -> tuple[str, ...]:
-    return (f"the last line is cut off after {counted(num_numbers, 'number')}, and left out.",) if num_numbers else ()
+def _truncation_notes(num_values: int) -> tuple[str, ...]:
+    return (f"the last line is cut off after {counted(num_values, 'number')}, and left out.",) if num_values else ()
 
 
 def frames_in_table(

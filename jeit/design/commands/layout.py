@@ -75,7 +75,7 @@ _COMPARED_QUANTITIES = (
 
 
 @layout.callback(invoke_without_command=True)
-def _top(context: typer.Context) -> None:
+def _print_help(context: typer.Context) -> None:
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
 
@@ -87,12 +87,12 @@ def _read_with_outline(name: str, width: float, height: float) -> "Layout":
     Raises `ValueError` for a layout with fewer than three electrodes.
     """
     from jeit.layout import named_layout, read_layout
-    from jeit.layout.layout import LARGEST, SMALLEST
+    from jeit.layout.layout import MAX_SKIN_SIZE, MIN_SKIN_SIZE
     from jeit.mesh import Rectangle
 
     def outline_from_options() -> Rectangle:
         for option, side in (("--width-mm", width), ("--height-mm", height)):
-            check_within(option, side, 1e3 * SMALLEST, 1e3 * LARGEST, "mm")
+            check_within(option, side, 1e3 * MIN_SKIN_SIZE, 1e3 * MAX_SKIN_SIZE, "mm")
         return Rectangle(1e-3 * width, 1e-3 * height)
 
     with naming_options({"name": "layout", "path": "layout"}):
@@ -194,7 +194,7 @@ def optimise(
 
 
 def _print_improvement(console, result: "ImprovedLayout") -> None:
-    from jeit.cli.console import pairs
+    from jeit.cli.console import name_value_table
     from jeit.design.reports import report_improved_layout
 
     report = report_improved_layout(result)
@@ -206,7 +206,7 @@ def _print_improvement(console, result: "ImprovedLayout") -> None:
         for name, factor, before, after in quantities
         if before is not None and after is not None
     ]
-    console.print(pairs(result.start.name, rows))
+    console.print(name_value_table(result.start.name, rows))
     console.print(f"  {report['status']}: {report['reason']}", soft_wrap=True)
     console.print(
         "  on a sheet that is touched everywhere, with all two-terminal pairs: 'jeit layout compare' computes figures "

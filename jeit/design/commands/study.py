@@ -27,7 +27,7 @@ Scheduler = Annotated[
 
 
 @study.callback(invoke_without_command=True)
-def _top(context: typer.Context) -> None:
+def _print_help(context: typer.Context) -> None:
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
 
@@ -132,7 +132,7 @@ def _run_with_progress(
     columns = (task_column, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), time_column)
     try:
         with ExitStack() as stack:
-            client = None if scheduler is None else stack.enter_context(connected(scheduler))
+            client = None if scheduler is None else stack.enter_context(connect_to_scheduler(scheduler))
             bar = stack.enter_context(Bar(*columns, console=console, disable=quiet))
             task = bar.add_task("points", total=len(sweep.points), left="")
 
@@ -151,7 +151,7 @@ def _run_with_progress(
         say_written(console, store, str(report_path))
 
 
-def connected(scheduler: str):
+def connect_to_scheduler(scheduler: str):
     """Connect to the dask scheduler at the address `scheduler`. Raises `ValueError` if the scheduler does not
     answer."""
     from jeit.arguments.extras import optional

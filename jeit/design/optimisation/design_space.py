@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.arguments import check_kind, check_metres, describe, is_number
-from jeit.design.optimisation.variables import Symmetry, Variables, Varied
+from jeit.design.optimisation.variables import LayoutParameters, Symmetry, Variables
 from jeit.design.skin.skin import Skin, longer_side
 from jeit.layout import SurfaceLayout
 from jeit.mesh import Domain
@@ -50,12 +50,14 @@ class Constraints(Module):
                 f"{1e3 * (x_max - x_min):.3g} × {1e3 * (y_max - y_min):.3g} mm; give less, or fewer electrodes."
             )
 
-    def shortfall(self, centres: Float[Array, "L 2"], radii: Float[Array, " L"]) -> Float[Array, " q"]:
+    def violations(self, centres: Float[Array, "L 2"], radii: Float[Array, " L"]) -> Float[Array, " q"]:
         """Violation (q,) of each of q constraints, metres: positive if the constraint is violated, otherwise zero or
         negative. The violation is differentiable almost everywhere."""
-        return jnp.concatenate(list(self.shortfalls(centres, radii).values()))
+        return jnp.concatenate(list(self.violations_by_name(centres, radii).values()))
 
-    def shortfalls(self, centres: Float[Array, "L 2"], radii: Float[Array, " L"]) -> dict[str, Float[Array, " q"]]:
+    def violations_by_name(
+        self, centres: Float[Array, "L 2"], radii: Float[Array, " L"]
+    ) -> dict[str, Float[Array, " q"]]:
         """Violations of the constraints on L discs, metres, by the name of the constraint: "minimum_spacing", "outline"
         and "keep_out"."""
         first, second = np.triu_indices(len(radii), 1)
@@ -146,19 +148,21 @@ class DesignSpace(Module):
         Raises `ValueError` for settings of the design space that no layout can satisfy."""
         options = {"sizes": self.sizes, "contacts": self.contact_impedance, "thickness": self.thickness}
         outline = constraints.outline
-        variables = Variables.create(outline, varied_of(skin), symmetry=self.symmetry, **options)
+        variables = Variables.create(outline, parameters_of(skin), symmetry=self.symmetry, **options)
         if self.thickness is not None:
             _check_thickness(self.thickness, depth, outline)
-        constraints.check_room(variables.smallest)
+        constraints.check_room(variables.min_radii)
         return variables
 
 
-def varied_of(skin: Skin) -> Varied:
+def parameters_of(skin: Skin) -> LayoutParameters:
     """Current positions, radii and contact impedances of a skin's electrodes and its thickness: the quantities that a
     layout optimisation may vary."""
     discs = skin.model.electrodes
     contact_impedance = discs.contact_impedance  # pyright: ignore[reportAttributeAccessIssue]
-    return Varied(skin.layout.centres, skin.layout.diameters / 2, contact_impedance, jnp.asarray(skin.thickness, float))
+    return LayoutParameters(
+        skin.layout.centres, skin.layout.diameters / 2, contact_impedance, jnp.asarray(skin.thickness, float)
+    )
 
 
 def _check_thickness(thickness: tuple[float, float], depth: float, outline: Domain) -> None:
@@ -188,7 +192,7 @@ class Record:
             self._callback(len(self.scores) - 1, self.scores[-1])
 
 
-def descend(
+def minimise_from_starts(
     cost, variables: Float[Array, "S v"], steps: int, record: Record, *, tolerance: float = _TOLERANCE
 ) -> tuple[Float[Array, "S v"], Status]:
     """Minimise the sum of the costs of S starts over v variables between 0 and 1 by L-BFGS. Returns the final variables

@@ -19,8 +19,8 @@ from jaxtyping import Array, Float
 
 from jeit.arguments import check_key, check_kind
 from jeit.design.defaults import STEPS
-from jeit.design.optimisation.design_space import Constraints, DesignSpace, Record, descend, varied_of
-from jeit.design.optimisation.variables import Objective, Variables, Varied
+from jeit.design.optimisation.design_space import Constraints, DesignSpace, Record, minimise_from_starts, parameters_of
+from jeit.design.optimisation.variables import LayoutParameters, Objective, Variables
 from jeit.design.scores import Scores
 from jeit.design.skin.skin import Skin, check_skin
 from jeit.layout import Layout, SurfaceLayout
@@ -119,20 +119,20 @@ def optimise_layout(
     initial_variables = np.stack([variables.start, *_random_starts(variables, constraints, starts - 1, key)])
     # The given layout is used unchanged, unless it violates the symmetry or the constraints.
     initial_variables = _make_feasible(variables, constraints, jnp.asarray(np.array(initial_variables)))
-    initial_scores = objective.scores_of_varied(skin, varied_of(skin))
+    initial_scores = objective.scores_of_varied(skin, parameters_of(skin))
     start_value = float(objective.score(initial_scores))
     if not np.isfinite(start_value):
         raise ValueError("score is not finite for the layout given; does some touch change no voltage?")
     search = _LayoutSearch(skin, objective, constraints, variables)
     final_variables, record, status = search.run(jnp.asarray(np.array(initial_variables)), steps, callback)
-    final_parameters = jax.tree.map(np.asarray, _varied(variables, final_variables))
+    final_parameters = jax.tree.map(np.asarray, _parameters_of_starts(variables, final_variables))
     values = np.asarray(search.cost(final_variables, 0.0)[1])
     centres_and_radii = zip(final_parameters.centres, final_parameters.radii, strict=True)
     violations = np.array([_largest_violation(constraints, centres, radii) for centres, radii in centres_and_radii])
     best, status, reason = search.choose_best(final_parameters, values, violations, start_value, status)
     final_layout, scores = skin.layout, initial_scores
     if best is not None:
-        best_parameters = Varied(*(values_of_starts[best] for values_of_starts in final_parameters))
+        best_parameters = LayoutParameters(*(values_of_starts[best] for values_of_starts in final_parameters))
         final_layout = search.create_layout(best_parameters, space.contact_impedance is not None)
         scores = objective.scores_of_varied(skin, best_parameters)
     return Optimisation(
@@ -145,7 +145,11 @@ def optimise_layout(
         shortfall=np.maximum(violations, 0),
         history=np.stack(record.scores, axis=1),
         snapshots=np.stack(
-            [np.asarray(_varied(variables, step_variables).centres) for step_variables in record.variables], axis=1
+            [
+                np.asarray(_parameters_of_starts(variables, step_variables).centres)
+                for step_variables in record.variables
+            ],
+            axis=1,
         ),
         best=best,
         status=status,
@@ -178,23 +182,25 @@ class _LayoutSearch(Module):
             num_steps = round(end_fraction * steps) - num_steps_done
             num_steps_done += num_steps
             if num_steps:
-                variables, status = descend(partial(self.cost, penalty_weight=weight), variables, num_steps, record)
+                variables, status = minimise_from_starts(
+                    partial(self.cost, penalty_weight=weight), variables, num_steps, record
+                )
         return _make_feasible(self.variables, self.constraints, variables), record, status
 
     def choose_best(
-        self, parameters: Varied, values, violations, start_value: float, status: str
+        self, parameters: LayoutParameters, values, violations, start_value: float, status: str
     ) -> tuple[int | None, str, str]:
         """Choose the start with the best final layout. Returns its index, the status, and the reason in words. The
         index is None if no start satisfies the constraints or improves on the given layout."""
         layout = self.skin.layout
         is_valid = (violations <= 0) & np.isfinite(values)
-        is_initial_valid = self.variables.represents(varied_of(self.skin))
+        is_initial_valid = self.variables.represents(parameters_of(self.skin))
         is_initial_valid = (
             is_initial_valid and _largest_violation(self.constraints, layout.centres, layout.diameters / 2) <= 1e-9
         )
         if not is_valid.any():
             nearest_start = int(violations.argmin())
-            violations_by_name = self.constraints.shortfalls(
+            violations_by_name = self.constraints.violations_by_name(
                 jnp.asarray(parameters.centres[nearest_start]), jnp.asarray(parameters.radii[nearest_start])
             )
             worst_name = max(
@@ -215,7 +221,7 @@ class _LayoutSearch(Module):
             )
         return best, status, reason
 
-    def create_layout(self, parameters: Varied, varies_contacts: bool) -> Layout:
+    def create_layout(self, parameters: LayoutParameters, varies_contacts: bool) -> Layout:
         """Create the layout with the final `parameters`. The contact impedances are those of `parameters` if
         `varies_contacts`, and otherwise those of the given layout."""
         layout = self.skin.layout
@@ -248,13 +254,13 @@ def _random_starts(variables: Variables, constraints: Constraints, num_layouts: 
 
 
 def _penalty(variables: Variables, constraints: Constraints, variable_values, margin=0.0) -> Float[Array, ""]:
-    violations = constraints.shortfall(*variables.varied(variable_values)[:2]) + margin
+    violations = constraints.violations(*variables.parameters(variable_values)[:2]) + margin
     return jnp.sum((jnp.maximum(violations, 0) / variables.pitch) ** 2)
 
 
 def _largest_violation(constraints: Constraints, centres, radii) -> float:
     """Largest violation of a constraint, metres; zero or negative if all constraints are satisfied."""
-    return float(jnp.max(constraints.shortfall(jnp.asarray(centres), jnp.asarray(radii))))
+    return float(jnp.max(constraints.violations(jnp.asarray(centres), jnp.asarray(radii))))
 
 
 def _make_feasible(variables: Variables, constraints: Constraints, start_variables):
@@ -265,7 +271,7 @@ def _make_feasible(variables: Variables, constraints: Constraints, start_variabl
         penalties, gradients = _penalty_and_gradient(start_variables, variables, constraints)
         return penalties, -penalties, gradients
 
-    return descend(cost, start_variables, 500, Record(), tolerance=0.0)[0]
+    return minimise_from_starts(cost, start_variables, 500, Record(), tolerance=0.0)[0]
 
 
 @eqx.filter_jit
@@ -285,7 +291,7 @@ def _penalised_cost(all_variables, penalty_weight, search: _LayoutSearch):
     variables, constraints, objective = search.variables, search.constraints, search.objective
 
     def cost_and_score(start_variables):
-        parameters = variables.varied(start_variables)
+        parameters = variables.parameters(start_variables)
         # The score is undefined for an electrode outside the skin, so the electrode is moved to the nearest point of
         # the skin.
         clipped_parameters = parameters._replace(centres=constraints.outline.nearest(parameters.centres))
@@ -298,8 +304,8 @@ def _penalised_cost(all_variables, penalty_weight, search: _LayoutSearch):
 
 
 @eqx.filter_jit
-def _varied(variables: Variables, all_variables) -> Varied:
-    return jax.vmap(variables.varied)(all_variables)
+def _parameters_of_starts(variables: Variables, all_variables) -> LayoutParameters:
+    return jax.vmap(variables.parameters)(all_variables)
 
 
 def _check_arguments(skin: Skin, objective: Objective, space: DesignSpace, steps: int, starts: int, key) -> None:

@@ -31,7 +31,7 @@ _IMAGES = {
 }
 
 
-class Varied(NamedTuple):
+class LayoutParameters(NamedTuple):
     """The parameters that an optimisation may vary: `centres` (L, 2) and `radii` (L,) of the electrodes in metres,
     their `contact_impedance` (L,) in ohm·m², and the `thickness` of the sheet in metres."""
 
@@ -68,8 +68,8 @@ class Range(Module):
 
 
 class Variables(Module):
-    """Mapping from design variables between 0 and 1 to the parameters `Varied` of a layout. The variables describe G
-    electrodes, the generators; the other electrodes are images of the generators under the symmetry.
+    """Mapping from design variables between 0 and 1 to the parameters `LayoutParameters` of a layout. The variables
+    describe G electrodes, the generators; the other electrodes are images of the generators under the symmetry.
 
     **Fields**
 
@@ -87,7 +87,7 @@ class Variables(Module):
     size: np.ndarray
     images: np.ndarray
     order: np.ndarray
-    initial: Varied
+    initial: LayoutParameters
     sizes: Range | None
     contacts: Range | None
     thickness: Range | None
@@ -96,7 +96,7 @@ class Variables(Module):
 
     @classmethod
     def create(
-        cls, outline: Domain, initial: Varied, *, symmetry=None, sizes=False, contacts=None, thickness=None
+        cls, outline: Domain, initial: LayoutParameters, *, symmetry=None, sizes=False, contacts=None, thickness=None
     ) -> "Variables":
         """Create the mapping from the `initial` parameters of a layout. Raises `ValueError` for settings that
         contradict the parameters."""
@@ -141,20 +141,20 @@ class Variables(Module):
             jnp.tile(jnp.asarray(values)[is_generator], len(images))[order]
             for values in (radii, initial.contact_impedance)
         )
-        symmetric_parameters = Varied(initial.centres, radii, impedance, initial.thickness)
+        symmetric_parameters = LayoutParameters(initial.centres, radii, impedance, initial.thickness)
         pitch = float(np.sqrt(np.prod(size) / len(order)))
         ranges = size_range, contact_range, thickness_range
         return cls(low, size, images, order, symmetric_parameters, *ranges, np.concatenate(start), pitch)
 
-    def represents(self, varied: Varied) -> bool:
-        """Whether the variables `start` reproduce the parameters `varied`: True if `varied` has the symmetry and lies
-        in the ranges."""
-        represented = self.varied(jnp.asarray(self.start))
+    def represents(self, parameters: LayoutParameters) -> bool:
+        """Whether the variables `start` reproduce the given `parameters`: True if the parameters have the symmetry and
+        lie in the ranges."""
+        represented = self.parameters(jnp.asarray(self.start))
         are_equal = (
             np.allclose(represented_values, given_values, rtol=1e-6, atol=0)
-            for represented_values, given_values in zip(represented[1:], varied[1:], strict=True)
+            for represented_values, given_values in zip(represented[1:], parameters[1:], strict=True)
         )
-        return bool(np.allclose(represented.centres, varied.centres, atol=1e-6)) and all(are_equal)
+        return bool(np.allclose(represented.centres, parameters.centres, atol=1e-6)) and all(are_equal)
 
     @property
     def num_generators(self) -> int:
@@ -162,13 +162,13 @@ class Variables(Module):
         return len(self.order) // len(self.images)
 
     @property
-    def smallest(self) -> Float[np.ndarray, " L"]:
+    def min_radii(self) -> Float[np.ndarray, " L"]:
         """Minimum radii (L,) of the electrodes, metres."""
         if self.sizes is None:
             return np.asarray(self.initial.radii)
         return np.tile(self.sizes.lower, len(self.images))[self.order]
 
-    def varied(self, variables: Float[Array, " v"]) -> Varied:
+    def parameters(self, variables: Float[Array, " v"]) -> LayoutParameters:
         """Parameters of the layout that correspond to the design variables (v,) between 0 and 1."""
         num_generators = self.num_generators
         offsets, remaining_variables = (
@@ -189,7 +189,7 @@ class Variables(Module):
             )
         if self.thickness is not None:
             thickness = self.thickness.values(remaining_variables)[0]
-        return Varied(centres[self.order], radii, contact_impedance, thickness)
+        return LayoutParameters(centres[self.order], radii, contact_impedance, thickness)
 
     def _values_of_images(self, values: Float[Array, " G"]) -> Float[Array, " L"]:
         """Repeat the values (G,) of the generators for their images: values (L,) of all electrodes."""
@@ -279,7 +279,7 @@ class Objective(Module):
         options = {"prior": self.prior, "noise": self.noise, "temperature": self.temperature}
         return layout_scores(skin.model, skin.model_conductivity, self.touches, **options)
 
-    def scores_of_varied(self, skin: Skin, varied: Varied) -> Scores:
+    def scores_of_varied(self, skin: Skin, varied: LayoutParameters) -> Scores:
         """Compute the scores of a skin with its electrodes and thickness replaced by those of `varied`. The scores are
         differentiable with respect to `varied`."""
         model = skin.model.with_electrodes(SheetDiscs(varied.centres, varied.radii, varied.contact_impedance))

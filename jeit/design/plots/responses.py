@@ -16,9 +16,9 @@ from jeit.arguments import check_kind, check_name
 from jeit.design.sensitivity import SensitivityMap
 from jeit.design.taxels import Taxels
 from jeit.plot.axes import (
-    INK,
+    DARK_GREY,
+    LIGHT_GREY,
     SEQUENTIAL,
-    SOFT,
     axes_or_new,
     draw_colour_bar,
     draw_legend_above,
@@ -28,7 +28,7 @@ from jeit.plot.axes import (
     soften_axes,
 )
 
-_COLOURS = (INK, "#c8102e", "#1f6fb4", "#2a9d6f")
+_COLOURS = (DARK_GREY, "#c8102e", "#1f6fb4", "#2a9d6f")
 _TAXEL_COLOURS = (*_COLOURS, "#8a5cb8", "#d98a1c")
 _PALETTE = "Set3"
 _QUANTITIES = {"area": "Taxel area (cm²)", "coverage": "Taxels over a point", "label": ""}
@@ -81,7 +81,7 @@ def plot_sensitivity_map(
     draw_colour_bar(ax, image, "Sensitivity (mV)")
     if electrodes is not None:
         x, y = np.asarray(electrodes).T[:2]
-        ax.plot(x, y, "o", markersize=4, markerfacecolor="white", markeredgecolor=INK, markeredgewidth=0.8)
+        ax.plot(x, y, "o", markersize=4, markerfacecolor="white", markeredgecolor=DARK_GREY, markeredgewidth=0.8)
     hide_axes(ax, extent, numbered=False)
     draw_scale_bar(ax, extent)
     if title:
@@ -121,10 +121,10 @@ def plot_sensitivity_histograms(
         ax.stairs(100 * sensitivity.histogram(edges)[0], 1e3 * edges, color=colour, label=name, linewidth=1.4)
     first_name, sensitivity = next(iter(maps.items()))
     ax.axvline(
-        1e3 * float(sensitivity.minimum), color=SOFT, linewidth=1, linestyle="--", label=f"least of {first_name}"
+        1e3 * float(sensitivity.minimum), color=LIGHT_GREY, linewidth=1, linestyle="--", label=f"least of {first_name}"
     )
-    ax.set_xlabel("Sensitivity (mV)", color=INK)
-    ax.set_ylabel("Share of the area (%)", color=INK)
+    ax.set_xlabel("Sensitivity (mV)", color=DARK_GREY)
+    ax.set_ylabel("Share of the area (%)", color=DARK_GREY)
     soften_axes(ax)
     draw_legend_above(ax)
     if title:
@@ -181,7 +181,7 @@ def plot_taxels(
         cells.set_clim(0, float(values.max()) if limit is None else limit * (1e4 if colour == "area" else 1))
         draw_colour_bar(ax, cells, _QUANTITIES[colour])
     if outlines:
-        style = {"colour": INK if colour == "label" else "white", "width": 0.7}
+        style = {"colour": DARK_GREY if colour == "label" else "white", "width": 0.7}
         _draw_outlines(ax, taxels, range(len(taxels.similarity)), **style)
     _finish_axes(ax, taxels, electrodes, title)
     return ax
@@ -222,8 +222,8 @@ def plot_taxel_areas(
         counts = np.histogram(area, edges)[0]
         ax.stairs(counts, edges, fill=True, color=colour, alpha=0.25)
         ax.stairs(counts, edges, color=colour, linewidth=1.6, label=label)
-    ax.set_xlabel("Taxel area (cm²)", color=INK)
-    ax.set_ylabel("Taxels", color=INK)
+    ax.set_xlabel("Taxel area (cm²)", color=DARK_GREY)
+    ax.set_ylabel("Taxels", color=DARK_GREY)
     ax.set_title(title or "")
     soften_axes(ax)
     draw_legend_above(ax)
@@ -321,7 +321,7 @@ def _finish_axes(ax: Axes, taxels: Taxels, electrodes: ArrayLike | None, title: 
         positions = np.asarray(electrodes, float)
         if positions.ndim != 2 or positions.shape[1] not in (2, 3):
             raise ValueError(f"electrodes has shape {positions.shape}; give positions (L, 2) or (L, 3) in metres.")
-        style = {"markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": INK, "markeredgewidth": 0.8}
+        style = {"markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": DARK_GREY, "markeredgewidth": 0.8}
         ax.plot(*positions[:, :2].T, marker="o", linestyle="none", **style)
     half_sizes = np.stack(_cell_sides(taxels), axis=1) / 2
     places = np.asarray(taxels.places)

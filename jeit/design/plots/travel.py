@@ -14,10 +14,10 @@ from jeit.arguments import check_kind
 from jeit.design.optimisation.optimise import Optimisation
 from jeit.layout.surface_layout import flat_layout
 from jeit.mesh import Domain
-from jeit.plot.axes import INK, SOFT, axes_or_new, draw_scale_bar, hide_axes
+from jeit.plot.axes import DARK_GREY, LIGHT_GREY, axes_or_new, draw_scale_bar, hide_axes
 from jeit.plot.imaging.electrodes import METAL
 
-_KEEP_OUT_STYLE = {"facecolor": "none", "edgecolor": SOFT, "hatch": "////", "linewidth": 0.5, "zorder": 1}
+_KEEP_OUT_STYLE = {"facecolor": "none", "edgecolor": LIGHT_GREY, "hatch": "////", "linewidth": 0.5, "zorder": 1}
 
 
 def plot_travel(
@@ -60,7 +60,7 @@ def plot_travel(
     ax = axes_or_new(ax)
     outline = flat_layout(optimisation.layout).outline
     if outline is not None:
-        ax.add_patch(PathPatch(outline_path(outline), facecolor="none", edgecolor=INK, linewidth=0.9, zorder=2))
+        ax.add_patch(PathPatch(outline_path(outline), facecolor="none", edgecolor=DARK_GREY, linewidth=0.9, zorder=2))
         extent = outline.extent
         hide_axes(ax, extent, numbered=False)
         draw_scale_bar(ax, extent)
@@ -68,12 +68,12 @@ def plot_travel(
         ax.add_patch(PathPatch(outline_path(domain), **_KEEP_OUT_STYLE))
     initial_discs = [Circle((x, y), r) for (x, y), r in zip(paths[0], radii, strict=True)]
     final_discs = [Circle((x, y), r) for (x, y), r in zip(final_centres, radii, strict=True)]
-    ax.add_collection(PatchCollection(initial_discs, facecolor="none", edgecolor=SOFT, linewidth=1.0, zorder=3))
-    ax.add_collection(LineCollection(list(paths.swapaxes(0, 1)), colors=SOFT, linewidths=1.2, zorder=3))
-    ax.add_collection(PatchCollection(final_discs, facecolor=METAL, edgecolor=INK, linewidth=0.6, zorder=4))
+    ax.add_collection(PatchCollection(initial_discs, facecolor="none", edgecolor=LIGHT_GREY, linewidth=1.0, zorder=3))
+    ax.add_collection(LineCollection(list(paths.swapaxes(0, 1)), colors=LIGHT_GREY, linewidths=1.2, zorder=3))
+    ax.add_collection(PatchCollection(final_discs, facecolor=METAL, edgecolor=DARK_GREY, linewidth=0.6, zorder=4))
     _draw_legend(ax, has_keep_out=bool(keep_out))
     distances = np.linalg.norm(final_centres - paths[0], axis=1)
-    ax.set_title(f"Moved {1e3 * distances.mean():.0f} mm on average" if title is None else title, color=INK)
+    ax.set_title(f"Moved {1e3 * distances.mean():.0f} mm on average" if title is None else title, color=DARK_GREY)
     return ax
 
 
@@ -81,13 +81,21 @@ def _draw_legend(ax: Axes, *, has_keep_out: bool) -> None:
     """Draw the legend of the positions below the plot, beside the scale bar."""
     disc = {"marker": "o", "markersize": 8, "linestyle": "none"}
     handles: list[Artist] = [
-        Line2D([], [], markerfacecolor="none", markeredgecolor=SOFT, label="where it began", **disc),
-        Line2D([], [], color=SOFT, linewidth=1.2, label="way, step by step"),
-        Line2D([], [], markerfacecolor=METAL, markeredgecolor=INK, markeredgewidth=0.6, label="where it ended", **disc),
+        Line2D([], [], markerfacecolor="none", markeredgecolor=LIGHT_GREY, label="where it began", **disc),
+        Line2D([], [], color=LIGHT_GREY, linewidth=1.2, label="way, step by step"),
+        Line2D(
+            [],
+            [],
+            markerfacecolor=METAL,
+            markeredgecolor=DARK_GREY,
+            markeredgewidth=0.6,
+            label="where it ended",
+            **disc,
+        ),
     ]
     if has_keep_out:
-        handles.append(Patch(facecolor="none", edgecolor=SOFT, hatch="////", label="kept free"))
-    style = {"frameon": False, "fontsize": 9, "labelcolor": INK, "borderaxespad": 0.2, "columnspacing": 1.2}
+        handles.append(Patch(facecolor="none", edgecolor=LIGHT_GREY, hatch="////", label="kept free"))
+    style = {"frameon": False, "fontsize": 9, "labelcolor": DARK_GREY, "borderaxespad": 0.2, "columnspacing": 1.2}
     ax.legend(handles=handles, loc="lower right", ncols=2, **style)
 
 

@@ -17,10 +17,10 @@ from jeit.electrodes import FaceDiscs, SurfaceDiscs
 from jeit.layout import SurfaceLayout
 from jeit.mesh.geodesic import Unrolled
 from jeit.plot.axes import (
-    CHANGE,
-    INK,
+    CHANGE_SCALE,
+    DARK_GREY,
+    LIGHT_GREY,
     SERIES_COLOURS,
-    SOFT,
     ColourScale,
     axes_or_new,
     check_scale,
@@ -39,7 +39,7 @@ def plot_unrolled(
     electrodes: SurfaceLayout | SurfaceDiscs | FaceDiscs | None = None,
     *,
     marks: Mapping[str, ArrayLike] | None = None,
-    scale: ColourScale = CHANGE,
+    scale: ColourScale = CHANGE_SCALE,
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
@@ -107,11 +107,11 @@ def plot_unrolled(
     hide_axes(ax, extent, numbered=False)
     draw_scale_bar(ax, extent)
     if marks:
-        ax.legend(loc="lower right", frameon=False, labelcolor=INK, ncols=len(marks), borderaxespad=0)
+        ax.legend(loc="lower right", frameon=False, labelcolor=DARK_GREY, ncols=len(marks), borderaxespad=0)
     if unrolled.mean_distortion > _MIN_STATED_DISTORTION:
         mean_percent, max_percent = 100 * unrolled.mean_distortion, 100 * unrolled.distortion
         distortion_text = f"lengths off by {mean_percent:.2g} % on average, {max_percent:.2g} % at most"
-        ax.text(0.5, 0.02, distortion_text, transform=ax.transAxes, ha="center", color=SOFT, fontsize=8)
+        ax.text(0.5, 0.02, distortion_text, transform=ax.transAxes, ha="center", color=LIGHT_GREY, fontsize=8)
     if title:
         ax.set_title(title)
     return ax
@@ -131,7 +131,7 @@ def _check_values(unrolled: Unrolled, values: ArrayLike) -> np.ndarray:
 
 def _draw_edges(ax: Axes, unrolled: Unrolled) -> None:
     for edges, style in ((unrolled.edge, "solid"), (unrolled.seam, (0, (3, 2)))):
-        ax.add_collection(LineCollection(list(edges), colors=SOFT, linewidths=1.0, linestyles=[style]))
+        ax.add_collection(LineCollection(list(edges), colors=LIGHT_GREY, linewidths=1.0, linestyles=[style]))
 
 
 def _draw_electrodes(ax: Axes, unrolled: Unrolled, electrodes) -> None:
@@ -146,6 +146,8 @@ def _draw_electrodes(ax: Axes, unrolled: Unrolled, electrodes) -> None:
         names = [str(k + 1) for k in range(electrodes.num_electrodes)]
     for flat_centre, radius, name in zip(unrolled.flat(centres), np.asarray(radii), names, strict=True):
         ax.add_patch(
-            Circle(tuple(flat_centre), float(radius), facecolor="#ffffffa0", edgecolor=INK, linewidth=0.8, zorder=3)
+            Circle(
+                tuple(flat_centre), float(radius), facecolor="#ffffffa0", edgecolor=DARK_GREY, linewidth=0.8, zorder=3
+            )
         )
-        ax.annotate(name, tuple(flat_centre), ha="center", va="center", fontsize=6, color=INK, zorder=4)
+        ax.annotate(name, tuple(flat_centre), ha="center", va="center", fontsize=6, color=DARK_GREY, zorder=4)

@@ -67,7 +67,7 @@ def draw_layout_comparison(result: LayoutComparison):
     from jeit.design.plots import plot_sensitivity_histograms, plot_sensitivity_map, plot_taxel_areas, plot_taxels
     from jeit.design.plots.travel import outline_path
     from jeit.layout.surface_layout import flat_layout
-    from jeit.plot.axes import INK, draw_scale_bar, hide_axes
+    from jeit.plot.axes import DARK_GREY, draw_scale_bar, hide_axes
 
     figure = Figure(figsize=(14.4, 8.8), layout="constrained")
     figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.12)
@@ -92,17 +92,22 @@ def draw_layout_comparison(result: LayoutComparison):
             scale_bar_part.remove()
         draw_scale_bar(row_axes[1], outline.extent)
         for ax in row_axes[:2]:
-            ax.add_patch(PathPatch(outline_path(outline), facecolor="none", edgecolor=INK, linewidth=0.9))
+            ax.add_patch(PathPatch(outline_path(outline), facecolor="none", edgecolor=DARK_GREY, linewidth=0.9))
             hide_axes(ax, outline.extent, numbered=False)
     plot_sensitivity_histograms(
         {name: response.sensitivity for name, response in zip(names, responses, strict=True)}, ax=axes[0, 2]
     )
     plot_taxel_areas({name: response.taxels for name, response in zip(names, responses, strict=True)}, ax=axes[1, 2])
-    disc: dict[str, Any] = {"marker": "o", "linestyle": "none", "markerfacecolor": "white", "markeredgecolor": INK}
+    disc: dict[str, Any] = {
+        "marker": "o",
+        "linestyle": "none",
+        "markerfacecolor": "white",
+        "markeredgecolor": DARK_GREY,
+    }
     handles: list[Artist] = [Line2D([], [], label="electrode", **disc)]
     if result.margin > 0:
         margin_label = f"not touched: {1e3 * result.margin:.3g} mm wide"
-        handles.append(Patch(facecolor="white", edgecolor=INK, linewidth=0.9, label=margin_label))
+        handles.append(Patch(facecolor="white", edgecolor=DARK_GREY, linewidth=0.9, label=margin_label))
     figure.legend(handles=handles, loc="outside lower left", ncols=2, frameon=False)
     return figure
 

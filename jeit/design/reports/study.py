@@ -248,7 +248,7 @@ def _escape_for_matplotlib(text: str) -> str:
 
 
 _PACKAGES = ("jeit", "jax", "numpy", "zarr", "xarray", "matplotlib")
-_TEXT = ("layout", "protocol")
+_TEXT_COLUMNS = ("layout", "protocol")
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 70em; margin: 2em auto; padding: 0 1em; color: #222 }
 table { border-collapse: collapse; font-size: 13px } th, td { padding: .2em .7em; text-align: right }
@@ -353,7 +353,10 @@ def _points_table(study: Study, data) -> str:
         *(name if unit == "1" else f"{name} / {unit}" for name, (_, unit) in values_and_units.items()),
     ]
     row_texts = [
-        "".join(f'<th class="{"text" if title in _TEXT else "number"}">{escape(title)}</th>' for title in column_titles)
+        "".join(
+            f'<th class="{"text" if title in _TEXT_COLUMNS else "number"}">{escape(title)}</th>'
+            for title in column_titles
+        )
     ]
     columns = [data[name].values.tolist() for name in swept_names] + [
         values.tolist() for values, _ in values_and_units.values()

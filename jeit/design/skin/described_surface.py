@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jeit.arguments import describe
-from jeit.layout.layout import LARGEST, SMALLEST
+from jeit.layout.layout import MAX_SKIN_SIZE, MIN_SKIN_SIZE
 from jeit.mesh import Mesh, bend, cap, forearm, from_gmsh, measures, read, rectangle, sphere, tube
 from jeit.mesh.checks import size_checked
 
@@ -46,7 +46,7 @@ def _check_unit(table: SurfaceTable, surface: Mesh) -> None:
     from jeit.design.skin.surface_tables import ScanTable
 
     extent = float(np.ptp(np.asarray(surface.points), axis=0).max())
-    if not isinstance(table, ScanTable) or SMALLEST <= extent <= LARGEST:
+    if not isinstance(table, ScanTable) or MIN_SKIN_SIZE <= extent <= MAX_SKIN_SIZE:
         return
     extents_by_unit = {unit: extent * scale / _UNITS[table.unit] for unit, scale in _UNITS.items()}
     likely_unit = min(extents_by_unit, key=lambda unit: abs(np.log(extents_by_unit[unit] / _TYPICAL_EXTENT)))

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import IN_MILLIMETRES, brief, check_kind, check_metres, page, picture
+from jeit.arguments import IN_MILLIMETRES, check_kind, check_metres, object_html, object_text, picture
 from jeit.design.defaults import CELL_SIZE, CONDUCTIVITY, CONTACT_IMPEDANCE, CONTRAST, NUM_LAYERS, THICKNESS
 from jeit.design.skin.names import skin_protocol
 from jeit.design.skin.sheet_touches import SheetTouches, sheet_touches
@@ -104,7 +104,7 @@ class Skin(Module):
         self.conductivity = jnp.asarray(conductivity, checked_conductivity.dtype)
 
     def __repr__(self) -> str:
-        return brief(
+        return object_text(
             lambda: f"Skin({self.layout!r},\n  {self.model!r})",
             self,
         )
@@ -113,7 +113,7 @@ class Skin(Module):
         return picture(self)
 
     def _repr_html_(self) -> str | None:
-        return page(self)
+        return object_html(self)
 
     @classmethod
     def create(

@@ -43,14 +43,14 @@ _INSULATING_FACTOR, _MAX_FACTOR = 10.0, 1e6
 _MIN_RELATIVE_VOLTAGE = 1e-12
 # Number of touches processed at once for exact and linearised changes, so that their blocks of the inverse or of the
 # Jacobian fit into the cache.
-EXACT_AT_ONCE, _LINEAR_AT_ONCE = 2, 8
+EXACT_BATCH_SIZE, _LINEAR_BATCH_SIZE = 2, 8
 # Multiple to which the number of strips of nodes that a touch spans is padded, since a program is compiled for each
 # number.
 _STRIP_MULTIPLE = 3
 # Number of touches per call of a compiled program. The numbers of nodes and of cells of a touch are padded to sizes,
 # and these are the ratios of successive sizes. One program is compiled for each size, and the cost of a touch grows
 # with the square of its number of nodes.
-_TOUCHES_PER_CALL, _NODE_SIZE_RATIO, _CELL_SIZE_RATIO = 2 * EXACT_AT_ONCE, 2**0.5, 2.0
+_TOUCHES_PER_CALL, _NODE_SIZE_RATIO, _CELL_SIZE_RATIO = 2 * EXACT_BATCH_SIZE, 2**0.5, 2.0
 
 
 def touch_changes(
@@ -94,9 +94,9 @@ def _linear_changes(model: ForwardModel, conductivity, touched: TouchedCells):
         return jnp.einsum("bc,bcm->bm", conductivity_changes[indices], jacobian[touched.cells[indices]])
 
     num_touches = len(conductivity_changes)
-    indices = jnp.minimum(jnp.arange(-(-num_touches // _LINEAR_AT_ONCE) * _LINEAR_AT_ONCE), num_touches - 1).reshape(
-        -1, _LINEAR_AT_ONCE
-    )
+    indices = jnp.minimum(
+        jnp.arange(-(-num_touches // _LINEAR_BATCH_SIZE) * _LINEAR_BATCH_SIZE), num_touches - 1
+    ).reshape(-1, _LINEAR_BATCH_SIZE)
     return _join_chunks(jax.lax.map(chunk_changes, indices))[:num_touches]
 
 
@@ -108,7 +108,7 @@ def _exact_changes(model: ForwardModel, conductivity, touched: TouchedCells):
     touches = on_device((touched.cells, touched.change, touched_at.nodes, touched_at.corners))
     num_touches, element_matrices = len(touched.cells), cell_stiffness(model, conductivity)
     compute_changes = partial(changes_between, model.protocol, element_matrices, fields_and_inverse_of_skin, touches)
-    changes = over_cores(compute_changes, num_touches, EXACT_AT_ONCE)[:num_touches]
+    changes = over_cores(compute_changes, num_touches, EXACT_BATCH_SIZE)[:num_touches]
     check_finite_changes(changes, np.asarray(touched.places))
     return changes
 
@@ -314,7 +314,7 @@ class RestingSkin(Module):
                     (padded_cells[rows], padded_changes[rows], padded_nodes[rows], padded_corners[rows])
                 )
                 work = partial(changes_between, self.model.protocol, self.element, skin_fields_and_inverse, touches)
-                voltage_changes[chunk] = np.asarray(over_cores(work, _TOUCHES_PER_CALL, EXACT_AT_ONCE))[: len(chunk)]
+                voltage_changes[chunk] = np.asarray(over_cores(work, _TOUCHES_PER_CALL, EXACT_BATCH_SIZE))[: len(chunk)]
         check_finite_changes(voltage_changes, np.asarray(touched.places))
         return voltage_changes
 

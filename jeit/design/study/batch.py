@@ -137,7 +137,7 @@ def _first_skin(study: Study, shape: Shape) -> Skin:
         conductivity=point.conductivity,
         num_layers=point.layers,
         cell_size=point.cell_size if isinstance(point.layout, Layout) else None,
-        protocol=point.measured(study.current),
+        protocol=point.measurement_protocol(study.current),
     )
 
 
@@ -162,7 +162,7 @@ def _shared_data(study: Study, shape: Shape) -> _SharedData:
 def _point_data(point: Point, current: float) -> _PointData:
     return _PointData(
         electrodes=point.electrodes,
-        protocol=point.measured(current),
+        protocol=point.measurement_protocol(current),
         thickness=jnp.asarray(point.thickness),
         conductivity=jnp.asarray(model_conductivity(point.conductivity, point.thickness, point.layers)),
         noise=jnp.asarray(point.noise),

@@ -45,12 +45,12 @@ class ProgressReporter:
         self._initial_points, self._start_time = self._num_finished_points(), time.monotonic()
         self._report(self._initial_points, None)
 
-    def finished(self, number: int) -> None:
+    def report_finished_chunk(self, number: int) -> None:
         """Report that the chunk `number` is finished."""
         self._finished_chunks.add(number)
         self._estimate_and_report(self._num_finished_points())
 
-    def solved(self, points: int) -> None:
+    def report_points(self, points: int) -> None:
         """Report the number of finished points of the current chunk."""
         self._estimate_and_report(self._num_finished_points() + points)
 
@@ -71,7 +71,7 @@ class ProgressReporter:
 _Result = TypeVar("_Result")
 
 
-def over_cluster(
+def solve_on_cluster(
     client: Any, solve: Callable[[Any, int], _Result], work: Any, numbers: Iterable[int]
 ) -> Iterator[tuple[int, _Result]]:
     """Yield the number of each chunk with its results `solve(work, number)`, in the order in which the workers of a
@@ -128,12 +128,12 @@ def run_study(
     need_extra("cluster", "a study")
     check_points(study)
     with writing(study, path) as store:
-        finished_chunks = set(store.sound())
+        finished_chunks = set(store.intact_chunks())
         remaining_chunks = [number for number in range(len(study.chunks)) if number not in finished_chunks]
         report = ProgressReporter(study.chunks, finished_chunks, progress)
-        for number, results in _solve_chunks(study, remaining_chunks, client, report.solved):
+        for number, results in _solve_chunks(study, remaining_chunks, client, report.report_points):
             store.write(number, results)
-            report.finished(number)
+            report.report_finished_chunk(number)
     return open_results(study, path)
 
 
@@ -155,7 +155,7 @@ def study_progress(study: Study, path: str | Path) -> Progress:
     print(study_progress(study, "study.zarr"))
     ```
     """
-    finished_chunks = Store(study, path, create=False).sound()
+    finished_chunks = Store(study, path, create=False).intact_chunks()
     points = sum(len(study.chunks[number]) for number in finished_chunks)
     return Progress(points, len(study.points), len(finished_chunks), len(study.chunks), None)
 
@@ -169,4 +169,4 @@ def _solve_chunks(
         for number in numbers:
             yield number, solve_chunk(study, number, solved)
         return
-    yield from over_cluster(client, solve_chunk, study, numbers)
+    yield from solve_on_cluster(client, solve_chunk, study, numbers)

@@ -81,7 +81,7 @@ class Point:
         """Electrodes of the point's forward model, in the sheet or on the bottom of the layer."""
         return skin_electrodes(self.layout, self.layers)
 
-    def measured(self, current: float) -> Protocol:
+    def measurement_protocol(self, current: float) -> Protocol:
         """Measurement protocol of the point, with an injected `current` in amperes."""
         return skin_protocol(self.layout, self.protocol, num_pairs=self.pairs, current=current)
 

@@ -67,7 +67,7 @@ def find_danger(path: Path) -> str | None:
             if name in _FORMAT_2_FILES:
                 return f"'{entry.relative_to(path)}' is of Zarr's format 2, which jeit does not write"
     for file in path.rglob(_METADATA_FILE):
-        content = _read_bytes(file)  # a file that Zarr cannot read is damaged, but not dangerous
+        content = _read_json_object(file)  # a file that Zarr cannot read is damaged, but not dangerous
         for location, node in [] if content is None else _metadata_nodes(content, str(file.relative_to(path))):
             reason = _find_node_danger(node)
             if reason:
@@ -78,7 +78,7 @@ def find_danger(path: Path) -> str | None:
 def find_damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
     """Describe the first difference between a store and a store with the arrays `expected` (by name); None if there is
     no difference. Raises `OSError` for files that cannot be read."""
-    content = _read_bytes(path / _METADATA_FILE)
+    content = _read_json_object(path / _METADATA_FILE)
     if content is None:
         return _UNREADABLE_METADATA
     array_names = {folder.name for folder in path.iterdir() if folder.is_dir()}
@@ -93,7 +93,7 @@ def find_damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
     for name, array in expected.items():
         if [*(path / name).rglob(_METADATA_FILE)] != [path / name / _METADATA_FILE]:
             return f"array '{name}' has not one {_METADATA_FILE}"
-        array_node = _read_bytes(path / name / _METADATA_FILE)
+        array_node = _read_json_object(path / name / _METADATA_FILE)
         reason = (
             _UNREADABLE_METADATA
             if array_node is None
@@ -174,7 +174,7 @@ def _find_node_damage(node: Any, expected: ArrayShape) -> str | None:
     return None
 
 
-def _read_bytes(file: Path) -> dict[str, Any] | None:
+def _read_json_object(file: Path) -> dict[str, Any] | None:
     """Read the JSON object in a file; None without a JSON object. Raises `OSError` if the file cannot be read."""
     try:
         content = json.loads(file.read_bytes())
@@ -193,7 +193,7 @@ def _short_text(values: Any) -> str:
 
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
-_TASK = "a store of results"
+_EXTRA_PURPOSE = "a store of results"
 _PATH_DESCRIPTION = "that of the store, such as 'results.zarr'"
 
 
@@ -212,7 +212,7 @@ class Store:
         """Raises `FileNotFoundError` if there is no store and `create` is False. Raises `ValueError` if the path is not
         a store or is the store of a different study, if the store is damaged, or if opening the store might run code.
         Raises `ImportError` without the extra `cluster`, and `OSError` if the store cannot be written."""
-        zarr = optional("zarr", _TASK)
+        zarr = optional("zarr", _EXTRA_PURPOSE)
         self.contents = work if isinstance(work, Contents) else study_contents(work)
         check_kind("path", path, (str, os.PathLike), _PATH_DESCRIPTION)
         self.path, kind = Path(path), self.contents.kind
@@ -247,13 +247,13 @@ class Store:
         """Versions of the packages that created the store, by the packages' names."""
         return self._attributes()["versions"]
 
-    def finished(self) -> dict[int, str]:
+    def finished_checksums(self) -> dict[int, str]:
         """Checksum of every finished chunk, by the chunk's number."""
         return {int(number): checksum for number, checksum in self._attributes()["finished"].items()}
 
-    def sound(self) -> list[int]:
+    def intact_chunks(self) -> list[int]:
         """Numbers of the finished chunks whose results match their checksums."""
-        return [number for number, checksum in self.finished().items() if self._checksum(number) == checksum]
+        return [number for number, checksum in self.finished_checksums().items() if self._checksum(number) == checksum]
 
     def write(self, number: int, results: Mapping[str, np.ndarray]) -> None:
         """Write the results of chunk `number`, then mark the chunk as finished. Raises `OSError` if the results cannot
@@ -261,9 +261,11 @@ class Store:
         try:
             for name, values in results.items():
                 self.write_array(name, self.contents.chunks[number], values)
-            self._mark(number, _checksum(results))
+            self._mark_finished(number, _checksum(results))
         except OSError as error:
-            progress_text = f"{len(self.finished())} of {len(self.contents.chunks)} chunks are finished and kept"
+            progress_text = (
+                f"{len(self.finished_checksums())} of {len(self.contents.chunks)} chunks are finished and kept"
+            )
             raise OSError(
                 error.errno,
                 f"{error.strerror}: a chunk could not be written; {progress_text}. Mend that, then resume the "
@@ -279,7 +281,7 @@ class Store:
             array[rows] = values[first_row:last_row]  # pyright: ignore[reportIndexIssue]
             first_row = last_row
 
-    def _mark(self, number: int, checksum: str) -> None:
+    def _mark_finished(self, number: int, checksum: str) -> None:
         content = _read_json(self.path)
         finished = content["attributes"]["finished"] | {str(number): checksum}
         content["attributes"]["finished"] = dict(sorted(finished.items(), key=lambda item: int(item[0])))
@@ -305,7 +307,7 @@ class Store:
 
     def open_dataset(self):
         """Open the whole store as an `xarray.Dataset`, whose values are read from disk when they are needed."""
-        return optional("xarray", _TASK).open_zarr(str(self.path), chunks=None, zarr_format=3)
+        return optional("xarray", _EXTRA_PURPOSE).open_zarr(str(self.path), chunks=None, zarr_format=3)
 
     def _check(self, expected: Mapping[str, ArrayShape]) -> None:
         """Check the metadata before Zarr opens the store. Raises `ValueError` if the store is dangerous or damaged."""
@@ -388,10 +390,10 @@ def open_results(study: Study, path: str | Path):
     results = open_results(study, "study.zarr")
     ```
     """
-    xarray = optional("xarray", _TASK)
+    xarray = optional("xarray", _EXTRA_PURPOSE)
     store = Store(study, path, create=False)
     is_finished = np.zeros(len(study.points), bool)
-    for number in store.sound():
+    for number in store.intact_chunks():
         is_finished[list(study.chunks[number])] = True
     variables = {}
     with store.open_dataset() as dataset:

@@ -15,9 +15,9 @@ from jaxtyping import Array, Float
 from jeit_solvers.engines import as_array
 from jeit_solvers.module import Module
 
-RULE = "noise-figure"
+DEFAULT_RULE = "noise-figure"
 """Default rule that chooses λ, for linear images and for nonlinear problems linearised at the background."""
-ITERATED = 5.0
+GAUSS_NEWTON_HYPERPARAMETER = 5.0
 """Default λ of Gauss-Newton images of a tank relative to a reference frame, with a smooth prior; the prior standard
 deviation of log σ is then 1/5."""
 EDGE_PRICE = 300.0

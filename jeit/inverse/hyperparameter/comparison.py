@@ -8,7 +8,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jeit.forward import ForwardModel
-from jeit.inverse.hyperparameter.choice import RULE, Choice
+from jeit.inverse.hyperparameter.choice import DEFAULT_RULE, Choice
 from jeit.inverse.hyperparameter.rules import RULES, Rule, choose
 from jeit.inverse.linearisation import Linearisation
 from jeit.inverse.prior.priors import AbstractPrior
@@ -18,7 +18,7 @@ def choose_hyperparameter(
     model: ForwardModel,
     conductivity: ArrayLike,
     *,
-    rule: str | Rule = RULE,
+    rule: str | Rule = DEFAULT_RULE,
     prior: AbstractPrior | None = None,
     difference: Float[Array, " M"] | None = None,
     noise: Float[Array, " M"] | float = 1.0,

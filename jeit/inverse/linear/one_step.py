@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Inexact, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import brief, check_has_values
+from jeit.arguments import check_has_values, object_text
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
-from jeit.inverse.hyperparameter.choice import RULE, Choice
+from jeit.inverse.hyperparameter.choice import DEFAULT_RULE, Choice
 from jeit.inverse.hyperparameter.rules import Rule, choose
 from jeit.inverse.linearisation import Linearisation
 from jeit.inverse.prior.priors import AbstractPrior
@@ -68,7 +68,7 @@ class LinearReconstruction:
     mixing: Inexact[Array, "K r"] | None = None
 
     def __repr__(self) -> str:
-        return brief(
+        return object_text(
             lambda: (
                 f"LinearReconstruction({self.method}: {self.num_measurements} channels to {self.mesh.num_cells} cells, "
                 f"hyperparameter {float(self.hyperparameter):.3g} ({self.rule}))"
@@ -226,7 +226,7 @@ def one_step(
     conductivity: ArrayLike,
     *,
     prior: AbstractPrior | None = None,
-    hyperparameter: float | str | Rule | Choice = RULE,
+    hyperparameter: float | str | Rule | Choice = DEFAULT_RULE,
     difference: Inexact[Array, " M"] | None = None,
     noise: Float[Array, " M"] | float = 1.0,
     mask: Bool[Array, " M"] | None = None,

@@ -11,7 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import brief, check_has_values
+from jeit.arguments import check_has_values, object_text
 from jeit.forward import ForwardModel
 from jeit.forward.model import channel_voltages, evaluate, fields_and_impedance_of, jacobian_blocks, voltages_of
 from jeit.forward.system import check_conductivity
@@ -28,7 +28,7 @@ from jeit.inverse.nonlinear.problem import (
     keep_informed_shapes,
 )
 from jeit.inverse.nonlinear.solvers import LBFGSB, SOLVERS, AbstractSolver, GaussNewton, as_solver
-from jeit.inverse.prior.matern import PRIOR
+from jeit.inverse.prior.matern import DEFAULT_PRIOR
 from jeit.inverse.prior.priors import AbstractPrior, check_prior
 from jeit.inverse.spectrum import Spectrum
 from jeit_solvers import Status
@@ -67,7 +67,7 @@ class Reconstruction(Module):
     reason: str = eqx.field(static=True)
 
     def __repr__(self) -> str:
-        return brief(
+        return object_text(
             lambda: (
                 f"Reconstruction({self.status}: {self.conductivity.shape[-1]} cells, "
                 f"{int(self.iterations)} iterations, "
@@ -166,7 +166,7 @@ def reconstruct(
     ```
     """
     measured, used = check_frame(model, voltages, mask)
-    prior = PRIOR if prior is None else prior
+    prior = DEFAULT_PRIOR if prior is None else prior
     check_prior(prior)
     parametrisation = as_parametrisation(parametrisation)
     parametrisation.check_model(model)

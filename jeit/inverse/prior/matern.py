@@ -153,10 +153,10 @@ def _covariance_factor(solve: Solve, mass: Float[np.ndarray, " n"]) -> Float[np.
     return solve(np.sqrt(mass)[:, None] * noise)
 
 
-PRIOR = Noser()
+DEFAULT_PRIOR = Noser()
 """Default prior of `one_step` and `reconstruct`: it needs no correlation length, so it can be used for bodies of which
 nothing is known."""
-MEASURED = "gaussian"
+MEASURED_DATA_PRIOR = "gaussian"
 """Name in `PRIORS` of the default prior for measured data and streams."""
 
 

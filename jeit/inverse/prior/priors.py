@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from scipy.spatial.distance import cdist
 
 from jeit.arguments import check_has_values, check_kind
-from jeit.inverse.hyperparameter.choice import RULE
+from jeit.inverse.hyperparameter.choice import DEFAULT_RULE
 from jeit.inverse.prior.bases import AbstractBasis, DenseBasis, DiagonalBasis, Regions
 from jeit.inverse.prior.linear_algebra import (
     GriddedGaussian,
@@ -93,7 +93,7 @@ class AbstractPrior(Module):
     @property
     def default_hyperparameter(self) -> float | str:
         """Default λ of `reconstruct`, or the name of the rule that chooses it."""
-        return RULE
+        return DEFAULT_RULE
 
     def penalty(
         self,

@@ -18,7 +18,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import brief, counted, describe, is_number
+from jeit.arguments import counted, describe, is_number, object_text
 from jeit.electrodes.point import IntegratedElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse.channels import IndependentChannels, Weighing
@@ -109,7 +109,7 @@ class Imager(Module):
     persistence: float = eqx.field(static=True)
 
     def __repr__(self) -> str:
-        return brief(
+        return object_text(
             lambda: (
                 f"Imager({type(self.solver).__name__}: {int(np.sum(self.mask))} of {len(self.mask)} channels,\n"
                 f"  {self.inversion.model!r})"

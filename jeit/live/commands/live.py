@@ -130,7 +130,7 @@ def live(
         "as_is": as_is or None,
     }
     options = {name: value for name, value in options.items() if value is not None}
-    _check_use(options, model, calibration, contacts)
+    _check_unused_options(options, model, calibration, contacts)
     if source.partition(":")[0] == "demo" and steps is None:
         options.setdefault("solver", "one-step")  # compiles in half the time
     with naming_options(_OPTION_NAMES):
@@ -224,7 +224,7 @@ def _check_folder(output: Path) -> None:
         raise ValueError(f"--output: no folder '{output}' can be made or written to; '{existing_path}' is in the way.")
 
 
-def _check_use(options: dict, model: Path | None, calibration: Path | None, contacts: bool) -> None:
+def _check_unused_options(options: dict, model: Path | None, calibration: Path | None, contacts: bool) -> None:
     """Raise `ValueError` if options of conductivity images are given together with a model or microphones, which do not
     use these options."""
     used_options = [_OPTION_NAMES.get(name, f"--{name.replace('_', '-')}") for name in options] + [

@@ -46,7 +46,7 @@ _HEADERS = {
     "Cache-Control": "no-store",
 }
 MAX_VIEWERS = 16
-_MAX_FAULTS = 20
+_MAX_INVALID_MESSAGES = 20
 _MEDIA_TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
 
 
@@ -230,7 +230,7 @@ async def _receive_commands(hub: Hub, viewer: Viewer, websocket: WebSocket) -> N
             command = read_command(message.get("text") or message.get("bytes") or "")
         except ValueError as error:
             faults += 1
-            if faults > _MAX_FAULTS:
+            if faults > _MAX_INVALID_MESSAGES:
                 await websocket.close(1008, "too many messages that are no commands")
                 return
             await websocket.send_text(to_json("answer", {"to": "message", "problem": str(error)}))

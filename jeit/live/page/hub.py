@@ -36,7 +36,7 @@ class Viewer:
         self._state_read = True
         self._last_sent = -1
         self._in_flight: deque[tuple[int, float]] = deque()
-        self._drawn: deque[tuple[float, float]] = deque(maxlen=2000)
+        self._drawn_latencies: deque[tuple[float, float]] = deque(maxlen=2000)
 
     def ready_for(self, number: int) -> bool:
         """Whether the picture with the frame number `number` may be sent to the page now."""
@@ -55,7 +55,7 @@ class Viewer:
         while self._in_flight and self._in_flight[0][0] <= number:
             sent_number, arrived = self._in_flight.popleft()
             if sent_number == number and not hidden:
-                self._drawn.append((now, now - arrived))
+                self._drawn_latencies.append((now, now - arrived))
         self.wake_event.set()
 
     def wants_state(self) -> bool:
@@ -77,8 +77,8 @@ class Viewer:
         The latency includes the transmission of the report, so that all times are from the same clock.
         """
         now = time.monotonic()
-        latencies = [latency for draw_time, latency in self._drawn if now - draw_time <= _LATENCY_SPAN]
-        num_recent = sum(now - draw_time <= 2.0 for draw_time, _ in self._drawn)
+        latencies = [latency for draw_time, latency in self._drawn_latencies if now - draw_time <= _LATENCY_SPAN]
+        num_recent = sum(now - draw_time <= 2.0 for draw_time, _ in self._drawn_latencies)
         if not latencies:
             return {"rate": 0.0, "latency_median": None, "latency_99": None}
         median, latency_99 = np.percentile(latencies, [50, 99])
@@ -94,8 +94,8 @@ class Hub:
         self.viewers: set[Viewer] = set()
         self.ended = threading.Event()
         self._closing = threading.Event()
-        self._newest: Result | None = None
-        self._encoded: tuple[int, bytes] | None = None
+        self._newest_result: Result | None = None
+        self._encoded_picture: tuple[int, bytes] | None = None
         self._state: dict[str, Any] = {}
         self._loop: asyncio.AbstractEventLoop | None = None
         self._is_woken = False
@@ -115,13 +115,13 @@ class Hub:
     def newest(self) -> tuple[Result, bytes] | None:
         """Return the newest picture and the bytes of its message to pages; the message is computed once for all
         pages."""
-        result = self._newest
+        result = self._newest_result
         if result is None:
             return None
-        if self._encoded is None or self._encoded[0] != result.frame.number:
+        if self._encoded_picture is None or self._encoded_picture[0] != result.frame.number:
             message = picture_message(result.frame, result.picture, latency=result.latency)
-            self._encoded = (result.frame.number, message)
-        return result, self._encoded[1]
+            self._encoded_picture = (result.frame.number, message)
+        return result, self._encoded_picture[1]
 
     def state_message(self, viewer: Viewer) -> str:
         """Return the state of the session and of a page as JSON text."""
@@ -143,7 +143,7 @@ class Hub:
             now = time.monotonic()
             if result is not None:
                 last_number = result.frame.number
-                self._newest = result
+                self._newest_result = result
                 self._wake_pages()
             if now - state_time >= _STATE_PERIOD:
                 state_time = now

@@ -42,7 +42,7 @@ class Front:
         return sum(len(stops) for stops in self.stops)
 
     @property
-    def num_held(self) -> int:
+    def num_immovable_nodes(self) -> int:
         """Number of nodes that may not move: the nodes on the outline and the fixed nodes."""
         return self.num_outline + len(self.fixed)
 
@@ -61,7 +61,7 @@ class Front:
             offset += len(stops)
         return np.concatenate(segments)
 
-    def guarded(self) -> np.ndarray:
+    def is_sharp_corner(self) -> np.ndarray:
         """Whether each node on the outline is a sharp corner (num_outline,)."""
         return np.concatenate(
             [
@@ -147,7 +147,7 @@ def select_apart(points: np.ndarray, radius: np.ndarray, priority: np.ndarray) -
     return order[is_selected]
 
 
-def clear_of_outline(front: Front, nodes: np.ndarray, points: np.ndarray, gap: np.ndarray) -> np.ndarray:
+def is_clear_of_outline(front: Front, nodes: np.ndarray, points: np.ndarray, gap: np.ndarray) -> np.ndarray:
     """Whether each of `points` lies inside the outline, at a distance of more than `gap` from the outline. `nodes` are
     the nodes of `front`."""
     if not len(points):
@@ -178,10 +178,10 @@ _STEP_DIRECTIONS = np.stack([np.cos(_STEP_ANGLES), np.sin(_STEP_ANGLES)], axis=1
 _TRIAL_STEPS = np.concatenate([length * _STEP_DIRECTIONS for length in (0.02, 0.06, 0.15, 0.3)])
 
 
-def improvable(front: Front, cells: np.ndarray) -> np.ndarray:
+def is_improvable(front: Front, cells: np.ndarray) -> np.ndarray:
     """Whether each cell can be improved; a cell at a sharp corner cannot, since the outline determines its shape."""
     is_sharp = np.zeros(cells.max() + 1, bool)
-    is_sharp[: front.num_outline] = front.guarded()
+    is_sharp[: front.num_outline] = front.is_sharp_corner()
     return np.logical_not(is_sharp[cells].any(axis=1))
 
 
@@ -199,14 +199,14 @@ def polish(front: Front, passes: int = 4) -> None:
     Steps in eight directions are tried for each node, because the smallest angle is not differentiable where two cells
     have equal smallest angles.
     """
-    num_held = front.num_held
+    num_immovable_nodes = front.num_immovable_nodes
     for _ in range(passes):
         points = front.points()
         cells = triangulate(front, points)
         angle = smallest_angles(points[cells])
-        bad_cells = np.flatnonzero((angle < _POLISH_ANGLE) & improvable(front, cells))
+        bad_cells = np.flatnonzero((angle < _POLISH_ANGLE) & is_improvable(front, cells))
         movable = np.unique(cells[bad_cells])
-        movable = movable[movable >= num_held]
+        movable = movable[movable >= num_immovable_nodes]
         if not movable.size:
             return
         order = np.argsort(cells.ravel(), kind="stable")
@@ -234,7 +234,7 @@ def polish(front: Front, passes: int = 4) -> None:
             if min_angles[best_index] > min_angles[0] + 1e-3:
                 points[node] = trial_points[best_index]
                 has_moved = True
-        front.free = points[num_held:]
+        front.free = points[num_immovable_nodes:]
         if not has_moved:
             return
 
@@ -255,7 +255,7 @@ def repair(front: Front) -> bool:
             _recover(front, points, missing_indices, remove=round_number < 10)
             continue
         angle = smallest_angles(points[cells])
-        bad_cells = np.flatnonzero((angle < _REPAIR_ANGLE) & improvable(front, cells))
+        bad_cells = np.flatnonzero((angle < _REPAIR_ANGLE) & is_improvable(front, cells))
         if not bad_cells.size:
             return True
         _insert_circumcentres(front, points, cells[bad_cells], angle[bad_cells])
@@ -271,7 +271,7 @@ def _diametral_circles(front: Front, points: np.ndarray) -> tuple[np.ndarray, np
 
 def _is_divisible(front: Front) -> np.ndarray:
     """Whether each outline segment may be divided: neither of its ends is a sharp corner."""
-    return np.logical_not(front.guarded()[front.segments()].any(axis=1))
+    return np.logical_not(front.is_sharp_corner()[front.segments()].any(axis=1))
 
 
 def _recover(front: Front, points: np.ndarray, missing_indices: np.ndarray, *, remove: bool) -> None:
@@ -306,7 +306,7 @@ def _insert_circumcentres(front: Front, points: np.ndarray, bad_cells: np.ndarra
         is_encroached[KDTree(centres).query(centre[lost_centres])[1]] = True
     accepted = centre[~is_affected & ~is_outside]
     if len(accepted):
-        accepted = accepted[clear_of_outline(front, points, accepted, np.zeros(len(accepted)))]
+        accepted = accepted[is_clear_of_outline(front, points, accepted, np.zeros(len(accepted)))]
     halved_segments = np.flatnonzero(is_encroached & is_divisible)
     front.free = np.concatenate([front.free, accepted])
     front.divide(halved_segments)
@@ -351,7 +351,7 @@ def fill(front: Front, size: Size) -> None:
         sizes = size(centre)
         is_large = radius > _RADIUS_PER_SIZE * sizes
         centre, ratio, sizes = centre[is_large], (radius / sizes)[is_large], sizes[is_large]
-        is_clear = clear_of_outline(front, points, centre, 0.5 * sizes)
+        is_clear = is_clear_of_outline(front, points, centre, 0.5 * sizes)
         if not is_clear.any():
             return
         centre, ratio, sizes = centre[is_clear], ratio[is_clear], sizes[is_clear]
@@ -360,7 +360,7 @@ def fill(front: Front, size: Size) -> None:
 
 def smooth(front: Front, size: Size, steps: int = _SMOOTHING_STEPS) -> None:
     """Move the free nodes towards the optimal Delaunay triangulation for the requested cell sizes."""
-    num_held = front.num_held
+    num_immovable_nodes = front.num_immovable_nodes
     if not len(front.free):
         return
     for _ in range(steps):
@@ -380,12 +380,12 @@ def smooth(front: Front, size: Size, steps: int = _SMOOTHING_STEPS) -> None:
                 for weight_column in weighted_centres.T
             ],
             axis=1,
-        )[num_held:]
+        )[num_immovable_nodes:]
         has_cells = node_sums[:, 2] > 0
         target = np.where(
             has_cells[:, None], node_sums[:, :2] / np.where(has_cells, node_sums[:, 2], 1.0)[:, None], front.free
         )
-        is_clear = clear_of_outline(front, points, target, 0.45 * size(target))
+        is_clear = is_clear_of_outline(front, points, target, 0.45 * size(target))
         front.free = np.where(is_clear[:, None], target, front.free)
 
 
@@ -411,7 +411,7 @@ def generate(
         points = front.points()
         cells = triangulate(front, points)
         angle = smallest_angles(points[cells])
-        if is_repaired and angle[improvable(front, cells)].min(initial=90.0) >= PROMISED_ANGLE:
+        if is_repaired and angle[is_improvable(front, cells)].min(initial=90.0) >= PROMISED_ANGLE:
             return order_nodes(points, cells)
         front = None
     raise ValueError(

@@ -83,7 +83,7 @@ def closed_line(vertices: np.ndarray) -> Curve:
     return Curve(
         length=float(stops[-1]),
         at=at,
-        inside=lambda points: topology.inside(points, [vertices]),
+        inside=lambda points: topology.is_inside_loops(points, [vertices]),
         distance=distance,
         corners=stops[:-1],
         angles=np.mod(angles, 2 * np.pi),

@@ -146,7 +146,7 @@ class SizeField:
         self._terms: list[tuple[Callable[[np.ndarray], np.ndarray], Refine]] = []
         self._user_size: Size | None = None
         if callable(refine):
-            self._user_size = limited(curves, refine)
+            self._user_size = limit_growth(curves, refine)
         elif refine is not None:
             for term in (refine,) if isinstance(refine, Refine) else tuple(refine):
                 if not isinstance(term, Refine):
@@ -211,7 +211,7 @@ def _size_at_close_nodes(required_nodes: np.ndarray, spacing: np.ndarray) -> Siz
     return size
 
 
-def limited(curves: list[Curve], function: Callable[[np.ndarray], Any], resolution: int = 128) -> Size:
+def limit_growth(curves: list[Curve], function: Callable[[np.ndarray], Any], resolution: int = 128) -> Size:
     """Limit the growth of a user's size function f to g = `_USER_SIZE_GROWTH`: the size at a point x becomes the
     minimum over y of f(y) + g |x − y|.
 

@@ -288,7 +288,7 @@ def loops_contain(loops: Sequence[Loop], points: ArrayLike) -> Bool[Array, "..."
     """Whether each of `points` (…, 2) lies inside the first loop and outside the holes (even-odd rule)."""
     if namespace(loops, points) is np:
         point_array = np.asarray(points)
-        return topology.inside(point_array.reshape(-1, 2), loops).reshape(point_array.shape[:-1])  # pyright: ignore
+        return topology.is_inside_loops(point_array.reshape(-1, 2), loops).reshape(point_array.shape[:-1])  # pyright: ignore
     points = jnp.asarray(points)
     is_inside = jnp.zeros(points.shape[:-1], bool)
     for loop in loops:
@@ -324,7 +324,9 @@ def _project_onto_loops(xp: Any, loops: Sequence[Loop], points: ArrayLike) -> tu
     closest_side = xp.argmin(((point_array[:, None] - on_sides) ** 2).sum(axis=-1), axis=1)
     nearest_points = xp.take_along_axis(on_sides, closest_side[:, None, None], axis=1)[:, 0]
     is_inside = (
-        topology.inside(point_array, chains) if xp is np else jax.lax.stop_gradient(loops_contain(chains, point_array))
+        topology.is_inside_loops(point_array, chains)
+        if xp is np
+        else jax.lax.stop_gradient(loops_contain(chains, point_array))
     )
     return point_array, is_inside, nearest_points
 

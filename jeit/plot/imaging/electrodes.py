@@ -19,7 +19,7 @@ from jeit.image import Inclusion
 from jeit.image.rasters import CONDUCTIVE, RESISTIVE
 from jeit.inverse.shapes import Star
 from jeit.mesh import Mesh
-from jeit.plot.axes import INK, axes_or_new
+from jeit.plot.axes import DARK_GREY, axes_or_new
 
 _STYLES = ((-1, RESISTIVE, "dashed", "resistive"), (1, CONDUCTIVE, "solid", "conductive"))
 
@@ -41,8 +41,8 @@ def draw_labels(labels: ArrayLike, extent: tuple[float, float, float, float], *,
     for _, label, style, name in _STYLES:
         region = pixels == label
         if region.any():
-            ax.contour(x, y, region, levels=[0.5], colors=INK, linewidths=1.4, linestyles=style)
-            ax.plot([], [], color=INK, linewidth=1.4, linestyle=style, label=name)
+            ax.contour(x, y, region, levels=[0.5], colors=DARK_GREY, linewidths=1.4, linestyles=style)
+            ax.plot([], [], color=DARK_GREY, linewidth=1.4, linestyle=style, label=name)
     return ax
 
 
@@ -54,7 +54,7 @@ def draw_outlines(stars: Sequence[Star], *, ax: Axes | None = None) -> Axes:
     for sign, _, style, name in _STYLES:
         for index, star in enumerate(star for star in stars if star.sign == sign):
             closed_outline = np.concatenate([star.outline, star.outline[:1]])
-            ax.plot(*closed_outline.T, color=INK, linewidth=1.4, linestyle=style, label=None if index else name)
+            ax.plot(*closed_outline.T, color=DARK_GREY, linewidth=1.4, linestyle=style, label=None if index else name)
     _label_intervals(ax, [star for star in stars if star.quantities is not None])
     return ax
 
@@ -84,7 +84,7 @@ def _label_intervals(ax: Axes, stars: Sequence[Star]) -> None:
             ha="center",
             va="bottom" if sides[position_index] > 0 else "top",
             fontsize=8,
-            color=INK,
+            color=DARK_GREY,
             zorder=4,
             path_effects=[withStroke(linewidth=2.5, foreground="white")],
         )
@@ -98,10 +98,18 @@ def draw_inclusions(inclusions: Sequence[Inclusion], *, ax: Axes | None = None) 
     for inclusion in inclusions:
         x, y = inclusion.centroid[:2]
         ax.add_patch(
-            Circle((x, y), inclusion.radius, fill=False, edgecolor=INK, linewidth=1.0, linestyle=(0, (4, 3)), zorder=3)
+            Circle(
+                (x, y),
+                inclusion.radius,
+                fill=False,
+                edgecolor=DARK_GREY,
+                linewidth=1.0,
+                linestyle=(0, (4, 3)),
+                zorder=3,
+            )
         )
         marker = "+" if inclusion.sign > 0 else "_"
-        ax.plot(x, y, marker=marker, color=INK, markersize=9, markeredgewidth=1.4, zorder=4, path_effects=halo)
+        ax.plot(x, y, marker=marker, color=DARK_GREY, markersize=9, markeredgewidth=1.4, zorder=4, path_effects=halo)
     return ax
 
 
@@ -210,7 +218,7 @@ def draw_numbers(
     for group in group_coincident(positions, 0.1 * number_distance):
         k = group[0]
         effects = white_rim if is_inside[k] or not beside[k] else None  # a white rim where the text is on the image
-        style = {"ha": "center", "va": "center", "fontsize": fontsize, "color": INK, "zorder": 4}
+        style = {"ha": "center", "va": "center", "fontsize": fontsize, "color": DARK_GREY, "zorder": 4}
         text = ", ".join(str(k + first) for k in group)
         if len(group) > 1:
             style["ha"] = _alignment(shifts[k])

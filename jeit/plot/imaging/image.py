@@ -20,9 +20,9 @@ from jeit.forward import ForwardModel
 from jeit.image import Inclusion, Raster
 from jeit.mesh import Mesh, check_flat, measures
 from jeit.plot.axes import (
-    CHANGE,
-    INK,
-    SOFT,
+    CHANGE_SCALE,
+    DARK_GREY,
+    LIGHT_GREY,
     ColourScale,
     axes_or_new,
     check_scale,
@@ -57,7 +57,7 @@ def plot_mesh(
     ax = axes_or_new(ax)
     points = np.asarray(mesh.points)
     triangles = np.asarray(mesh.cells if mesh.dimension == 2 else mesh.facets)
-    ax.triplot(points[:, 0], points[:, 1], triangles, color=SOFT, linewidth=0.7)
+    ax.triplot(points[:, 0], points[:, 1], triangles, color=LIGHT_GREY, linewidth=0.7)
     if mesh.dimension == 2:
         draw_outline(mesh, ax)
     if electrodes is not None:
@@ -81,7 +81,7 @@ def check_body(mesh: Mesh, electrodes: AbstractElectrodes | None) -> None:
 def draw_outline(mesh: Mesh, ax: Axes) -> None:
     """Draw the boundary of a 2-D mesh, including holes."""
     edges = np.asarray(mesh.points)[np.asarray(mesh.facets)]
-    ax.add_collection(LineCollection(list(edges), colors=INK, linewidths=0.9, capstyle="round", zorder=2))
+    ax.add_collection(LineCollection(list(edges), colors=DARK_GREY, linewidths=0.9, capstyle="round", zorder=2))
 
 
 def draw_slice_outline(
@@ -93,7 +93,7 @@ def draw_slice_outline(
     is_inside = np.pad(np.isfinite(pixels).astype(float), 1)
     width, height = (extent[1] - extent[0]) / pixels.shape[1], (extent[3] - extent[2]) / pixels.shape[0]
     padded_extent = (extent[0] - width, extent[1] + width, extent[2] - height, extent[3] + height)
-    ax.contour(is_inside, [0.5], extent=padded_extent, origin="upper", colors=INK, linewidths=0.9, zorder=2)
+    ax.contour(is_inside, [0.5], extent=padded_extent, origin="upper", colors=DARK_GREY, linewidths=0.9, zorder=2)
 
 
 def slice_text(mesh: Mesh, height: float | None = None, subject: str = "slice") -> str:
@@ -111,7 +111,7 @@ def plot_image(
     electrodes: AbstractElectrodes | None = None,
     *,
     inclusions: Sequence[Inclusion] = (),
-    scale: ColourScale = CHANGE,
+    scale: ColourScale = CHANGE_SCALE,
     title: str | None = None,
     height: float | None = None,
     ax: Axes | None = None,
@@ -182,7 +182,7 @@ def plot_raster(
     mesh: Mesh | None = None,
     electrodes: AbstractElectrodes | None = None,
     inclusions: Sequence[Inclusion] = (),
-    scale: ColourScale = CHANGE,
+    scale: ColourScale = CHANGE_SCALE,
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:

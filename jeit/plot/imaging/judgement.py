@@ -15,10 +15,10 @@ from jeit.arguments import check_kind
 from jeit.image.rasters import FiguresOfMerit
 from jeit.inverse.hyperparameter.choice import Choice
 from jeit.plot.axes import (
-    INK,
+    DARK_GREY,
+    LIGHT_GREY,
     SERIES_COLOURS,
     SERIES_MARKERS,
-    SOFT,
     axes_or_new,
     draw_horizontal_grid,
     soften_axes,
@@ -26,7 +26,7 @@ from jeit.plot.axes import (
 )
 from jeit.protocol import Protocol
 
-# Colour of each rule for λ; other rules, and values of λ specified as numbers, are drawn in the colour `INK`.
+# Colour of each rule for λ; other rules, and values of λ specified as numbers, are drawn in the colour `DARK_GREY`.
 COLOURS = {
     "gcv": "#d1495b",
     "l-curve": "#1f6fb4",
@@ -45,8 +45,8 @@ _CRITERIA = {
     "best-resolution": ("blur radius / body", "linear", "least"),
 }
 # Colours of measured and modelled voltages.
-MEASURED = "#1f6fb4"
-MODELLED = "#d1495b"
+MEASURED_COLOUR = "#1f6fb4"
+MODELLED_COLOUR = "#d1495b"
 
 
 def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = None, ax: Axes | None = None) -> Axes:
@@ -124,7 +124,7 @@ def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = N
 def _draw_l_curve(ax: Axes, curve: Choice, choices: list[Choice]) -> None:
     """Draw the L-curve, its points at powers of ten of λ, and all choices, with labels in the free corner of the L."""
     values, residual, penalty = (np.asarray(array) for array in (curve.candidates, curve.residual, curve.penalty))
-    ax.loglog(residual, penalty, color=SOFT, linewidth=1.8, zorder=1)
+    ax.loglog(residual, penalty, color=LIGHT_GREY, linewidth=1.8, zorder=1)
     exponents = np.arange(np.ceil(np.log10(values[0])), np.floor(np.log10(values[-1])) + 1, dtype=int)
     extent = np.log10([residual.max() / residual.min(), penalty.max() / penalty.min()])
     labelled_positions = np.full((1, 2), np.inf)
@@ -135,8 +135,8 @@ def _draw_l_curve(ax: Axes, curve: Choice, choices: list[Choice]) -> None:
             continue
         labelled_positions = np.vstack([labelled_positions, relative_position])
         name = "λ = " if exponent == exponents[-1] else ""
-        label = {"textcoords": "offset points", "ha": "right", "va": "top", "color": SOFT, "fontsize": 7.5}
-        ax.plot(*point, "o", color=SOFT, markersize=3, zorder=1)
+        label = {"textcoords": "offset points", "ha": "right", "va": "top", "color": LIGHT_GREY, "fontsize": 7.5}
+        ax.plot(*point, "o", color=LIGHT_GREY, markersize=3, zorder=1)
         ax.annotate(f"{name}$10^{{{exponent}}}$", point, (-4, -3), **label)
     sorted_choices = sorted(choices, key=lambda choice: float(choice.hyperparameter))
     for rank, choice in enumerate(sorted_choices):
@@ -165,7 +165,7 @@ def _draw_criterion(ax: Axes, choice: Choice, *, is_small: bool = False) -> None
     ax.set_yscale(scale)
     ax.plot(np.asarray(choice.candidates), np.asarray(choice.criterion), color=_rule_colour(choice), linewidth=1.6)
     if choice.target is not None:
-        ax.axhline(choice.target, color=INK, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
+        ax.axhline(choice.target, color=DARK_GREY, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
     ax.plot(
         value, choice.read(choice.criterion), clip_on=False, zorder=3, **_marker_style(choice, 6 if is_small else 8)
     )
@@ -192,7 +192,7 @@ def _choice_title(choice: Choice) -> str:
 
 
 def _rule_colour(choice: Choice) -> str:
-    return COLOURS.get(choice.rule, INK)
+    return COLOURS.get(choice.rule, DARK_GREY)
 
 
 def _style_axes(ax: Axes, ticks: int = 6) -> None:
@@ -261,7 +261,7 @@ def plot_figures_of_merit(
         column, row = panel_index % 3, panel_index // 3
         panel = ax.inset_axes((0.36 * column, 0.55 * (1 - row), 0.28, 0.43))
         if perfect_value is not None:
-            panel.axhline(factor * perfect_value, color=SOFT, linewidth=1.0, linestyle=(0, (4, 3)), zorder=1)
+            panel.axhline(factor * perfect_value, color=LIGHT_GREY, linewidth=1.0, linestyle=(0, (4, 3)), zorder=1)
         for merit, colour, marker in zip(figures.values(), SERIES_COLOURS, SERIES_MARKERS, strict=False):
             distance, value = 1e3 * np.asarray(merit.distance), factor * np.asarray(getattr(merit, field))
             is_finite = np.isfinite(value)
@@ -270,10 +270,10 @@ def plot_figures_of_merit(
             panel.plot(distance[is_finite], value[is_finite], marker, color=colour, markersize=3.2, zorder=3)
         _style_panel(panel, heading, unit, max_radius)
         if panel_index >= 2:  # the lowest plot of its column
-            panel.set_xlabel("Target's distance from the centre (mm)", fontsize=9, color=INK)
+            panel.set_xlabel("Target's distance from the centre (mm)", fontsize=9, color=DARK_GREY)
     styles = zip(figures, SERIES_COLOURS, SERIES_MARKERS, strict=False)
     lines = [Line2D([], [], color=colour, marker=marker, markersize=5, label=name) for name, colour, marker in styles]
-    lines.append(Line2D([], [], color=SOFT, linewidth=1.0, linestyle=(0, (4, 3)), label="perfect image"))
+    lines.append(Line2D([], [], color=LIGHT_GREY, linewidth=1.0, linestyle=(0, (4, 3)), label="perfect image"))
     ax.legend(handles=lines, frameon=False, loc="center", bbox_to_anchor=(0.72, 0, 0.28, 0.43), fontsize=11)
     return ax
 
@@ -285,8 +285,8 @@ def _binned_means(distance: np.ndarray, value: np.ndarray, tolerance: float) -> 
 
 
 def _style_panel(panel: Axes, heading: str, unit: str, max_distance: float) -> None:
-    panel.set_title(heading, loc="left", fontsize=11, color=INK)
-    panel.set_ylabel(unit, fontsize=9, color=INK)
+    panel.set_title(heading, loc="left", fontsize=11, color=DARK_GREY)
+    panel.set_ylabel(unit, fontsize=9, color=DARK_GREY)
     panel.set_xlim(0, max_distance)
     lower_limit, upper_limit = panel.get_ylim()
     panel.set_ylim(min(lower_limit, 0), upper_limit)  # from zero, so that small variations look small
@@ -332,10 +332,10 @@ def plot_voltages(
     difference_axes = ax.inset_axes((0, 0, 1, 0.36), sharex=voltage_axes)
     marker_size = float(np.clip(500 / channel.size, 0.8, 3))
     voltage_axes.plot(
-        channel, factor * measured[is_drawn], "o", color=MEASURED, markersize=2 * marker_size, label="measured"
+        channel, factor * measured[is_drawn], "o", color=MEASURED_COLOUR, markersize=2 * marker_size, label="measured"
     )
     voltage_axes.plot(
-        channel, factor * modelled[is_drawn], "o", color=MODELLED, markersize=marker_size, label="modelled"
+        channel, factor * modelled[is_drawn], "o", color=MODELLED_COLOUR, markersize=marker_size, label="modelled"
     )
     voltage_axes.set_ylabel(f"Voltage ({unit})")
     voltage_axes.legend(
@@ -344,9 +344,9 @@ def plot_voltages(
     voltage_axes.set_title(title or f"Relative misfit {100 * misfit:.2g} %", loc="left", fontsize=11)
     voltage_axes.tick_params(labelbottom=False)
     residual = 100 * (modelled - measured)[is_drawn] / rms_voltage
-    difference_axes.axhline(0, color=SOFT, linewidth=0.8)
-    difference_axes.vlines(channel, 0, residual, color=INK, linewidth=0.6)
-    difference_axes.plot(channel, residual, "o", color=INK, markersize=marker_size)
+    difference_axes.axhline(0, color=LIGHT_GREY, linewidth=0.8)
+    difference_axes.vlines(channel, 0, residual, color=DARK_GREY, linewidth=0.6)
+    difference_axes.plot(channel, residual, "o", color=DARK_GREY, markersize=marker_size)
     difference_axes.set_ylabel("Difference\n(% of rms)")
     difference_axes.set_xlabel("Channel")
     if protocol is not None:

@@ -19,9 +19,9 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.image import ImageSeries, Oscillation, Raster, amplitude_spectrum
 from jeit.mesh import Mesh
 from jeit.plot.axes import (
-    CHANGE,
-    INK,
-    SOFT,
+    CHANGE_SCALE,
+    DARK_GREY,
+    LIGHT_GREY,
     ColourScale,
     FittedScale,
     check_scale,
@@ -92,7 +92,7 @@ class FramePicture:
         if show_scale_bar:
             draw_scale_bar(ax, extent)
         centre = (extent[0] + extent[1]) / 2, (extent[2] + extent[3]) / 2
-        style = {"ha": "center", "va": "center", "color": INK, "fontsize": 10, "zorder": 5}
+        style = {"ha": "center", "va": "center", "color": DARK_GREY, "fontsize": 10, "zorder": 5}
         self.refused = ax.text(*centre, "refused", **style)  # pyright: ignore[reportArgumentType]
 
     def show(self, change: Float[np.ndarray, " m"], title: str) -> None:
@@ -105,7 +105,7 @@ class FramePicture:
         self.ax.set_title(title, fontsize=10)
 
 
-def fit_scale(changes: Float[np.ndarray, "F m"], mesh: Mesh, scale: ColourScale = CHANGE) -> FittedScale:
+def fit_scale(changes: Float[np.ndarray, "F m"], mesh: Mesh, scale: ColourScale = CHANGE_SCALE) -> FittedScale:
     """Fit one colour scale to all imaged frames. Raises `ValueError` if all frames were refused."""
     check_scale(scale)
     finite_changes = changes[np.isfinite(changes)]
@@ -120,7 +120,7 @@ def plot_frames(
     electrodes: AbstractElectrodes | None = None,
     *,
     titles: Sequence[str] | None = None,
-    scale: ColourScale = CHANGE,
+    scale: ColourScale = CHANGE_SCALE,
     most: int = SHEET_FRAMES,
     count: FrameCount | None = None,
 ) -> Figure:
@@ -171,7 +171,7 @@ def plot_frames(
         count = FrameCount(len(values), len(refused), refused)
     text = _count_text(count, len(selected), mesh)
     if text:
-        figure.supxlabel(text, fontsize=9, color=SOFT)
+        figure.supxlabel(text, fontsize=9, color=LIGHT_GREY)
     return figure
 
 
@@ -321,7 +321,7 @@ def _draw_spectra(ax: Axes, spectra: Mapping, oscillations: Sequence[Oscillation
     for frequencies, amplitude in spectra.values():
         ax.plot(frequencies, amplitude, linewidth=1.2)
     for oscillation in oscillations:
-        ax.axvline(oscillation.frequency, color=INK, linewidth=0.8, linestyle=":")
+        ax.axvline(oscillation.frequency, color=DARK_GREY, linewidth=0.8, linestyle=":")
     ax.set(xlabel="Frequency (Hz)", ylabel=f"Amplitude ({unit})", title="their spectra")
     _style_graph(ax)
 

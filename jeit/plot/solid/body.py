@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgba
 
 from jeit.electrodes.electrode_shapes import ElectrodeShapes, ProjectionSurface, surface_triangles
 from jeit.mesh import Mesh
-from jeit.plot.axes import SOFT
+from jeit.plot.axes import LIGHT_GREY
 from jeit.plot.imaging.electrodes import METAL, group_coincident
 from jeit.plot.solid.scene import BODY, Scene, draw_number
 
@@ -37,7 +37,7 @@ def add_hull(scene: Scene, mesh: Mesh) -> None:
     """Add the translucent boundary of a solid to a scene, with its edges and its outline."""
     points, triangles = np.asarray(mesh.points), surface_triangles(mesh)
     scene.add_triangles(points, triangles, np.array(to_rgba(BODY, _HULL_OPACITY)), smooth=True, is_lit=False)
-    scene.add_lines(points[visible_edges(points, triangles, scene.camera.toward)], SOFT, 0.9)
+    scene.add_lines(points[visible_edges(points, triangles, scene.camera.toward)], LIGHT_GREY, 0.9)
 
 
 def visible_edges(points, triangles, toward: Float[np.ndarray, "3"]) -> np.ndarray:

@@ -17,9 +17,9 @@ from jeit.arguments.extras import how_to_install, optional
 from jeit.electrodes import AbstractElectrodes, ElectrodeShapes, shapes_of
 from jeit.image import Inclusion
 from jeit.mesh import Mesh
-from jeit.plot.axes import CHANGE, INK, ColourScale
+from jeit.plot.axes import CHANGE_SCALE, DARK_GREY, ColourScale
 from jeit.plot.imaging.electrodes import METAL
-from jeit.plot.solid.isosurfaces import HALF, OUTER, check_drawn, level_surfaces
+from jeit.plot.solid.isosurfaces import DEFAULT_LEVELS, OUTER_OPACITY, check_drawn, level_surfaces
 from jeit.plot.solid.scene import BODY
 from jeit.plot.solid.slices import cell_values
 
@@ -34,9 +34,9 @@ def view_solid(
     values: ArrayLike,
     electrodes: AbstractElectrodes | ElectrodeShapes | None = None,
     *,
-    levels: Sequence[float] = HALF,
+    levels: Sequence[float] = DEFAULT_LEVELS,
     inclusions: Sequence[Inclusion] = (),
-    scale: ColourScale = CHANGE,
+    scale: ColourScale = CHANGE_SCALE,
     off_screen: bool = False,
 ) -> pyvista.Plotter:
     """Create an interactive view of a solid image (extra `view`): hull, isosurfaces, numbered electrodes, a slice that
@@ -73,13 +73,13 @@ def view_solid(
         plotter.enable_depth_peeling()
     hull = pv.PolyData.from_regular_faces(points, np.asarray(mesh.facets))
     plotter.add_mesh(hull, color=BODY, opacity=0.12, name="hull")
-    plotter.add_mesh(hull.extract_feature_edges(30), color=INK, line_width=1.5, name="edges")
+    plotter.add_mesh(hull.extract_feature_edges(30), color=DARK_GREY, line_width=1.5, name="edges")
     for k, (value, level, surface) in enumerate(surfaces):
         if not len(surface.triangles):
             continue
         shell = pv.PolyData.from_regular_faces(1e3 * surface.points, surface.triangles)
         shell["value"] = np.full(shell.n_points, fitted_scale.factor * value)
-        opacity = 1.0 if level == max(levels) else OUTER
+        opacity = 1.0 if level == max(levels) else OUTER_OPACITY
         options = {"smooth_shading": True, "show_scalar_bar": False, "name": f"isosurface {k}"}
         plotter.add_mesh(shell, scalars="value", opacity=opacity, **options, **colour_options)
     grid = pv.UnstructuredGrid({pv.CellType.TETRA: np.asarray(mesh.cells)}, points)
@@ -88,7 +88,7 @@ def view_solid(
     quantity, bracket, unit = fitted_scale.label.rpartition(" (")
     bar = {
         "title": f"{quantity}\n{bracket.strip()}{unit}",
-        "color": INK,
+        "color": DARK_GREY,
         "vertical": True,
         "n_labels": 5,
         "fmt": "%.3g",
@@ -104,7 +104,7 @@ def view_solid(
         else:
             surface = inclusion.form.surface()
             body_surface = pv.PolyData.from_regular_faces(1e3 * surface.points, surface.triangles)
-        plotter.add_mesh(body_surface, style="wireframe", color=INK, opacity=0.15, name=f"inclusion {k}")
+        plotter.add_mesh(body_surface, style="wireframe", color=DARK_GREY, opacity=0.15, name=f"inclusion {k}")
     plotter.add_axes()  # pyright: ignore[reportCallIssue]
     plotter.camera_position = [(-1, -1.7, 1), (0, 0, 0), (0, 0, 1)]
     plotter.reset_camera()  # pyright: ignore[reportCallIssue]
@@ -159,5 +159,5 @@ def _add_electrodes(plotter: pyvista.Plotter, pv: Any, shapes: ElectrodeShapes) 
             )
     plotter.add_mesh(pv.merge(electrode_surfaces), color=METAL, name="electrodes", ambient=0.35)
     numbers = [str(k + 1) for k in range(shapes.number)]
-    style: dict[str, Any] = {"font_size": 14, "text_color": INK, "shape_opacity": 0.6, "show_points": False}
+    style: dict[str, Any] = {"font_size": 14, "text_color": DARK_GREY, "shape_opacity": 0.6, "show_points": False}
     plotter.add_point_labels(1e3 * shapes.middles(), numbers, always_visible=True, shape_color="white", **style)

@@ -17,12 +17,12 @@ from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane, TriangleSurface, cut_by_plane, isosurface_of, node_values
 from jeit.image.plane import check_solid, crossed_edges
 from jeit.mesh import Mesh
-from jeit.plot.axes import CHANGE, INK, ColourScale, FittedScale, axes_or_new, check_scale
+from jeit.plot.axes import CHANGE_SCALE, DARK_GREY, ColourScale, FittedScale, axes_or_new, check_scale
 from jeit.plot.solid.body import add_electrodes, add_hull, number_electrodes
 from jeit.plot.solid.scene import CORNER_VIEW, Camera, Scene, hide_axes_in_space, mark_sign
 from jeit.plot.solid.surfaces import colours_of, mappable
 
-_DASH_PATTERN = {"fill": False, "edgecolor": INK, "linewidth": 1, "linestyle": (0, (4, 3)), "zorder": 3}
+_DASH_PATTERN = {"fill": False, "edgecolor": DARK_GREY, "linewidth": 1, "linestyle": (0, (4, 3)), "zorder": 3}
 
 
 def draw_visible_body(ax: Axes, camera: Camera, inclusion: Inclusion) -> None:
@@ -60,8 +60,8 @@ def _draw_round(ax: Axes, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray,
     return corners
 
 
-HALF = (0.5,)
-OUTER = 0.3
+DEFAULT_LEVELS = (0.5,)
+OUTER_OPACITY = 0.3
 # Isosurfaces of changes of one sign are drawn if the maximum change of this sign is at least this fraction of the
 # maximum change of either sign.
 _MIN_PEAK = 0.3
@@ -72,10 +72,10 @@ def plot_isosurfaces(
     values: ArrayLike,
     electrodes: AbstractElectrodes | ElectrodeShapes | None = None,
     *,
-    levels: Sequence[float] = HALF,
+    levels: Sequence[float] = DEFAULT_LEVELS,
     inclusions: Sequence[Inclusion] = (),
     camera: Camera = CORNER_VIEW,
-    scale: ColourScale = CHANGE,
+    scale: ColourScale = CHANGE_SCALE,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw isosurfaces of a solid image, at specified shares of the maximum change of each sign.
@@ -139,14 +139,14 @@ def draw_in_space(
     surfaces = level_surfaces(mesh, values, levels, is_signed=fitted.scale.difference)
     for value, share, surface in surfaces:
         colour = np.array(colours_of(fitted, np.array([value]))[0])
-        colour[3] = 1.0 if share == max(levels) else OUTER
+        colour[3] = 1.0 if share == max(levels) else OUTER_OPACITY
         scene.add_triangles(surface.points, surface.triangles, colour, smooth=True)
     for plane in planes:
         outline = cut_by_plane(mesh, plane).outline
         end_points = (
             outline[..., :1] * plane.right + outline[..., 1:] * plane.up + (plane.point @ plane.toward) * plane.toward
         )
-        scene.add_lines(end_points, INK, 0.6)
+        scene.add_lines(end_points, DARK_GREY, 0.6)
     shapes = shapes_of(mesh, electrodes) if isinstance(electrodes, AbstractElectrodes) else electrodes
     points, facets = np.asarray(mesh.points), np.asarray(mesh.facets)
     if shapes is not None:

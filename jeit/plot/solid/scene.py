@@ -16,7 +16,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.patheffects import withStroke
 
 from jeit.arguments import describe, is_number
-from jeit.plot.axes import INK, draw_scale_bar
+from jeit.plot.axes import DARK_GREY, draw_scale_bar
 
 # Direction towards the light, above and to the left of the viewer: components to the right and up on the page, and
 # towards the viewer.
@@ -170,7 +170,7 @@ class Scene:
         )
         self.add_triangles(points, triangles, np.array(to_rgba(colour)), depth_offset=depth_offset)
         edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)[rim]
-        self.add_lines(edges, INK, 0.5, depth_offset=depth_offset + abs(depth_offset) * 0.05)
+        self.add_lines(edges, DARK_GREY, 0.5, depth_offset=depth_offset + abs(depth_offset) * 0.05)
 
     def add_lines(self, ends: Float[np.ndarray, "s 2 3"], colour, width: float, *, depth_offset: float = 0.0) -> None:
         """Add lines between pairs of `ends`, `width` in points; `depth_offset` as in `add_triangles`."""
@@ -235,7 +235,7 @@ def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], origin: tupl
         tip = np.array(origin) + length * direction
         style = {
             "arrowstyle": "-|>,head_width=0.14,head_length=0.28",
-            "color": INK,
+            "color": DARK_GREY,
             "linewidth": 0.9,
             "shrinkA": 0,
             "shrinkB": 0,
@@ -243,7 +243,7 @@ def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], origin: tupl
         ax.annotate("", xy=tuple(tip), xytext=origin, arrowprops=style, annotation_clip=False)
         # The distance of the letter from the tip does not depend on the length of the arrow.
         x, y = tip + 0.3 * length * direction / np.hypot(*direction)
-        ax.text(x, y, letter, ha="center", va="center", fontsize=8, color=INK)
+        ax.text(x, y, letter, ha="center", va="center", fontsize=8, color=DARK_GREY)
 
 
 def draw_number(
@@ -252,7 +252,7 @@ def draw_number(
     """Draw a number on the page with a white rim; `align`: horizontal alignment relative to `position`."""
     x, y = position
     ax.text(
-        x, y, text, ha=align, va="center", fontsize=fontsize, color=INK, alpha=0.45 if is_faint else 1.0,
+        x, y, text, ha=align, va="center", fontsize=fontsize, color=DARK_GREY, alpha=0.45 if is_faint else 1.0,
         path_effects=_RIM, zorder=4,
     )  # fmt: skip
 
@@ -260,4 +260,4 @@ def draw_number(
 def mark_sign(ax: Axes, x: float, y: float, sign: int) -> None:
     """Draw a plus at a conductive inclusion, or a minus at a resistive inclusion."""
     marker = "+" if sign > 0 else "_"
-    ax.plot(x, y, marker=marker, color=INK, markersize=8, markeredgewidth=1.4, zorder=4, path_effects=_HALO)
+    ax.plot(x, y, marker=marker, color=DARK_GREY, markersize=8, markeredgewidth=1.4, zorder=4, path_effects=_HALO)

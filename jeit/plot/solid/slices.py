@@ -18,10 +18,10 @@ from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane, cut_by_plane
 from jeit.image.plane import AXES, crossed_edges
 from jeit.mesh import Mesh, centroids
-from jeit.plot.axes import CHANGE, INK, ColourScale, FittedScale, axes_or_new, draw_scale_bar
+from jeit.plot.axes import CHANGE_SCALE, DARK_GREY, ColourScale, FittedScale, axes_or_new, draw_scale_bar
 from jeit.plot.imaging.electrodes import METAL
 from jeit.plot.solid.body import size_of
-from jeit.plot.solid.isosurfaces import HALF, check_drawn, draw_body_in_plane, draw_in_space
+from jeit.plot.solid.isosurfaces import DEFAULT_LEVELS, check_drawn, draw_body_in_plane, draw_in_space
 from jeit.plot.solid.scene import CORNER_VIEW, Camera, draw_axes_cross, draw_number
 from jeit.plot.solid.surfaces import mappable
 
@@ -37,7 +37,7 @@ def plot_slice(
     electrodes: AbstractElectrodes | ElectrodeShapes | None = None,
     *,
     inclusions: Sequence[Inclusion] = (),
-    scale: ColourScale = CHANGE,
+    scale: ColourScale = CHANGE_SCALE,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw the section of a solid image by a plane: the sections of all cells, and the outline of the body.
@@ -80,7 +80,7 @@ def plot_slices(
     axis: str = "z",
     at: Sequence[float] | int = 9,
     inclusions: Sequence[Inclusion] = (),
-    scale: ColourScale = CHANGE,
+    scale: ColourScale = CHANGE_SCALE,
     figure: Figure | None = None,
 ) -> Figure:
     """Draw a grid of slices of a solid image, with common scales of lengths and colours.
@@ -165,7 +165,9 @@ def draw_slice(
     cells.set_cmap(fitted.keywords["cmap"])
     cells.set_clim(fitted.keywords["vmin"], fitted.keywords["vmax"])
     ax.add_collection(cells)
-    ax.add_collection(LineCollection(list(section.outline), colors=INK, linewidths=0.9, capstyle="round", zorder=2))
+    ax.add_collection(
+        LineCollection(list(section.outline), colors=DARK_GREY, linewidths=0.9, capstyle="round", zorder=2)
+    )
     shapes = _electrode_shapes(mesh, electrodes)
     if shapes is not None:
         _draw_cut_electrodes(ax, plane, shapes, 0.05 * size_of(mesh), section.polygons.reshape(-1, 2).mean(axis=0))
@@ -256,10 +258,10 @@ def plot_solid(
     values: ArrayLike,
     electrodes: AbstractElectrodes | ElectrodeShapes | None = None,
     *,
-    levels: Sequence[float] = HALF,
+    levels: Sequence[float] = DEFAULT_LEVELS,
     inclusions: Sequence[Inclusion] = (),
     camera: Camera = CORNER_VIEW,
-    scale: ColourScale = CHANGE,
+    scale: ColourScale = CHANGE_SCALE,
     figure: Figure | None = None,
 ) -> Figure:
     """Draw a solid image as isosurfaces in space, beside three perpendicular slices through its strongest change. The
@@ -341,7 +343,7 @@ def _caption(ax: Axes, common_point, levels, inclusions: Sequence[Inclusion], *,
             lines.append(f"    {interval_text(inclusion.contrast_interval, signed_percent)}")
     if len(inclusions) > _MAX_LISTED:
         lines.append(f"and {len(inclusions) - _MAX_LISTED} more")
-    ax.text(0, 0.9, "\n".join(lines), transform=ax.transAxes, va="top", fontsize=8.5, color=INK, linespacing=1.6)
+    ax.text(0, 0.9, "\n".join(lines), transform=ax.transAxes, va="top", fontsize=8.5, color=DARK_GREY, linespacing=1.6)
 
 
 def _position_text(position) -> str:

@@ -18,7 +18,7 @@ from jeit.electrodes.electrode_shapes import ElectrodeShapes, ProjectionSurface,
 from jeit.layout import SurfaceLayout
 from jeit.mesh import measures
 from jeit.mesh.geodesic import Triangles
-from jeit.plot.axes import CHANGE, INK, SERIES_COLOURS, ColourScale, FittedScale, axes_or_new, check_scale
+from jeit.plot.axes import CHANGE_SCALE, DARK_GREY, SERIES_COLOURS, ColourScale, FittedScale, axes_or_new, check_scale
 from jeit.plot.imaging.electrodes import METAL
 from jeit.plot.solid.body import add_electrodes, number_electrodes, size_of
 from jeit.plot.solid.scene import BODY, CORNER_VIEW, Camera, Scene, hide_axes_in_space
@@ -34,7 +34,7 @@ def plot_surface(
     electrodes: ElectrodeShapes | None = None,
     *,
     camera: Camera = CORNER_VIEW,
-    scale: ColourScale = CHANGE,
+    scale: ColourScale = CHANGE_SCALE,
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
@@ -149,7 +149,7 @@ def plot_curved_skin(
     *,
     marks: Mapping[str, ArrayLike] | None = None,
     camera: Camera = CORNER_VIEW,
-    scale: ColourScale = CHANGE,
+    scale: ColourScale = CHANGE_SCALE,
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
@@ -217,7 +217,7 @@ def plot_curved_skin(
             bbox_to_anchor=(0.5, 0.0),
             ncols=len(marks),
             frameon=False,
-            labelcolor=INK,
+            labelcolor=DARK_GREY,
             borderaxespad=0,
         )
     if title is not None:

@@ -44,7 +44,7 @@ listen = typer.Typer(
 
 
 @listen.callback(invoke_without_command=True)
-def _top(context: typer.Context) -> None:
+def _print_help(context: typer.Context) -> None:
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
 
@@ -160,7 +160,7 @@ def fit(
 
     from jeit.arguments import counted
     from jeit.arguments.extras import need_extra
-    from jeit.cli.console import Steps, pairs, plain_console, say_written
+    from jeit.cli.console import Steps, name_value_table, plain_console, say_written
     from jeit.touch.listening import Listener, read_clips
     from jeit.touch.listening.learners import BATCHES
     from jeit.touch.reports.listener import LISTENER_FILES, summary, write_listener
@@ -206,7 +206,7 @@ def fit(
     ]
     rows += [("note", note) for note in listener.notes]
     console.print()
-    console.print(pairs(f"Learnt from {listener.name}", rows))
+    console.print(name_value_table(f"Learnt from {listener.name}", rows))
     say_written(console, output / "listener.jeit", "report.json", "learning.png")
 
 
@@ -214,13 +214,13 @@ def _print_summary(console, result: "SoundLabels") -> None:
     """Print the class of the whole recording, and a line for each sound in it."""
     from rich.table import Table
 
-    from jeit.cli.console import pairs
+    from jeit.cli.console import name_value_table
 
     name, probability = result.whole
     description = f"{name}, {100 * probability:.0f} %" if name else "nothing"
     rows = [("windows", str(len(result))), ("as a whole", description), *(("note", note) for note in result.notes)]
     console.print()
-    console.print(pairs(result.name, rows))
+    console.print(name_value_table(result.name, rows))
     console.print()
     has_positions = result.position is not None
     names = ("sound", "from / s", "to / s", "sure / %", *(("x / mm", "y / mm") if has_positions else ()))

@@ -109,8 +109,8 @@ def image_by_network(
         frame_depths = stream_depths(network, stopping.until(frames), reference_frame)
         if numbers is not None:
             frame_depths = (item._replace(number=int(numbers[item.number])) for item in frame_depths)
-        drawing = stopping.before(PICTURES, step)
-        with stopping.ending(counter, "frames.csv", "depth.npz"):
+        drawing = stopping.drawing_reporter(PICTURES, step)
+        with stopping.exit_after_signal(counter, "frames.csv", "depth.npz"):
             summary = write_depths(frame_depths, network, output, name=str(data), progress=show, drawing=drawing)
     if quiet:
         return
@@ -180,7 +180,7 @@ learn = typer.Typer(name="learn", help="Train networks on simulated touches of a
 
 
 @learn.callback(invoke_without_command=True)
-def _top(context: typer.Context) -> None:
+def _print_help(context: typer.Context) -> None:
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
 
@@ -222,9 +222,9 @@ def image(
     from contextlib import ExitStack
 
     from jeit.arguments.extras import need_extra
-    from jeit.cli.console import Steps, pairs, plain_console, say_written
+    from jeit.cli.console import Steps, name_value_table, plain_console, say_written
     from jeit.design import read_described_skin
-    from jeit.design.commands.study import connected
+    from jeit.design.commands.study import connect_to_scheduler
     from jeit.touch.networks import learn_images
     from jeit.touch.reports.image_network import LEARNT_FILES, write_learnt_images
 
@@ -237,7 +237,7 @@ def image(
         step("read")
         with naming_options({"path": "skin"}):
             described_skin = read_described_skin(skin)
-        client = None if scheduler is None else stack.enter_context(connected(scheduler))
+        client = None if scheduler is None else stack.enter_context(connect_to_scheduler(scheduler))
         step("learn")
         learnt = learn_images(
             described_skin,
@@ -266,5 +266,5 @@ def image(
         ("time", ", ".join(f"{name} {seconds:.0f} s" for name, seconds in learnt.seconds.items())),
     ]
     console.print()
-    console.print(pairs(f"Learnt of {skin.name}", rows))
+    console.print(name_value_table(f"Learnt of {skin.name}", rows))
     say_written(console, output / "network.jeit", "report.json", "learning.png")

@@ -24,13 +24,13 @@ touch.command()(health)
 # Number of nodes of the mesh for images. Contacts are located more precisely than the size of the mesh's cells.
 _NUM_NODES = 400
 # Assumed frame rate of a recording without times, frames/s.
-_USUAL_RATE = 10.0
+_DEFAULT_RATE = 10.0
 # Maximum number of touches that are printed.
-_MOST_TOUCHES = 30
+_MAX_PRINTED_TOUCHES = 30
 
 
 @touch.callback(invoke_without_command=True)
-def _top(context: typer.Context) -> None:
+def _print_help(context: typer.Context) -> None:
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
 
@@ -94,7 +94,7 @@ def contacts(
         recorded = read_frame_recording(recording, description)
         seconds = recorded.seconds
         if seconds is None:
-            seconds = np.arange(len(recorded.frames)) / (rate or _USUAL_RATE)
+            seconds = np.arange(len(recorded.frames)) / (rate or _DEFAULT_RATE)
         with naming_options({"untouched": "--untouched"}):
             still = (
                 untouched_frames(recorded, seconds, untouched)
@@ -113,7 +113,7 @@ def contacts(
         return
     console.print(f"\n{counted(len(seconds), 'frame')}: {counted(len(found.touches), 'touch')}")
     if recorded.seconds is None and rate is None:
-        console.print(f"  note: no times are known: {_USUAL_RATE:g} frames a second are assumed; see --rate")
+        console.print(f"  note: no times are known: {_DEFAULT_RATE:g} frames a second are assumed; see --rate")
     for note in found.notes:
         console.print(f"  note: {note}", soft_wrap=True)
     _print_touches(console, found.touches, images.background)
@@ -166,7 +166,7 @@ def fit(
     Writes skin.skops, report.json and learning.png, a picture of the errors, to the folder SKIN.
     """
     from jeit.arguments.extras import need_extra
-    from jeit.cli.console import Steps, pairs, plain_console, say_written
+    from jeit.cli.console import Steps, name_value_table, plain_console, say_written
     from jeit.data import load_description
     from jeit.mesh import OwnMesh
     from jeit.touch import LearntSkin, read_presses
@@ -203,7 +203,7 @@ def fit(
     for name, standing in skin.standing.items():
         rows += [(f"{name}: method", standing.method), (f"{name}, held out", summary(name, standing))]
     console.print()
-    console.print(pairs(f"Learnt from {recorded_presses.name}", rows))
+    console.print(name_value_table(f"Learnt from {recorded_presses.name}", rows))
     _print_notes(console, skin.notes)
     say_written(console, output / "skin.skops", "report.json", "learning.png")
 
@@ -270,15 +270,15 @@ def _print_touches(console, touches, background: float) -> None:
     table = Table(*names, box=None, padding=(0, 2, 0, 0))
     for column in table.columns:
         column.justify = "right"
-    for path in touches[:_MOST_TOUCHES]:
+    for path in touches[:_MAX_PRINTED_TOUCHES]:
         places = [f"({1e3 * x:+.1f}, {1e3 * y:+.1f})" for x, y in path.position[[0, -1]]]
         peak = path.peak[abs(path.peak).argmax()] / background
         table.add_row(str(path.number), f"{path.onset:.2f}", f"{path.offset:.2f}", *places, f"{100 * peak:+.0f} %")
     if touches:
         console.print()
         console.print(table)
-    if len(touches) > _MOST_TOUCHES:
-        console.print(f"  {len(touches) - _MOST_TOUCHES} more in report.json")
+    if len(touches) > _MAX_PRINTED_TOUCHES:
+        console.print(f"  {len(touches) - _MAX_PRINTED_TOUCHES} more in report.json")
 
 
 def _print_notes(console, notes) -> None:

@@ -47,7 +47,7 @@ def gestures(
     Writes gestures.skops, report.json and gestures.png, the confusion matrix, to the folder MODEL.
     """
     from jeit.arguments.extras import need_extra
-    from jeit.cli.console import Steps, pairs, plain_console, say_written
+    from jeit.cli.console import Steps, name_value_table, plain_console, say_written
     from jeit.data import GestureSet, load_description
     from jeit.touch import learn_gestures
     from jeit.touch.reports.touch_watch import GESTURE_FILES, write_gestures
@@ -76,7 +76,7 @@ def gestures(
         rows.append(("right, held out", f"{100 * is_right.mean():.1f} % ({shares})"))
     rows += [("note", note) for note in model.notes]
     console.print()
-    console.print(pairs(f"Learnt from {recordings.name}", rows))
+    console.print(name_value_table(f"Learnt from {recordings.name}", rows))
     say_written(console, output / "gestures.skops", "report.json", "gestures.png")
 
 
@@ -156,7 +156,7 @@ def watch(
                 live_frames = LiveFrames(parse_frames(sys.stdin), rate, default_rate)
                 if untouched_frames is None:
                     step(f"untouched, for {untouched:g} s")
-                    untouched_frames = live_frames.untouched(untouched)
+                    untouched_frames = live_frames.initial_frames(untouched)
                 frames, frame_rate = live_frames, live_frames.rate_seen
             else:
                 frames, untouched_frames, frame_rate = _read_recording(

@@ -162,10 +162,10 @@ class TouchWatch:
         times that decrease.
         """
         check_kind("frames", frames, Iterable, "pairs of a second and a frame (M,), one after another")
-        return _Session(self).follow(frames)
+        return _WatchState(self).follow(frames)
 
 
-class _Session:
+class _WatchState:
     """State of a `TouchWatch` between two frames."""
 
     def __init__(self, watch: TouchWatch):

@@ -102,7 +102,7 @@ class LossFit:
         self.region = LocalChange(refined_model, conductivity[parent], centre, _REFINED_RADIUS * self.skin_size)
         self.lower_corner = np.maximum(self.lower_corner, centre - self.region.radius)
         self.upper_corner = np.minimum(self.upper_corner, centre + self.region.radius)
-        self.edge, self.band_half_width, self.model_conductivity = (
+        self.edge_length, self.band_half_width, self.model_conductivity = (
             edge_length,
             _BAND_HALF_WIDTH * edge_length,
             conductivity,
@@ -142,8 +142,8 @@ class LossFit:
                 for direction in directions
             ]
             starts_by_depth.append(sorted(candidate_starts, key=self._misfit)[:_NUM_OPTIMISED_STARTS])
-        complete_cuts = [self._fit(start, fixed=True) for start in starts_by_depth[0]]
-        partial_cuts = [self._fit(start) for start in starts_by_depth[1]]
+        complete_cuts = [self._minimise_misfit(start, fixed=True) for start in starts_by_depth[0]]
+        partial_cuts = [self._minimise_misfit(start) for start in starts_by_depth[1]]
         complete_cut = min(complete_cuts, key=lambda fit: fit.misfit)
         partial_cut = min(partial_cuts, key=lambda fit: fit.misfit)
         complete_cut, partial_cut = self._fit_bend(complete_cut, fixed=True), self._fit_bend(partial_cut)
@@ -160,7 +160,7 @@ class LossFit:
     def fit_spot(self, start: np.ndarray) -> FittedLoss:
         """Fit a round spot of lost or gained conductivity near a place (x, y), metres."""
         candidate_starts = [np.array([*start, np.log(_INITIAL_SPOT_RADIUS), depth, 0.0]) for depth in _SPOT_DEPTHS]
-        best_fit = min((self._fit(candidate) for candidate in candidate_starts), key=lambda fit: fit.misfit)
+        best_fit = min((self._minimise_misfit(candidate) for candidate in candidate_starts), key=lambda fit: fit.misfit)
         return FittedLoss(best_fit.unknowns[None, :2], best_fit.misfit, self._conductivity_on_mesh(best_fit.unknowns))
 
     def _fit_bend(self, straight_fit: _FittedUnknowns, *, fixed: bool = False) -> _FittedUnknowns:
@@ -171,11 +171,11 @@ class LossFit:
             np.array([*ends[0], *bend_place, *ends[-1], *straight_fit.unknowns[-2:]])
             for bend_place in (centre + bend_offset, centre - bend_offset)
         ]
-        bent_fits = [self._fit(candidate, fixed=fixed) for candidate in candidate_starts]
+        bent_fits = [self._minimise_misfit(candidate, fixed=fixed) for candidate in candidate_starts]
         bent_fit = min(bent_fits, key=lambda fit: fit.misfit)
         return bent_fit if bent_fit.misfit < _MAX_BEND_RATIO * straight_fit.misfit else straight_fit
 
-    def _fit(self, start: np.ndarray, *, fixed: bool = False) -> _FittedUnknowns:
+    def _minimise_misfit(self, start: np.ndarray, *, fixed: bool = False) -> _FittedUnknowns:
         """Minimise the misfit over the unknowns of a cut or a spot, from `start`; if `fixed`, the added length across
         the cut is not fitted."""
         from scipy.optimize import least_squares
@@ -224,10 +224,10 @@ class LossFit:
         min_energy = fitted.misfit * self.energy
         residual_variance = min_energy / max(len(self.change) - len(fitted.unknowns), 1)
         path = fitted.unknowns[:-2].reshape(-1, 2)
-        variance = 2 * (0.5 * self.edge) ** 2
+        variance = 2 * (0.5 * self.edge_length) ** 2
         for end, next_point in ((0, 1), (-1, -2)):
             step = path[end] - path[next_point]
-            step = self.edge * step / max(float(np.linalg.norm(step)), 1e-12)
+            step = self.edge_length * step / max(float(np.linalg.norm(step)), 1e-12)
             energy_increases = []
             for sign in (1.0, -1.0):
                 moved_path = path.copy()
@@ -235,7 +235,7 @@ class LossFit:
                 energy_increases.append(
                     self._misfit(np.array([*moved_path.ravel(), *fitted.unknowns[-2:]])) - min_energy
                 )
-            variance += self.edge**2 * min(
+            variance += self.edge_length**2 * min(
                 residual_variance / max(max(energy_increases), 1e-12 * self.energy), _MAX_END_DEVIATION**2
             )
         return float(np.sqrt(variance))

@@ -71,11 +71,11 @@ def finer_mesh(mesh: Mesh, centre: np.ndarray, radius: float, area: float) -> tu
         is_large = is_near & (np.asarray(measures(refined_mesh)) > area)
         if not is_large.any():
             break
-        points, cells, parent = _halve(points, cells, parent, is_large)
+        points, cells, parent = _halve_cells(points, cells, parent, is_large)
     return Mesh.create(points, cells), parent
 
 
-def _halve(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, is_large: Bool[np.ndarray, " m"]):
+def _halve_cells(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, is_large: Bool[np.ndarray, " m"]):
     """Halve the cells that `is_large` marks, and further cells as needed to avoid hanging nodes. Returns the points,
     the cells, and the index of each cell's original cell."""
     node_pairs = np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]], axis=-1)
@@ -155,7 +155,7 @@ class LocalChange:
         self.rest_product, self.resistance = solved.product, solved.resistance
         self.solution = np.asarray(solved.solution)[nodes]
         matrix = solved.operator.pattern.to_scipy(solved.operator.values).tocsr()
-        self.inverse = _inverse_between(matrix, nodes)
+        self.inverse = _restricted_inverse(matrix, nodes)
 
     def impedance(self, change: Float[np.ndarray, "c ..."]) -> Float[np.ndarray, "L L"]:
         """Compute the transfer impedance matrix (electrodes, electrodes), ohms, after a `change` of the conductivity in
@@ -217,7 +217,7 @@ class LocalChange:
         return np.asarray(electrode_impedance(product, self.resistance).transfer)
 
 
-def _inverse_between(matrix, nodes: Int[np.ndarray, " t"]) -> Float[np.ndarray, "t t"]:
+def _restricted_inverse(matrix, nodes: Int[np.ndarray, " t"]) -> Float[np.ndarray, "t t"]:
     """Compute the inverse of a sparse symmetric matrix, restricted to `nodes`: the inverse of the Schur complement
     after elimination of all other nodes."""
     others = np.setdiff1d(np.arange(matrix.shape[0]), nodes)

@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 
 from jeit.arguments import check_key, check_kind, real_array
 from jeit.arguments.extras import optional
-from jeit.files import need, npz_arrays, written_whole
+from jeit.files import npz_arrays, require_arrays, written_whole
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 
 # Number of neurons from which the place of a frame is estimated, and regularisation of the neurons' shares. The
@@ -340,7 +340,7 @@ def read_map(path: str | Path) -> SelfOrganisingMap | PlacedMap:
         raise FileNotFoundError(f"'{path}': there is no such file.")
     try:
         arrays = npz_arrays(Path(path), "weights", "scale", *_PLACE_FIELDS)
-        need(arrays, "weights", "scale")
+        require_arrays(arrays, "weights", "scale")
         learnt = SelfOrganisingMap(arrays["weights"], _read_scalar("scale", arrays))
         if "places" not in arrays:
             return learnt

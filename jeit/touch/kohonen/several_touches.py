@@ -41,7 +41,7 @@ def neuron_shares(placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> 
     and Hanson 1974). Raises `ValueError` if `placed` is no map with places, and for more than one frame, a number of
     channels that is not that of the map, and NaN.
     """
-    touch_sum = _TouchSum.from_frame(placed, frame, reference)
+    touch_sum = _TouchSuperposition.from_frame(placed, frame, reference)
     shares = np.zeros(placed.learnt.shape)
     shares[placed.placed] = touch_sum.fit_shares(np.ones(len(touch_sum.places), bool))[0]
     return shares
@@ -84,7 +84,7 @@ def touches_reported(
         raise ValueError(f"least must be a share, from 0 to below 1; it is {describe(least)}.")
     if apart is not None and not (is_number(apart) and apart > 0):
         raise ValueError(f"apart must be positive, in metres; it is {describe(apart)}.")
-    touch_sum = _TouchSum.from_frame(placed, frame, reference)
+    touch_sum = _TouchSuperposition.from_frame(placed, frame, reference)
     if apart is None:
         apart = _RELATIVE_SEPARATION * float(np.ptp(touch_sum.places, axis=0).max())
     shares, residual = touch_sum.fit_shares(np.ones(len(touch_sum.places), bool))
@@ -104,7 +104,7 @@ def touches_reported(
 
 
 @dataclass(frozen=True)
-class _TouchSum:
+class _TouchSuperposition:
     """Model of the voltage `change` of a frame as a weighted sum of the `changes` of neurons at `places`.
 
     `change` (channels,) and `changes` (neurons, channels) are divided by the root mean square of the neurons' changes;
@@ -117,7 +117,7 @@ class _TouchSum:
     variance: float
 
     @classmethod
-    def from_frame(cls, placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> "_TouchSum":
+    def from_frame(cls, placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> "_TouchSuperposition":
         check_kind("placed", placed, PlacedMap, "a map with places, as of PlacedMap.learn")
         frame_values, reference_values = (
             _check_frame(placed, name, array) for name, array in (("frame", frame), ("reference", reference))
@@ -137,7 +137,7 @@ class _TouchSum:
         shares[neurons], residual_norm = nnls(self.changes[neurons].T, self.change)
         return shares, float(residual_norm) ** 2
 
-    def group_neurons(self, shares: Float[np.ndarray, " k"], apart: float) -> list[Bool[np.ndarray, " k"]]:
+    def group_neurons(self, shares: Float[np.ndarray, " k"], min_distance: float) -> list[Bool[np.ndarray, " k"]]:
         """Group the neurons that have a share in the frame into clusters of nearby places.
 
         Returns, for each of the clusters that change the frame most, whether each neuron is near the cluster.
@@ -147,16 +147,18 @@ class _TouchSum:
         neurons_with_share = np.flatnonzero(shares)
         cluster_numbers = np.ones(1, int)
         if len(neurons_with_share) > 1:
-            cluster_numbers = fcluster(linkage(self.places[neurons_with_share], "single"), apart, "distance")
+            cluster_numbers = fcluster(linkage(self.places[neurons_with_share], "single"), min_distance, "distance")
         clusters = [neurons_with_share[cluster_numbers == number] for number in np.unique(cluster_numbers)]
         clusters.sort(key=lambda cluster: -np.linalg.norm(shares[cluster] @ self.changes[cluster]))
         return [
-            np.linalg.norm(self.places[:, None] - self.places[cluster], axis=-1).min(axis=1) < apart / 2
+            np.linalg.norm(self.places[:, None] - self.places[cluster], axis=-1).min(axis=1) < min_distance / 2
             for cluster in clusters[:_MAX_TOUCHES]
         ]
 
 
-def _select_groups(model: _TouchSum, groups: list[np.ndarray], variance: float) -> list[Bool[np.ndarray, " k"]]:
+def _select_groups(
+    model: _TouchSuperposition, groups: list[np.ndarray], variance: float
+) -> list[Bool[np.ndarray, " k"]]:
     """Select groups of neurons by forward selection until no further group reduces the residual of the frame enough."""
     selected_groups: list[np.ndarray] = []
     residual = float(model.change @ model.change)

@@ -225,7 +225,7 @@ class Channels:
             remaining_frames = np.setdiff1d(remaining_frames, rows, assume_unique=True)
         novelty = _novelty(scores, residual, alive, self.spread) / self.usual
         novelty = np.maximum(novelty, _NOVELTY_AT_USUAL_DISTANCE * self.neighbourhood(scores))
-        return completed_changes * self.scale, alive, novelty, self._excess(residual, alive)
+        return completed_changes * self.scale, alive, novelty, self._excess_deviations(residual, alive)
 
     def _working_channels(self, frame: np.ndarray, has_reading: np.ndarray) -> np.ndarray:
         """Determine which channels of a frame agree with the prediction from the other channels.
@@ -295,7 +295,7 @@ class Channels:
                 )
         return errors
 
-    def _excess(self, residual: np.ndarray, alive: np.ndarray) -> Float[np.ndarray, "n m"]:
+    def _excess_deviations(self, residual: np.ndarray, alive: np.ndarray) -> Float[np.ndarray, "n m"]:
         """Estimate the standard deviation of reading errors (frames, channels) in excess of the errors of the training
         presses.
 

@@ -17,9 +17,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from jeit.arguments import describe, listed
+from jeit.arguments import describe, names_text
 from jeit.arguments.extras import need_extra
-from jeit.files import check_archive, reason, written_whole
+from jeit.files import check_archive, error_text, written_whole
 from jeit.touch.kohonen.placed_map import PlacedMap
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 from jeit.touch.learnt.array_models import Forest, NearestNeighbours, SupportVectorMachine
@@ -178,7 +178,7 @@ def read_plain(path: Path, kind: str, version: int, description: str, make: Call
         check_archive(path)
         untrusted_types = sorted(get_untrusted_types(file=path))
         if untrusted_types:
-            raise ValueError(f"it holds {listed(untrusted_types, max_names=3)}, which no {description} does")
+            raise ValueError(f"it holds {names_text(untrusted_types, max_names=3)}, which no {description} does")
         content = load(path, trusted=[])
         if not isinstance(content, dict) or content.get("kind") != kind:
             raise ValueError("it is of another kind")
@@ -188,7 +188,9 @@ def read_plain(path: Path, kind: str, version: int, description: str, make: Call
         fields_by_name: Any = _from_plain(content["skin"])
         return make(fields_by_name)
     except Exception as error:  # any exception: the file may create objects of many packages
-        raise ValueError(f"'{path}' is not a {description} that can be read ({reason(error)}); fit it again.") from None
+        raise ValueError(
+            f"'{path}' is not a {description} that can be read ({error_text(error)}); fit it again."
+        ) from None
 
 
 def _to_plain(value):

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
-from jeit.arguments import readings
-from jeit.files import need, npz_arrays
+from jeit.arguments import measurable_values
+from jeit.files import npz_arrays, require_arrays
 from jeit.touch.learnt.features import Features
 
 # Minimum number of frames of a session whose voltage changes are standardised separately.
@@ -209,7 +209,7 @@ def _read_arrays(path: str | Path, *keys: str) -> dict[str, np.ndarray]:
     if not Path(path).is_file():
         raise FileNotFoundError(f"'{path}': there is no such file.")
     arrays = npz_arrays(Path(path), *keys)
-    need(arrays, "frames")
+    require_arrays(arrays, "frames")
     return {key: array for key, array in arrays.items() if key}
 
 
@@ -236,7 +236,7 @@ def check_frames(name: str, values) -> Float[np.ndarray, "N M"]:
             f"{name} is {frames.dtype} of shape {frames.shape}; give real numbers, (frames, channels), one row for "
             "each frame."
         )
-    return readings(frames.astype(float))
+    return measurable_values(frames.astype(float))
 
 
 def check_reference(values, frames) -> Float[np.ndarray, "N M"]:

@@ -14,7 +14,7 @@ from jaxtyping import Array
 from jeit.acoustic import Calibration, Recording, locate_touches
 from jeit.arguments import check_key, check_kind, check_name, counted
 from jeit.arguments.extras import need_extra
-from jeit.files import reason
+from jeit.files import error_text
 from jeit.touch.learnt.answers import Standing
 from jeit.touch.learnt.methods import fit_sharpness, probabilities
 from jeit.touch.listening.feature_images import NUM_BANDS, WINDOW_INTERVAL, image_blocks
@@ -311,7 +311,7 @@ class Listener:
             names, notes, name = tuple(map(str, header["names"])), tuple(map(str, header["notes"])), str(header["name"])
             channels, loudness = int(header["channels"]), bool(header["loudness_counts"])
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise ValueError(f"'{path}' is not {_KIND} that can be read: {reason(error)}.") from None
+            raise ValueError(f"'{path}' is not {_KIND} that can be read: {error_text(error)}.") from None
         return cls(
             names,
             header["method"],

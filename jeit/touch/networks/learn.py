@@ -85,7 +85,7 @@ class StoredTouches:
     def __init__(self, indents: IndentSet, path: str | Path, max_chunk_size: int = _MAX_TOUCHES_IN_MEMORY):
         """Open the store of touches. Raises `ValueError` if the set is not finished, and as `Store` does."""
         store, chunks = Store(indents.contents(), path, create=False), indents.chunks
-        checksums = store.finished()
+        checksums = store.finished_checksums()
         if len(checksums) < len(chunks):
             raise ValueError(
                 f"path: {len(checksums)} of {len(chunks)} chunks of {path} are simulated; run simulate_presses again."

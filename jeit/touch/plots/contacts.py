@@ -14,8 +14,8 @@ from jeit.arguments import check_kind
 from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Mesh
 from jeit.plot.axes import (
-    CHANGE,
-    INK,
+    CHANGE_SCALE,
+    DARK_GREY,
     ColourScale,
     axes_or_new,
     draw_colour_bar,
@@ -35,7 +35,7 @@ def plot_contacts(
     contacts: Sequence[Contact],
     electrodes: AbstractElectrodes | None = None,
     *,
-    scale: ColourScale = CHANGE,
+    scale: ColourScale = CHANGE_SCALE,
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
@@ -73,8 +73,8 @@ def draw_contacts(contacts: Sequence[Contact], *, ax: Axes | None = None) -> Axe
     ax = axes_or_new(ax)
     for contact in contacts:
         x, y = contact.centroid
-        ax.add_patch(Polygon(contact.contour, fill=False, edgecolor=INK, linewidth=1.2, zorder=3))
-        ax.plot(x, y, marker="+", color=INK, markersize=9, markeredgewidth=1.4, zorder=4, path_effects=_HALO)
+        ax.add_patch(Polygon(contact.contour, fill=False, edgecolor=DARK_GREY, linewidth=1.2, zorder=3))
+        ax.plot(x, y, marker="+", color=DARK_GREY, markersize=9, markeredgewidth=1.4, zorder=4, path_effects=_HALO)
         text = f"({1e3 * x:+.1f}, {1e3 * y:+.1f}) mm".replace("-", "−")
         contour_top = contact.contour[:, 1].max()
         ax.annotate(
@@ -83,7 +83,7 @@ def draw_contacts(contacts: Sequence[Contact], *, ax: Axes | None = None) -> Axe
             (0, 4),
             textcoords="offset points",
             ha="center",
-            color=INK,
+            color=DARK_GREY,
             fontsize=8,
             zorder=5,
             path_effects=_HALO,

@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind
 from jeit.plot.axes import (
-    CHANGE,
-    INK,
+    CHANGE_SCALE,
+    DARK_GREY,
+    LIGHT_GREY,
     SERIES_COLOURS,
-    SOFT,
     ColourScale,
     axes_or_new,
     draw_scale_bar,
@@ -33,7 +33,7 @@ def plot_health(
     health: SkinHealth,
     image: ArrayLike | None = None,
     *,
-    scale: ColourScale = CHANGE,
+    scale: ColourScale = CHANGE_SCALE,
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
@@ -153,9 +153,9 @@ def plot_health_course(
     )
     relative_sizes = np.where(has_reading.any(axis=1), change_size(scaled_changes) / healthy.limit, np.nan)
     ax = axes_or_new(ax, (9.0, 3.2))
-    ax.plot(time_values, relative_sizes, color=INK, linewidth=0.8)
-    ax.axhline(1.0, color=SOFT, linewidth=1, linestyle=(0, (4, 3)))
-    ax.text(1, 1.0, " limit", color=SOFT, fontsize=8, va="center", transform=ax.get_yaxis_transform())
+    ax.plot(time_values, relative_sizes, color=DARK_GREY, linewidth=0.8)
+    ax.axhline(1.0, color=LIGHT_GREY, linewidth=1, linestyle=(0, (4, 3)))
+    ax.text(1, 1.0, " limit", color=LIGHT_GREY, fontsize=8, va="center", transform=ax.get_yaxis_transform())
     for event in health.events:
         colour = SERIES_COLOURS[2] if event.kind == EventKind.REPAIRED else SERIES_COLOURS[1]
         ax.axvline(event.time, color=colour, linewidth=1.4)
@@ -174,7 +174,7 @@ def plot_health_course(
     ax.set_yscale("symlog", linthresh=1.0)
     ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     ax.set_ylim(0, max(_MIN_AXIS_LIMIT, 1.6 * float(np.nanmax(relative_sizes, initial=1.0))))
-    ax.set_ylabel("Change, times the limit", color=INK)
+    ax.set_ylabel("Change, times the limit", color=DARK_GREY)
     soften_axes(ax)
     if title is not None:
         ax.set_title(title)

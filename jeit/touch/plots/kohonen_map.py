@@ -10,7 +10,16 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 from jeit.arguments import check_kind, real_array
-from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, draw_colour_bar, draw_scale_bar, extent_of, hide_axes
+from jeit.plot.axes import (
+    DARK_GREY,
+    LIGHT_GREY,
+    SEQUENTIAL,
+    axes_or_new,
+    draw_colour_bar,
+    draw_scale_bar,
+    extent_of,
+    hide_axes,
+)
 from jeit.touch.kohonen import MapTouch
 
 # Area of a neuron's marker, points², in a map of the reference size; number of neurons of a map of this size.
@@ -69,7 +78,9 @@ def plot_map(
         for edge in np.stack([first_ends, second_ends], axis=-2).reshape(-1, 2, 2)
         if np.isfinite(edge).all()
     ]
-    ax.add_collection(LineCollection(edges, colors=INK if values is None else SOFT, linewidths=0.5, zorder=1))
+    ax.add_collection(
+        LineCollection(edges, colors=DARK_GREY if values is None else LIGHT_GREY, linewidths=0.5, zorder=1)
+    )
     if values is not None:
         marker_area = _MARKER_AREA * min(4.0, _REFERENCE_NEURONS / has_place.size)
         points = ax.scatter(

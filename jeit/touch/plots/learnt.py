@@ -12,10 +12,10 @@ from matplotlib.collections import EllipseCollection
 
 from jeit.arguments import check_kind, real_array
 from jeit.plot.axes import (
-    INK,
+    DARK_GREY,
+    LIGHT_GREY,
     SEQUENTIAL,
     SERIES_COLOURS,
-    SOFT,
     axes_or_new,
     draw_colour_bar,
     draw_legend_above,
@@ -83,7 +83,7 @@ def plot_answers(touches: Touches, *, title: str | None = None, ax: Axes | None 
             touches.touched.T, aspect="auto", cmap="Blues", vmin=0, vmax=1.2, interpolation="nearest", origin="lower"
         )
         ax.set_yticks(range(touches.touched.shape[1]))
-        ax.set_ylabel("Key", color=INK)
+        ax.set_ylabel("Key", color=DARK_GREY)
     elif touches.label is not None:
         labels = [str(text) for text in np.unique(touches.label) if text]
         has_label = touches.label != ""
@@ -102,10 +102,10 @@ def plot_answers(touches: Touches, *, title: str | None = None, ax: Axes | None 
         lower_limits, upper_limits = touches.force - touches.force_std, touches.force + touches.force_std
         ax.fill_between(frame, lower_limits, upper_limits, color=SERIES_COLOURS[0], alpha=0.2, linewidth=0)
         ax.plot(frame, touches.force, color=SERIES_COLOURS[0], linewidth=1.2)
-        ax.set_ylabel("Force (N)", color=INK)
+        ax.set_ylabel("Force (N)", color=DARK_GREY)
     for unlike_frame in frame[touches.unlike]:
         ax.axvline(unlike_frame, color=SERIES_COLOURS[1], linewidth=0.6, alpha=0.5, zorder=0)
-    ax.set_xlabel("Frame", color=INK)
+    ax.set_xlabel("Frame", color=DARK_GREY)
     num_unlike = int(touches.unlike.sum())
     ax.set_title((f"red: {num_unlike} frames unlike any learnt from" if num_unlike else "") if title is None else title)
     soften_axes(ax)
@@ -179,8 +179,8 @@ def plot_losses(courses: Mapping[str, TrainingResult], *, title: str | None = No
         relative_losses = np.array(course.validation) / course.validation[0]
         ax.plot(course.steps, relative_losses, color=colour, linewidth=1.6, label=name)
         ax.plot(course.steps[course.best], relative_losses[course.best], marker="o", color=colour, markersize=5)
-    ax.set_xlabel("Batches", color=INK)
-    ax.set_ylabel("Loss of touches held out, of that at first", color=INK)
+    ax.set_xlabel("Batches", color=DARK_GREY)
+    ax.set_ylabel("Loss of touches held out, of that at first", color=DARK_GREY)
     soften_axes(ax)
     draw_legend_above(ax)
     if title is not None:
@@ -217,7 +217,7 @@ def plot_force_errors(force: Standing, *, title: str | None = None, ax: Axes | N
     ax = axes_or_new(ax)
     true_forces, estimated_forces = force.right[:, 0], force.held_out[:, 0]
     limits = [min(true_forces.min(), estimated_forces.min()), max(true_forces.max(), estimated_forces.max())]
-    ax.plot(limits, limits, color=SOFT, linewidth=1, zorder=1)
+    ax.plot(limits, limits, color=LIGHT_GREY, linewidth=1, zorder=1)
     ax.plot(
         true_forces,
         estimated_forces,
@@ -228,8 +228,8 @@ def plot_force_errors(force: Standing, *, title: str | None = None, ax: Axes | N
         color=SERIES_COLOURS[0],
         markeredgewidth=0,
     )
-    ax.set_xlabel("Force (N)", color=INK)
-    ax.set_ylabel("Estimated force of presses held out (N)", color=INK)
+    ax.set_xlabel("Force (N)", color=DARK_GREY)
+    ax.set_ylabel("Estimated force of presses held out (N)", color=DARK_GREY)
     ax.set_title(
         f"Forces: {np.abs(estimated_forces - true_forces).mean():.3g} N off on average" if title is None else title
     )
@@ -270,10 +270,10 @@ def plot_confusion(label: Standing, *, title: str | None = None, ax: Axes | None
         ax.set_yticks(range(len(labels)), labels)
     if len(labels) <= 10:
         for row, column in np.argwhere(shares >= 0.5):
-            colour = "white" if shares[row, column] > 50 else INK
+            colour = "white" if shares[row, column] > 50 else DARK_GREY
             ax.text(column, row, f"{shares[row, column]:.0f}", ha="center", va="center", color=colour, fontsize=8)
-    ax.set_xlabel("Predicted label", color=INK)
-    ax.set_ylabel("True label", color=INK)
+    ax.set_xlabel("Predicted label", color=DARK_GREY)
+    ax.set_ylabel("True label", color=DARK_GREY)
     percentage = 100 * np.mean(label.right == label.held_out)
     ax.set_title(f"Labels: {percentage:.1f} % right of presses held out" if title is None else title)
     return ax
@@ -285,8 +285,8 @@ def plot_key_errors(keys: Standing, *, title: str | None = None, ax: Axes | None
     error_rates = 100 * np.mean(keys.held_out != keys.right, axis=0)
     ax.bar(range(len(error_rates)), error_rates, color=SERIES_COLOURS[0], width=0.7)
     ax.set_xticks(range(len(error_rates)))
-    ax.set_xlabel("Key", color=INK)
-    ax.set_ylabel("Classified wrongly (%)", color=INK)
+    ax.set_xlabel("Key", color=DARK_GREY)
+    ax.set_ylabel("Classified wrongly (%)", color=DARK_GREY)
     ax.set_ylim(0, max(1.0, 1.1 * error_rates.max()))
     pattern_share = 100 * np.mean((keys.held_out == keys.right).all(axis=1))
     default_title = f"Keys: {100 - error_rates.mean():.1f} % right, whole patterns {pattern_share:.1f} %"
@@ -302,11 +302,11 @@ def plot_tried(label: Standing, *, title: str | None = None, ax: Axes | None = N
     colours = [SERIES_COLOURS[0] if name == label.method else "#c9d3de" for name in names]
     ax.barh(range(len(names)), percentages, color=colours, height=0.7)
     for row, value in enumerate(percentages):
-        ax.text(value, row, f" {value:.0f}", va="center", color=INK, fontsize=8)
+        ax.text(value, row, f" {value:.0f}", va="center", color=DARK_GREY, fontsize=8)
     ax.set_yticks(range(len(names)), names, fontsize=8)
     ax.invert_yaxis()
     ax.set_xlim(0, 105)
-    ax.set_xlabel("Right of what was held out (%)", color=INK)
+    ax.set_xlabel("Right of what was held out (%)", color=DARK_GREY)
     ax.set_title("What was tried" if title is None else title)
     soften_axes(ax)
     return ax

@@ -13,9 +13,9 @@ from jeit.arguments import check_kind
 from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Mesh
 from jeit.plot.axes import (
-    INK,
+    DARK_GREY,
+    LIGHT_GREY,
     SERIES_COLOURS,
-    SOFT,
     axes_or_new,
     draw_colour_bar,
     draw_scale_bar,
@@ -58,10 +58,10 @@ def plot_changes(
         )
     ax = axes_or_new(ax, (9.0, 2.6))
     factor, prefixed_unit = with_si_prefix(float(np.nanmax(values, initial=level)), unit)
-    ax.plot(*_reduce_points(*_interrupt_at_gaps(times, factor * values)), color=INK, linewidth=0.8)
-    ax.axhline(factor * level, color=SOFT, linewidth=1, linestyle=(0, (4, 3)))
-    ax.text(1, factor * level, " level", color=SOFT, fontsize=8, va="center", transform=ax.get_yaxis_transform())
-    ax.set_ylabel(f"Greatest change ({prefixed_unit})", color=INK)
+    ax.plot(*_reduce_points(*_interrupt_at_gaps(times, factor * values)), color=DARK_GREY, linewidth=0.8)
+    ax.axhline(factor * level, color=LIGHT_GREY, linewidth=1, linestyle=(0, (4, 3)))
+    ax.text(1, factor * level, " level", color=LIGHT_GREY, fontsize=8, va="center", transform=ax.get_yaxis_transform())
+    ax.set_ylabel(f"Greatest change ({prefixed_unit})", color=DARK_GREY)
     ax.set_ylim(bottom=min(0.0, factor * float(np.nanmin(values, initial=0.0))))
     soften_axes(ax)
     if title is not None:
@@ -114,7 +114,7 @@ def plot_timeline(
                 touch.touch.offset if touch.touch.cut_off else touch.touch.onset,
                 lane,
                 marker="|",
-                color=INK,
+                color=DARK_GREY,
                 markersize=14,
             )
         if len(touches) <= _MAX_NUMBERED:
@@ -125,13 +125,13 @@ def plot_timeline(
                 (0, 1),
                 textcoords="offset points",
                 ha="center",
-                color=INK,
+                color=DARK_GREY,
                 fontsize=7,
             )
     ax.set_yticks(range(len(lanes)), lanes)
     ax.set_ylim(len(lanes) - 0.4, -0.75)
     ax.autoscale_view(scaley=False)
-    ax.set_xlabel("Time (s)", color=INK)
+    ax.set_xlabel("Time (s)", color=DARK_GREY)
     soften_axes(ax)
     if title is not None:
         ax.set_title(title)
@@ -192,7 +192,13 @@ def plot_touch_paths(
             )
             if len(touches) <= _MAX_NUMBERED:
                 ax.annotate(
-                    f"{touch.number}", centroids[0], (4, 2), textcoords="offset points", color=INK, fontsize=7, zorder=5
+                    f"{touch.number}",
+                    centroids[0],
+                    (4, 2),
+                    textcoords="offset points",
+                    color=DARK_GREY,
+                    fontsize=7,
+                    zorder=5,
                 )
     hide_axes(ax, extent)
     draw_scale_bar(ax, extent)
@@ -279,7 +285,7 @@ def plot_sound_labels(labels: SoundLabels, *, title: str | None = None, ax: Axes
             ax.plot(bar_limits, [bar_height, bar_height], color=SERIES_COLOURS[1], linewidth=2.5, solid_capstyle="butt")
     ax.set_yticks(range(len(names)), names)
     ax.set_xlim(0, extent[1])
-    ax.set_xlabel("Time (s)", color=INK)
+    ax.set_xlabel("Time (s)", color=DARK_GREY)
     num_quiet = int((labels.named == "").sum())
     default_title = f"{labels.name}: sounds in red" + (
         f"; blank, {num_quiet} of {len(labels)} windows quiet" if num_quiet else ""

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from jeit.arguments import describe
-from jeit.files import reason, written_whole
+from jeit.files import error_text, written_whole
 
 # First bytes of a model file; maximum size of its header, and of all its arrays together, bytes.
 _MAGIC, _MAX_HEADER_SIZE, _MAX_ARRAY_SIZE = b"jeit model\n", 2**20, 2**31
@@ -73,7 +73,7 @@ def read_model(
             architecture = eqx.filter_eval_shape(make, head)
         except (KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
             raise ValueError(
-                f"its header does not describe such a model ({type(error).__name__}: {reason(error)})"
+                f"its header does not describe such a model ({type(error).__name__}: {error_text(error)})"
             ) from None
         arrays = [leaf for leaf in jax.tree.leaves(architecture) if isinstance(leaf, jax.ShapeDtypeStruct)]
         remaining_bytes = os.fstat(file.fileno()).st_size - file.tell()
@@ -113,7 +113,7 @@ def _open_file(path: Path, kind: str) -> Iterator[BinaryIO]:
         with path.open("rb") as file:
             yield file
     except Exception as error:  # any exception: the model of the header is created before it can be checked
-        raise ValueError(f"'{path}' is not {kind} that can be read: {reason(error)}.") from None
+        raise ValueError(f"'{path}' is not {kind} that can be read: {error_text(error)}.") from None
 
 
 def _read_header(file: BinaryIO, kind: str, version: int) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Inexact, Int
 from jeit_solvers.cores import memory_of_machine
 from jeit_solvers.engines import has_values
 from jeit_solvers.sparse.exact_fronts import Fronts, find_fronts
-from jeit_solvers.sparse.exact_fronts_numpy import solve_at_once
+from jeit_solvers.sparse.exact_fronts_numpy import solve_with_cached_factor
 from jeit_solvers.sparse.operator import MatrixSolver, NumpySolver, SparseSymmetric, require_sparse_symmetric
 from jeit_solvers.sparse.optional_packages import Multigrid, multigrid_is_installed
 from jeit_solvers.sparse.padded_fronts import FactorisationPlan, analyse
@@ -234,7 +234,7 @@ class FrontalCholesky(MatrixSolver):
 
     def solve_columns(self, state: SparseSymmetric, columns: Inexact[Array, "n k"]) -> Inexact[Array, "n k"]:
         """Solutions (n, k) for k right-hand sides `columns`."""
-        return solve_at_once(self.fronts, state.values, columns)
+        return solve_with_cached_factor(self.fronts, state.values, columns)
 
     def compute(
         self, state: SparseSymmetric, vector: Inexact[Array, " n"], options: dict[str, Any]

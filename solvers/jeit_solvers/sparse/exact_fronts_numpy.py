@@ -34,7 +34,7 @@ _MIN_PARALLEL_OPERATIONS = 5e9
 # Number of rows of a child front's Schur complement that are added to the parent front together. Each such block
 # includes some entries below the diagonal, which are not needed.
 _ADDED_ROWS = 64
-# Maximum number of entries of a factor that `solve_at_once` caches for the next call.
+# Maximum number of entries of a factor that `solve_with_cached_factor` caches for the next call.
 _MAX_CACHED_ENTRIES = 100_000_000
 
 
@@ -186,7 +186,7 @@ def factorise_fronts(fronts: Fronts, values: Inexact[np.ndarray, " nnz"]) -> Fro
     return FrontalFactor(fronts, panels)
 
 
-def solve_at_once(
+def solve_with_cached_factor(
     fronts: Fronts, values: Inexact[Array, " nnz"], columns: Inexact[Array, "n k"]
 ) -> Inexact[Array, "n k"]:
     """Solve for k right-hand sides `columns` (n, k), also inside `jax.jit`, where the compiled program calls NumPy. The

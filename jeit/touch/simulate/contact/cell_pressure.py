@@ -73,7 +73,7 @@ def _pressed_cells(
     samples.check(presses)
     positions = np.array([press.position for press in presses])
     indenter_numbers = _indenter_numbers(presses)
-    max_reaches = samples.chord * np.array([press.indenter.reach for press in presses])
+    max_reaches = samples.max_chord_ratio * np.array([press.indenter.reach for press in presses])
     # The extent of the pressure on a flat skin is no upper bound for that on a concave skin.
     reach_bounds = max_reaches if samples.curved is not None else _reach_bounds(support, presses, indenter_numbers)
     extents = np.minimum(reach_bounds, max_reaches) + samples.radius
@@ -159,7 +159,7 @@ def _pressures_of_equal_indenters(samples: Samples, support: AbstractSupport, pr
     )
     loads = np.array([press.load for press in presses])
     pressure = support.spread(
-        presses[0].indenter, loads, local_points, sample_areas, _height_below_plane(samples, fall)
+        presses[0].indenter, loads, local_points, sample_areas, _depth_below_plane(samples, fall)
     ) * (sample_areas > 0)
     pressure = pressure.reshape(sample_shape)
     for press_index in np.flatnonzero(np.count_nonzero(pressure, axis=(1, 2)) < _MIN_NUM_SAMPLES).tolist():
@@ -184,7 +184,7 @@ def _pressures_on_finer_lattice(samples: Samples, support: AbstractSupport, pres
         area_ratios[0] * samples.area[cells] * is_cell * num_samples / num_fine_samples, num_fine_samples
     )[None]
     loads = np.array([press.load])
-    pressure = support.spread(press.indenter, loads, local_points, sample_areas, _height_below_plane(samples, fall)) * (
+    pressure = support.spread(press.indenter, loads, local_points, sample_areas, _depth_below_plane(samples, fall)) * (
         sample_areas > 0
     )
     if pressure.any():
@@ -211,9 +211,10 @@ def _pressures_on_finer_lattice(samples: Samples, support: AbstractSupport, pres
     return pressure
 
 
-def _height_below_plane(samples: Samples, fall):
-    """Return `fall`, the distance of a curved skin's surface below the plane of the press; None for flat skins."""
-    return None if samples.curved is None else fall
+def _depth_below_plane(samples: Samples, depth_below_plane):
+    """Return `depth_below_plane`, the distance of a curved skin's surface below the plane of the press; None for flat
+    skins."""
+    return None if samples.curved is None else depth_below_plane
 
 
 def _pad_and_stack(rows_of_cells: list, pressures: list) -> PressedCells:

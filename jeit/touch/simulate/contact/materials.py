@@ -195,7 +195,7 @@ class Material(Module):
             _check_number(name, getattr(self, name), lambda value: value >= 0, "zero or more")
         for name in ("conductivity_trend", "contact_trend"):
             _check_number(name, getattr(self, name), lambda _: True, "a number")
-        if not _are_branches(self.creep):
+        if not _are_creep_branches(self.creep):
             raise ValueError(
                 f"creep: give (share, seconds) of every branch, shares of sum below 1, such as ((0.1, 1.0), (0.1, "
                 f"60.0)); it is {self.creep!r}."
@@ -212,7 +212,7 @@ def _check_number(name: str, value, is_valid: Callable[[float], bool], requireme
         raise ValueError(f"{name} must be {requirement}; it is {describe(value)}.")
 
 
-def _are_branches(creep) -> bool:
+def _are_creep_branches(creep) -> bool:
     """Whether `creep` consists of pairs (share, seconds) whose shares have a sum below 1."""
     if not isinstance(creep, (tuple, list)) or not all(
         isinstance(branch, (tuple, list)) and len(branch) == 2 for branch in creep

@@ -18,7 +18,7 @@ import numpy as np
 from jeit.arguments import check_kind, describe
 from jeit.arguments.extras import need_extra
 from jeit.design.study.contents import Contents
-from jeit.design.study.run import Progress, ProgressReporter, over_cluster
+from jeit.design.study.run import Progress, ProgressReporter, solve_on_cluster
 from jeit.design.study.store import Store, writing
 from jeit.touch.simulate.contact.indent_sets import IndentSet
 from jeit.touch.simulate.contact.indents import PressDraws
@@ -191,12 +191,12 @@ def simulate_presses(
     need_extra("cluster", "a set of touches")
     check_kind("presses", presses, (PressSet, IndentSet), "a PressSet(skin, draws, number), or an IndentSet")
     with writing(presses.contents(), path) as store:
-        finished_chunks = set(store.sound())
+        finished_chunks = set(store.intact_chunks())
         remaining_chunks = [number for number in range(len(presses.chunks)) if number not in finished_chunks]
         report = ProgressReporter(presses.chunks, finished_chunks, progress)
         for number, results in _solve_chunks(presses, remaining_chunks, client):
             store.write(number, results)
-            report.finished(number)
+            report.report_finished_chunk(number)
     return open_presses(presses, path)
 
 
@@ -224,7 +224,7 @@ def open_presses(presses: PressSet | IndentSet, path: str | Path):
     need_extra("cluster", "a set of touches")
     store = Store(presses.contents(), path, create=False)
     is_finished = np.zeros(presses.number, bool)
-    for number in store.sound():
+    for number in store.intact_chunks():
         is_finished[list(presses.chunks[number])] = True
     return store.open_dataset().assign_coords(finished=("touch", is_finished))
 
@@ -239,4 +239,4 @@ def _solve_chunks(
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     if client is None:
         return ((number, solve_presses(presses, number)) for number in chunks)
-    return over_cluster(client, solve_presses, presses, chunks)
+    return solve_on_cluster(client, solve_presses, presses, chunks)

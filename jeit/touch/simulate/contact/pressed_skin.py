@@ -91,7 +91,7 @@ def advance_state(
     """Advance a material's `state` by a time step of `seconds`, at the end of which the material bears `pressure` (m,);
     return the new state and the effective pressure (m,), pascals."""
     output = np.maximum(pressure, np.minimum(state.hysteresis_output, pressure / (1 - material.hysteresis)))
-    shares, times = _branches(material)
+    shares, times = _creep_branches(material)
     branch_states = state.branch_states
     if seconds > 0:
         relative_times = seconds / times
@@ -105,11 +105,11 @@ def advance_state(
 def held_pressure(material: Material, pressure: Float[np.ndarray, "..."], seconds: float) -> Float[np.ndarray, "..."]:
     """Compute the effective pressure (…), pascals, under the first `pressure` on a material, applied suddenly and
     constant for `seconds`."""
-    shares, times = _branches(material)
+    shares, times = _creep_branches(material)
     return np.asarray(pressure) * (1 - np.sum(shares * np.exp(-seconds / times)))
 
 
-def _branches(material: Material) -> tuple[np.ndarray, np.ndarray]:
+def _creep_branches(material: Material) -> tuple[np.ndarray, np.ndarray]:
     """Return the shares (k, 1) and time constants (k, 1), seconds, of a material's k branches of creep."""
     pairs = np.array(material.creep, float).reshape(-1, 2)
     return pairs[:, :1], pairs[:, 1:]

@@ -130,7 +130,7 @@ class Samples(NamedTuple):
         ]
 
     @property
-    def chord(self) -> float:
+    def max_chord_ratio(self) -> float:
         """Maximum ratio of the distance of a point from the place pressed to the distance of the point from the axis of
         the press."""
         return 1.0 if self.curved is None else _MAX_CHORD_RATIO
