@@ -26,14 +26,17 @@ from jeit.design import Skin
 from jeit.inverse import Gaussian, Laplace, one_step
 from jeit.inverse.streaming.imager import Imager
 from jeit.mesh import centroids
-from jeit.touch.networks import DESIGNS, PRESETS, ImageNetwork, learn_images, read_network
+from jeit.touch.networks import DESIGNS, PRESETS, ImageNetwork, NetworkPreset, learn_images, read_network
 from jeit.touch.networks.linear_channels import deepest_positions, depth_centroids, detection_noise, error_statistics
 from jeit.touch.simulate import depth_maps
 from jeit.touch.simulate.contact.indent_sets import image_places
+from jeit.touch.training import TrainingPlan
 
 SHAPE = (48, 48)
 # Factors by which the λ chosen by the noise figure is multiplied.
 WEIGHTS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
+# Training of a smoke run, whose figures are not judged.
+_SMALL = NetworkPreset(64, 20, TrainingPlan(rate=2e-3, batch=32, epochs=2, patience=2, decay=0.8))
 ASKED_MEAN, ASKED_RATIO, ASKED_FRAME, ASKED_EACH = 4.2e-3, 0.8, 16.7e-3, 0.2e-3
 Maps = Callable[[np.ndarray], np.ndarray]
 
@@ -129,7 +132,7 @@ def _networks(options: Options, nominal_skin: Skin, quick: bool) -> dict[str, Im
             found[design] = read_network(own, skin=nominal_skin)
             continue
         with tempfile.TemporaryDirectory() as folder:
-            preset = PRESETS["quick" if quick else "full"]
+            preset = _SMALL if quick else PRESETS["full"]
             found[design] = learn_images(nominal_skin, Path(folder), preset=preset, design=design, progress=say).network
     return found
 
