@@ -286,7 +286,7 @@ class PressedSkin(Module):
         progress: Callable[[str], None] | None = None,
     ) -> TouchedCells:
         """Compute which cells change their conductivity in each of T frames, also due to earlier loads, and their
-        relative changes. Arguments and errors: see `record`."""
+        relative changes. The arguments are those of `record`, which raises the same errors."""
         seconds = _check_times(seconds)
         motions = motions_of(motions, len(seconds))
         presses_of_frames = [[motion.at(frame) for motion in motions] for frame in range(len(seconds))]
