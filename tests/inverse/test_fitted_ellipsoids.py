@@ -18,13 +18,6 @@ def coarse():
     return model(2500)
 
 
-@pytest.fixture(scope="module")
-def few():
-    """A model with fewer nodes, and its voltages of the bath."""
-    one = model(1200)
-    return one, np.asarray(one.voltages(BATH))
-
-
 @pytest.fixture
 def one_mesh(monkeypatch):
     """Use one finer mesh where the result does not depend on their number."""
@@ -106,9 +99,8 @@ def test_two_balls_are_of_one_material_unless_the_data_contradict(coarse, bath, 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kinds", ["ellipsoids", "columns"])
-def test_a_given_kind_is_kept(few, one_mesh, column, kinds):
+def test_a_given_kind_is_kept(coarse, bath, one_mesh, column, kinds):
     """Voltages of a column, from two starts of which only one is at a body."""
-    coarse, bath = few
     frame, noise = bath + column, 0.03 * np.sqrt(np.mean(column**2))
     start, prior = [(1, BALL + 0.005, 0.03), (-1, (-0.03, 0.04, 0.03), 0.02)], EllipsoidPrior(kinds=kinds)
     found = reconstruct_shapes(coarse, frame, BATH, start=start, noise=noise, prior=prior)
