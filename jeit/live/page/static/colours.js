@@ -1,5 +1,5 @@
 // Colour maps that are straight lines in OKLab, a colour space in which equal distances look equally different, so that
-// equal differences of values look equal on the whole scale. Colour-blind people can tell blue from orange, and light
+// equal differences of values look equal on the whole scale. Colour-blind people distinguish blue from orange, and light
 // from dark. https://bottosson.github.io/posts/oklab/
 
 const STEPS = 256;
