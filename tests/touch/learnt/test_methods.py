@@ -13,6 +13,7 @@ from jeit.touch.learnt.methods import (
     log_odds,
     probabilities,
 )
+from jeit.touch.learnt.neural_networks import _draw_batches
 
 RNG = np.random.default_rng(0)
 FEATURES = RNG.normal(size=(220, 6)) * np.linspace(2, 0.5, 6)
@@ -131,3 +132,11 @@ def test_the_most_likely_sharpness_is_found():
     drawn = (probabilities(odds, 1.0).cumsum(axis=1) > RNG.random((4000, 1))).argmax(axis=1)
     assert 0.8 < fit_sharpness(odds, drawn) < 1.25
     assert fit_sharpness(odds, right) < 0.1
+
+
+@pytest.mark.parametrize("num_rows", [7, 220])
+def test_an_epoch_of_a_network_draws_every_row_once(num_rows):
+    rows = _draw_batches(num_rows, 3).ravel()
+    epochs = rows[: 3 * num_rows].reshape(3, num_rows)
+    np.testing.assert_array_equal(np.sort(epochs, axis=1), np.tile(np.arange(num_rows), (3, 1)))
+    assert not np.array_equal(epochs[0], epochs[1])
