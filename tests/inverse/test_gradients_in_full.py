@@ -132,9 +132,10 @@ def test_uncertainties():
     assert_gradient(deviation, THETA | {"hyperparameter": 10.0})
 
 
-@pytest.mark.parametrize("prior", [Gaussian(0.03), Laplace()], ids=lambda p: type(p).__name__)
+@pytest.mark.parametrize("prior", [Gaussian(0.02), Laplace()], ids=lambda p: type(p).__name__)
 def test_nonlinear_images_of_smooth_priors(prior):
-    settings = {"hyperparameter": 3.0} | ({"length": 0.03} if isinstance(prior, Gaussian) else {})
+    """At some lengths the basis of the Gaussian gains a shape and the image jumps; the tested one is far from these."""
+    settings = {"hyperparameter": 3.0} | ({"length": 0.02} if isinstance(prior, Gaussian) else {})
 
     def image(theta):
         chosen = Gaussian(theta["length"]) if isinstance(prior, Gaussian) else prior
