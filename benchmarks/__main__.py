@@ -72,9 +72,9 @@ def list_cases() -> None:
         print(f"{name:20}{case.description} ({case.minutes:g} min)")
 
 
-def measure(name: str, options: argparse.Namespace) -> tuple[Result, list[str]]:
-    """Run one case; return its result, and the heading that names the machine. Raises `CaseFailedError` if the case
-    ends without a result."""
+def measure(name: str, options: argparse.Namespace, threads: int) -> tuple[Result, list[str]]:
+    """Run one case with `threads` threads of linear algebra; return its result, and the heading that names the machine.
+    Raises `CaseFailedError` if the case ends without a result."""
     case = find(name)
     pictures = machine.ROOT / "docs" / "images" if options.write and case.pictures else None
     case_options = Options(
@@ -91,14 +91,15 @@ def measure(name: str, options: argparse.Namespace) -> tuple[Result, list[str]]:
         case_options.output.mkdir(parents=True, exist_ok=True)
     say(f"== {name}: {case.description}")
     heading = machine.heading()
-    return run_apart(name, case_options), heading
+    return run_apart(name, case_options, threads), heading
 
 
 def measure_all(names: Iterable[str], options: argparse.Namespace) -> Iterator[tuple[str, Callable]]:
     """Yield the name of each case when it is done, with a function that returns the result of `measure`.
 
     Cases that measure times run first, one after the other. The other cases then run in parallel, as many as there are
-    cores. In a quick run, times are not judged, so all cases run in parallel.
+    cores, with one thread each: more would wait for each other. In a quick run, times are not judged, so all cases run
+    in parallel.
     """
     studies = []
     for name in names:
@@ -107,11 +108,11 @@ def measure_all(names: Iterable[str], options: argparse.Namespace) -> Iterator[t
         except CaseFailedError:
             timed = True
         if timed:
-            yield name, partial(measure, name, options)
+            yield name, partial(measure, name, options, machine.CORES)
         else:
             studies.append(name)
     with ThreadPoolExecutor(machine.CORES) as pool:
-        futures = {pool.submit(measure, name, options): name for name in studies}
+        futures = {pool.submit(measure, name, options, 1): name for name in studies}
         for future in as_completed(futures):
             yield futures[future], future.result
 

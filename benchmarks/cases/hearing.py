@@ -57,7 +57,7 @@ def frames(number: int):
 def run(options: Options) -> Result:
     """Run every task, then the recording, and check the required figures."""
     number, rounds = (8, 2) if options.quick else (32, options.rounds or 15)
-    duel = Duel(number)
+    duel = Duel(number, 512 if options.quick else 4096)
     rows, spent, theirs = [], {}, {}
     for name, (mine, other, count) in duel.tasks().items():
         found = timed(mine, rounds)
@@ -92,8 +92,8 @@ def run(options: Options) -> Result:
 class Duel:
     """Frames, jeit's localisers with and without maps, and SciPy's localiser."""
 
-    def __init__(self, number: int):
-        self.array, self.power = frames(max(number, 4096))
+    def __init__(self, number: int, without_map: int):
+        self.array, self.power = frames(without_map)
         self.few, self.many = self.power[:number], self.power[: 8 * number]
         decay, microphones = self.array.decay, np.asarray(self.array.microphones)
         self.plain = PlainLocaliser(microphones, np.asarray(decay.a), np.asarray(decay.b), 0.1, 200)

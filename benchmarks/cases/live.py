@@ -37,7 +37,7 @@ from jeit.live.views.conductivity import ConductivityView
 
 RATE = 60.0
 # Seconds of each stream and seconds between faults, in a full run (False) and in a quick run (True).
-LENGTHS = {False: (600.0, 7.0), True: (10.0, 1.2)}
+LENGTHS = {False: (600.0, 7.0), True: (5.0, 1.0)}
 # Fraction by which memory may grow after a quarter of the stream (the first minute fills the store of pictures); limits
 # of the median and the 99th percentile of latency in seconds; least number of pictures per second.
 GROWTH, MEDIAN, HIGH, PICTURES = 0.05, 0.05, 0.1, 20.0

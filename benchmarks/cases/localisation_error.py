@@ -57,21 +57,20 @@ def averaged_intensities(skin, places, bursts: int):
     return power, found.floor, float(np.median(found.freedom)) * bursts, usable
 
 
-def errors(calibration, skin, places, bursts: int, pad: int):
+def errors(calibration, skin, places, bursts: int):
     """Errors (positions,) in metres of the positions by each method, the fraction of the likelihood's 95 % ellipses
     that contain the true position, and the root mean square error by the Cramér-Rao bound.
     """
 
     power, floor, freedom, usable = averaged_intensities(skin, places, bursts)
-    order = np.arange(pad) % len(places)  # the same shape for all tests, so that code is compiled once
-    measured = Intensities(np.arange(pad), power[order], floor=floor, freedom=freedom, usable=usable[order])
+    measured = Intensities(np.arange(len(places)), power, floor=floor, freedom=freedom, usable=usable)
     microphone_array, use, _ = microphones_in_use(measured, calibration)
     found = {name: Localiser.create(microphone_array, method=name)(measured.power, use) for name in METHODS}
-    off = {name: np.asarray(one.position)[: len(places)] - places for name, one in found.items()}
+    off = {name: np.asarray(one.position) - places for name, one in found.items()}
     best = found["likelihood"]
-    covariance = np.asarray(best.covariance)[: len(places)]
+    covariance = np.asarray(best.covariance)
     square = np.einsum("fi,fij,fj->f", off["likelihood"], np.linalg.inv(covariance), off["likelihood"])
-    bound = np.asarray(cramer_rao(microphone_array, places, np.asarray(best.strength)[: len(places)]))
+    bound = np.asarray(cramer_rao(microphone_array, places, np.asarray(best.strength)))
     least = np.sqrt(np.mean(np.trace(bound, axis1=1, axis2=2)))
     return (
         {name: np.linalg.norm(one, axis=1) for name, one in off.items()},
@@ -85,31 +84,32 @@ def spread(values) -> str:
     return f"{1e3 * np.mean(values):.1f} ± {1e3 * np.std(values):.1f}"
 
 
-def paper_table(skin, calibration, pad: int, sides=(0.15, 0.18), bursts: int = 10) -> tuple[Table, dict]:
+def paper_table(skin, calibration, number: int, sides, bursts: int) -> tuple[Table, dict]:
     """A table of the paper's experiment, and of the same experiment nearer to the edge, and the errors of the first.
 
-    `sides`: sides of the touched squares in metres; `bursts`: number of taps at each place.
+    `number`: number of places along a side; `sides`: sides of the touched squares in metres; `bursts`: number of taps
+    at each place.
     """
-    header = ["13 × 13 places, mm", "the paper's loss", "likelihood", "in the 95 % ellipse"]
+    header = [f"{number} × {number} places, mm", "the paper's loss", "likelihood", "in the 95 % ellipse"]
     rows, first = [["paper, measured", "6.6 ± 3.8", "", ""]], None
     for name, side in zip(("simulated", "to 10 mm from the edge"), sides, strict=False):
-        off, cover, _ = errors(calibration, skin, grid(side, side, 13, 13), bursts, pad)
+        off, cover, _ = errors(calibration, skin, grid(side, side, number, number), bursts)
         rows.append([name, *(spread(off[method]) for method in METHODS), f"{100 * cover:.0f} %"])
         say(" | ".join(rows[-1]))
         first = first or off
     return Table(header, rows), first or {}
 
 
-def ratio_table(skin, calibration, ratios, pad: int) -> tuple[Table, dict[str, list[float]], list[float]]:
+def ratio_table(skin, calibration, ratios, number: int) -> tuple[Table, dict[str, list[float]], list[float]]:
     """A table of single taps at several signal-to-noise ratios, root mean square errors by method, and Cramér-Rao
     bounds, in metres."""
-    places = grid(0.15, 0.15, 13, 13)
+    places = grid(0.15, 0.15, number, number)
     loudest = 10 * np.log10((expected_power(skin, places) / noise_power(skin)).max(axis=1).mean())
     curve: dict[str, list[float]] = {"paper's loss": [], "likelihood": []}
     rows, bounds = [], []
     for ratio in ratios:
         noisy = SoundingSkin(jax.random.key(0), microphone_model=MicrophoneModel(snr_db=ratio - loudest))
-        off, cover, least = errors(calibration, noisy, places, 1, pad)
+        off, cover, least = errors(calibration, noisy, places, 1)
         roots = [float(np.sqrt(np.mean(off[name] ** 2))) for name in METHODS]
         bounds.append(least)
         for name, root in zip(curve, roots, strict=True):
@@ -122,23 +122,23 @@ def ratio_table(skin, calibration, ratios, pad: int) -> tuple[Table, dict[str, l
     return Table(header, rows), curve, bounds
 
 
-def microphone_table(sides, pad: int) -> Table:
+def microphone_table(sides, number: int) -> Table:
     """A table of the errors with ten bursts for several numbers of microphones; `sides` are the numbers of microphones
     along a side."""
     rows = []
     for side in sides:
         few = SoundingSkin(jax.random.key(0), microphone_grid(side))
-        off, cover, _ = errors(calibrated(few), few, grid(0.15, 0.15, 13, 13), 10, pad)
+        off, cover, _ = errors(calibrated(few), few, grid(0.15, 0.15, number, number), 10)
         rows.append([str(side**2), *(spread(off[name]) for name in METHODS), f"{100 * cover:.0f} %"])
         say(" | ".join(rows[-1]))
     return Table(["microphones", "paper's loss, mm", "likelihood, mm", "in the 95 % ellipse"], rows)
 
 
-def change_table(changes) -> Table:
+def change_table(changes, number: int) -> Table:
     """A table of the errors with ten bursts at each position, located with the defaults, after changes of microphone
     positions and gains."""
     header = ["microphones off, mm", "gains changed, %", "median, mm", "greatest, mm", "in the 95 % ellipse"]
-    given, places, rows = microphone_grid(5), grid(0.15, 0.15, 13, 13), []
+    given, places, rows = microphone_grid(5), grid(0.15, 0.15, number, number), []
     for place, gain in changes:
         rng = np.random.default_rng(0)
         skin = SoundingSkin(jax.random.key(0), given + place * rng.normal(size=given.shape))
@@ -172,13 +172,14 @@ def draw(ratios, curve: dict[str, list[float]], bounds: list[float], path: Path)
 
 def run(options: Options) -> Result:
     """Compute the tables and, if an output folder is given, draw the curve."""
-    skin, ratios, pad = SoundingSkin(jax.random.key(0)), (20,) if options.quick else RATIOS, 256
+    quick, skin = options.quick, SoundingSkin(jax.random.key(0))
+    number, ratios, sides, bursts = (4, (20,), (0.15,), 1) if quick else (13, RATIOS, (0.15, 0.18), 10)
     calibration = calibrated(skin)
-    paper, off = paper_table(skin, calibration, pad, *(((0.15,), 1) if options.quick else ()))
-    against, curve, bounds = ratio_table(skin, calibration, ratios, pad)
-    tables = [paper, against, change_table(CHANGES[2:3] if options.quick else CHANGES)]
-    if not options.quick:
-        tables.insert(2, microphone_table((2, 3, 4, 5), pad))
+    paper, off = paper_table(skin, calibration, number, sides, bursts)
+    against, curve, bounds = ratio_table(skin, calibration, ratios, number)
+    tables = [paper, against, change_table(CHANGES[2:3] if quick else CHANGES, number)]
+    if not quick:
+        tables.insert(2, microphone_table((2, 3, 4, 5), number))
     if options.output is not None:
         draw(ratios, curve, bounds, options.output / "hearing-error.png")
     asked = _asked(off)

@@ -43,7 +43,7 @@ def run(options: Options) -> Result:
 
 
 def _touches(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Asked]]:
-    number, seconds = 12 if quick else 1000, np.arange(0, SEQUENCE, 1 / RATE)
+    number, seconds = 4 if quick else 1000, np.arange(0, SEQUENCE, 1 / RATE)
     alarms = 0
     for one in range(number):
         frames = skin.read(skin.skin, 1000 + one, seconds, skin.touches)
@@ -57,7 +57,7 @@ def _touches(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Aske
 def _cuts(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Asked]]:
     rows, asked = [], []
     seconds = np.arange(0, RECORDING, 1 / RATE)
-    for depth, number, first in ((1.0, 3 if quick else 20, 10_000), (0.5, 1 if quick else 5, 20_000)):
+    for depth, number, first in ((1.0, 1 if quick else 20, 10_000), (0.5, 1 if quick else 5, 20_000)):
         detected, named, after, error, beside = 0, 0, [], [], []
         for one in range(first, first + number):
             cut = skin.cut(one, depth)
@@ -102,7 +102,7 @@ def _cuts(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Asked]]
 def _faults(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Asked]]:
     rows, asked = [], []
     seconds = np.arange(0, RECORDING, 1 / RATE)
-    number = 2 if quick else 10
+    number = 1 if quick else 10
     for kind in ("dead", "torn", "loose"):
         detected, named, after = 0, 0, []
         for one in range(30_000, 30_000 + number):

@@ -24,7 +24,7 @@ from jeit.inverse.nonlinear import GaussNewton, OneStep
 SENSOR, NODES, BASE = "disk, 16 electrodes", 1193, 400
 # Number of frames, frames from one burst of faults to the next, and maximum frames of a burst, for linear images and
 # for Gauss-Newton; in a full run (False) and in a quick run (True).
-LENGTHS = {False: ((1_000_000, 2000, 400), (20_000, 400, 80)), True: ((20_000, 400, 80), (500, 50, 10))}
+LENGTHS = {False: ((1_000_000, 2000, 400), (20_000, 400, 80)), True: ((3000, 400, 80), (100, 50, 10))}
 # Megabytes by which memory may grow from a tenth of the stream to its end, due to fluctuations of the allocator.
 GROWTH = 8.0
 

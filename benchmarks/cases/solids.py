@@ -71,7 +71,7 @@ def run(options: Options) -> Result:
     only some of the images are computed.
     """
     rows, checks, wrong = [], [], []
-    for nodes in options.nodes or (1500 if options.quick else 20_000,):
+    for nodes in options.nodes or (800 if options.quick else 20_000,):
         for name in JOBS if nodes <= LARGE else AT_LARGE:
             script, most = JOBS[name]
             text = _SETUP.replace("{nodes}", str(nodes)) + script + _DONE

@@ -60,11 +60,12 @@ def arrays_table(found: list[dict[str, Located]]) -> Table:
     return Table(header, rows, f"{len(found)} arrays", "Median: of the medians of 40 touches of each array.")
 
 
-def steep_table(lengths) -> Table:
-    """A table of median errors with 25 microphones under 200 × 200 mm, for two arrays of each attenuation length."""
+def steep_table(lengths, seeds) -> Table:
+    """A table of median errors with 25 microphones under 200 × 200 mm, for an array of each attenuation
+    length and seed."""
     rows = []
     for length in lengths:
-        found = [locate_by_each(steep_array(length, seed)) for seed in (0, 1)]
+        found = [locate_by_each(steep_array(length, seed)) for seed in seeds]
         chosen = ", ".join(dict.fromkeys(one[AUTO].decay for one in found))
         figures = [f"{1e3 * np.mean(medians(found, name)):.1f}" for name in NAMES]
         rows.append([f"{1e3 * length:.0f} mm", *figures, chosen])
@@ -74,13 +75,13 @@ def steep_table(lengths) -> Table:
 
 def run(options: Options) -> Result:
     """Compute both tables, and check the required figures."""
-    number, lengths = (4, LENGTHS[1:2]) if options.quick else (ARRAYS, LENGTHS)
+    number, lengths, seeds = (1, LENGTHS[1:2], (0,)) if options.quick else (ARRAYS, LENGTHS, (0, 1))
     found = []
     for k in range(number):
         found.append(locate_by_each(draw_array(REPORTED, SEED + k)))
         if (k + 1) % 20 == 0:
             say(f"{k + 1} arrays, median {1e3 * np.median(medians(found, AUTO)):.1f} mm")
-    return Result([arrays_table(found), steep_table(lengths)], asked(found))
+    return Result([arrays_table(found), steep_table(lengths, seeds)], asked(found))
 
 
 def asked(found: list[dict[str, Located]]) -> list[Asked]:

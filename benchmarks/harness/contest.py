@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.harness.machine import ROOT, same_for_all
+from benchmarks.harness.machine import ROOT
 
 # After its last task, a pool of BLAS threads occupies the processor for a while; this pause in seconds lets it sleep
 # before the next turn.
@@ -63,7 +63,6 @@ class Contestant:
         self._process = subprocess.Popen(
             [interpreter, "-m", "benchmarks.harness.worker", name, str(problem)],
             cwd=ROOT,
-            env=same_for_all(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

@@ -23,12 +23,12 @@ def use_cores(count: int = CORES) -> None:
         os.sched_setaffinity(0, allowed[:count])
 
 
-def same_for_all() -> dict[str, str]:
-    """The environment variables of every measured process: the same number of threads, and no cache of compiled
-    code."""
+def same_for_all(threads: int = CORES) -> dict[str, str]:
+    """The environment variables of every measured process: the same number of threads of linear algebra, and no cache
+    of compiled code."""
     environment = dict(os.environ)
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        environment[variable] = str(CORES)
+        environment[variable] = str(threads)
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
     return environment
 

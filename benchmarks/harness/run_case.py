@@ -22,14 +22,14 @@ class CaseFailedError(Exception):
     """Error raised if a case ended without a result."""
 
 
-def run_apart(name: str, options: Options) -> Result:
-    """Run a case in a separate process and return the result. Raises `CaseFailedError` if the process ends without a
-    result."""
+def run_apart(name: str, options: Options, threads: int) -> Result:
+    """Run a case in a separate process, with `threads` threads of linear algebra, and return the result. Raises
+    `CaseFailedError` if the process ends without a result."""
     with tempfile.TemporaryDirectory() as folder:
         option_file, answer = Path(folder, "options"), Path(folder, "result")
         option_file.write_bytes(pickle.dumps(options))
         command = [sys.executable, "-m", "benchmarks.harness.run_case", name, str(option_file), str(answer)]
-        ended = subprocess.run(command, cwd=ROOT, env=same_for_all(), check=False)
+        ended = subprocess.run(command, cwd=ROOT, env=same_for_all(threads), check=False)
         if ended.returncode != 0 or not answer.is_file():
             raise CaseFailedError(f"{name} ended with exit code {ended.returncode}; see the messages above.")
         return Result.from_dict(json.loads(answer.read_text(encoding="utf-8")))
