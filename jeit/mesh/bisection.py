@@ -56,31 +56,47 @@ def bisect_with_parents(mesh: Mesh, size: Callable[..., Float[np.ndarray, " m"]]
     """Refine a mesh as `bisect` does. Also returns, for each cell of the new mesh, the index of the cell of the
     original mesh that contains it. Raises `ValueError` as `bisect` does."""
     split_mesh = _SplitMesh.from_mesh(mesh)
-    parent = np.arange(len(split_mesh.cells))
-    exceeds_size = _exceeds_size(split_mesh, slice(None), size)
+    parent, everywhere = np.arange(len(split_mesh.cells)), slice(None)
+    longest_edge, longest_length = _longest_edges(split_mesh, everywhere)
+    exceeds_size = _exceeds_size(split_mesh, everywhere, longest_length, size)
     while exceeds_size.any():
-        points, cells = split_mesh.points, split_mesh.cells
-        is_near = _is_node_of(cells[exceeds_size], len(points))
-        while True:
-            near_cells = np.flatnonzero(is_near[cells].any(axis=1))
-            edges, edge_indices, rank = _edges(points, cells[near_cells])
-            longest = _longest_edge_of_cell(edge_indices, rank)
-            is_marked = np.zeros(len(edges), bool)
-            is_marked[longest[exceeds_size[near_cells]]] = True
-            # If a marked edge is not the longest edge of a cell, mark that cell's longest edge, which is split first.
-            while not is_marked[added_edges := longest[is_marked[edge_indices].any(axis=1)]].all():
-                is_marked[added_edges] = True
-            if is_near[edges[is_marked]].all():
-                break
-            is_near |= _is_node_of(edges[is_marked], len(points))
-        split_edges = edges[is_marked & _is_longest_around(edge_indices, rank)]
+        points = split_mesh.points
+        split_edges = _edges_to_split(
+            split_mesh.cells, longest_edge, np.unique(longest_edge[exceeds_size]), len(points)
+        )
         if len(points) + len(split_edges) > MOST_POINTS:
             raise ValueError(f"size asks for more than {MOST_POINTS:,} nodes; give longer edges. Are they in metres?")
         split_mesh, origin = split_mesh.split(split_edges, points[split_edges].mean(axis=1))
-        parent = parent[origin]
-        is_new, exceeds_size = np.bincount(origin)[origin] > 1, exceeds_size[origin]
-        exceeds_size[is_new] = _exceeds_size(split_mesh, is_new, size)
+        parent, longest_edge, exceeds_size = parent[origin], longest_edge[origin], exceeds_size[origin]
+        is_new = np.bincount(origin)[origin] > 1
+        longest_edge[is_new], longest_length = _longest_edges(split_mesh, is_new)
+        exceeds_size[is_new] = _exceeds_size(split_mesh, is_new, longest_length, size)
     return split_mesh.mesh(mesh.tags), parent
+
+
+def _edges_to_split(cells, longest_edge, marked, num_points: int) -> Int[np.ndarray, "e 2"]:
+    """The edges (e, 2) that are split next so that the `marked` edges can be split: the longest edges of all the cells
+    around them. If a marked edge is not the longest edge of a cell, that cell's longest edge is marked, too.
+
+    `longest_edge` (m,) and `marked` are numbers of edges, as returned by `_edge_numbers`.
+    """
+    to_split, new = [], marked
+    while len(new):
+        around, edge = _cells_around(cells, new, num_points)
+        is_longest = longest_edge[around] == edge
+        to_split.append(np.setdiff1d(new, edge[~is_longest], assume_unique=True))
+        new = np.setdiff1d(longest_edge[around[~is_longest]], marked)
+        marked = np.union1d(marked, new)
+    return _edges_of_numbers(np.sort(np.concatenate(to_split)))
+
+
+def _cells_around(cells, edges, num_points: int) -> tuple[Int[np.ndarray, " i"], Int[np.ndarray, " i"]]:
+    """All pairs of a cell and an edge of the cell among `edges`, which are sorted numbers: indices of the cells, and
+    numbers of the edges."""
+    candidates = _with_two_nodes(cells, _edges_of_numbers(edges), num_points)
+    numbers = _edge_numbers(_edge_nodes(cells[candidates]))
+    row, column = np.nonzero(edges[np.minimum(np.searchsorted(edges, numbers), len(edges) - 1)] == numbers)
+    return candidates[row], numbers[row, column]
 
 
 def cut(mesh: Mesh, level: Callable[[Float[np.ndarray, "n s"]], Float[np.ndarray, " n"]]) -> Mesh:
@@ -157,9 +173,18 @@ class _SplitMesh:
         return _SplitMesh(np.concatenate([self.points, middles]), cells, facets, self.side[side]), origin
 
 
-def _exceeds_size(split_mesh: _SplitMesh, selected_cells, size) -> Bool[np.ndarray, " m"]:
-    """Whether the longest edge of each selected cell exceeds the length that `size` allows. Raises `ValueError` if
-    `size` does not return one positive number per cell."""
+def _longest_edges(split_mesh: _SplitMesh, selected_cells) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Number and length in metres of the longest edge of each selected cell. Of edges of the same length, the one with
+    the largest number counts as the longest, in every cell."""
+    ends = _edge_nodes(split_mesh.cells[selected_cells])
+    lengths, numbers = _edge_lengths(split_mesh.points[ends]), _edge_numbers(ends)
+    longest_length = lengths.max(axis=1)
+    return np.where(lengths == longest_length[:, None], numbers, -1).max(axis=1), longest_length
+
+
+def _exceeds_size(split_mesh: _SplitMesh, selected_cells, longest_length, size) -> Bool[np.ndarray, " m"]:
+    """Whether the longest edge of each selected cell, of `longest_length` in metres, exceeds the length that `size`
+    allows. Raises `ValueError` if `size` does not return one positive number per cell."""
     cells = split_mesh.cells[selected_cells]
     max_lengths = np.asarray(size(split_mesh.points[cells]))
     if max_lengths.shape != (len(cells),) or not (max_lengths > 0).all():
@@ -167,7 +192,7 @@ def _exceeds_size(split_mesh: _SplitMesh, selected_cells, size) -> Bool[np.ndarr
             f"size must give one number per cell, metres, above zero (numpy.inf leaves it); of {len(cells)} cells it "
             f"gave {describe(max_lengths)}."
         )
-    return _longest_edge_lengths(split_mesh.points, cells) > max_lengths
+    return longest_length > max_lengths
 
 
 def _move_nodes_onto(split_mesh: _SplitMesh, level) -> tuple[_SplitMesh, Float[np.ndarray, " n"]]:
@@ -229,17 +254,23 @@ def _edges(points, simplices) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "
 def _edge_nodes(simplices) -> Int[np.ndarray, "m k 2"]:
     """The two nodes of each edge of each simplex, the lower-numbered node first."""
     pairs = np.array(list(itertools.combinations(range(simplices.shape[1]), 2)))
-    return np.sort(simplices[:, pairs].astype(np.int64), axis=2)
+    first, second = (simplices[:, nodes].astype(np.int64) for nodes in pairs.T)
+    return np.stack([np.minimum(first, second), np.maximum(first, second)], axis=2)
+
+
+def _edge_numbers(edges: Int[np.ndarray, "... 2"]) -> Int[np.ndarray, "..."]:
+    """Number (…) of each edge (…, 2), which is ordered as the edge's nodes are."""
+    return edges[..., 0] << 32 | edges[..., 1]
+
+
+def _edges_of_numbers(numbers: Int[np.ndarray, " e"]) -> Int[np.ndarray, "e 2"]:
+    """The two nodes of each edge of `numbers`."""
+    return np.stack([numbers >> 32, numbers & 0xFFFFFFFF], axis=1)
 
 
 def _edge_lengths(ends: Float[np.ndarray, "... 2 s"]) -> Float[np.ndarray, "..."]:
     """Lengths (…) of edges with the end points `ends` (…, 2, s)."""
     return np.linalg.norm(ends[..., 1, :] - ends[..., 0, :], axis=-1)
-
-
-def _longest_edge_lengths(points, cells) -> Float[np.ndarray, " m"]:
-    """Length of the longest edge of each cell, metres."""
-    return _edge_lengths(points[_edge_nodes(cells)]).max(axis=1)
 
 
 def _longest_edge_of_cell(edge_indices, rank) -> Int[np.ndarray, " m"]:
@@ -262,6 +293,12 @@ def _is_node_of(simplices, num_points: int) -> Bool[np.ndarray, " n"]:
     return is_node
 
 
+def _with_two_nodes(simplices, edges, num_points: int) -> Int[np.ndarray, " c"]:
+    """Indices of the simplices with at least two nodes that belong to any of the edges."""
+    is_node = _is_node_of(edges, num_points).astype(np.int8)
+    return np.flatnonzero(sum(is_node[nodes] for nodes in simplices.T) > 1)  # quicker than sum(axis=1)
+
+
 def _volumes(points, cells) -> Float[np.ndarray, " m"]:
     """Volumes of cells up to a constant factor, negative for inverted cells; areas of triangles in space are never
     negative."""
@@ -274,7 +311,7 @@ def _volumes(points, cells) -> Float[np.ndarray, " m"]:
 def _split_simplices(simplices, edges, new_nodes, num_points: int) -> tuple[np.ndarray, np.ndarray]:
     """Split each simplex that contains one of the `edges` into two, at the edge's new node in `new_nodes`. Also
     returns, for each resulting simplex, the index of the original simplex that contains it."""
-    candidates = np.flatnonzero(_is_node_of(edges, num_points)[simplices].sum(axis=1) > 1)
+    candidates = _with_two_nodes(simplices, edges, num_points)
     split_keys = edges @ [num_points, 1]
     order = np.argsort(split_keys)
     ends = _edge_nodes(simplices[candidates])
