@@ -11,7 +11,6 @@ further solve:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -68,11 +67,7 @@ class SolvedFields(NamedTuple):
         fields: Any = self.fields
         if cells is None:
             return np.stack([self._energy_everywhere(cell_change) for cell_change in slope.T])
-        changed_cells = np.asarray(self.mesh.cells)[cells]
-        nodes, corners = np.unique(changed_cells, return_inverse=True)
-        points = np.asarray(self.mesh.points)[nodes]
-        changed_mesh = replace(self.mesh, points=points, cells=corners.reshape(changed_cells.shape), tags={})
-        return _field_energies(field_gradients(changed_mesh, fields[nodes]), slope)
+        return _field_energies(field_gradients(self.mesh, fields, cells), slope)
 
     def _energy_everywhere(self, change: Float[np.ndarray, " m"]) -> Float[np.ndarray, "L L"]:
         cells, size = np.asarray(self.mesh.cells), self.mesh.num_points

@@ -129,16 +129,16 @@ def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Arra
     )
 
 
-def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> Inexact[Array, "d m p"]:
+def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"], cells: Any = slice(None)) -> Inexact[Array, "d m p"]:
     """Gradients (d, m, p) of p nodal fields in each of m cells along d axes, multiplied by the square root of the
-    cell's measure.
+    cell's measure. `cells`: indices of the cells; by default all cells.
 
     With this weight the product of the gradients of two fields u, w is the integral ∫_e ∇u·∇w over the cell e.
     """
     xp = namespace(mesh, fields)
-    gradient, measure = _cached_geometry(mesh)
+    gradient, measure = (values[cells] for values in _cached_geometry(mesh))
     weighted = gradient * xp.sqrt(measure)[:, None, None]
-    corners = [gather(fields, mesh.cells[:, k]) for k in range(mesh.dimension + 1)]
+    corners = [gather(fields, nodes) for nodes in mesh.cells[cells].T]
     return xp.stack(
         [
             functools.reduce(operator.add, [weighted[:, k, axis, None] * corner for k, corner in enumerate(corners)])
