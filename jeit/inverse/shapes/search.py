@@ -29,6 +29,7 @@ from jeit.inverse.shapes.problem import Fit, ShapeProblem, SmoothField
 from jeit.inverse.shapes.quantities import Accuracy, include_deviation, with_quantities
 from jeit.inverse.shapes.star import Star, StarPrior, Stars
 from jeit.mesh import check_flat
+from jeit_solvers import one_thread_of_blas
 from jeit_solvers.engines import as_array
 from jeit_solvers.module import Module
 
@@ -116,6 +117,7 @@ class ShapeReconstruction(Module):
         return None
 
 
+@one_thread_of_blas()  # several threads would only wait for each other in its small products
 def reconstruct_shapes(
     model: ForwardModel,
     voltages: Float[Array, " M"],
