@@ -41,10 +41,11 @@ def test_refuses_arguments_that_cannot_be_satisfied(arguments, capsys):
 
 
 def test_a_case_that_fails_does_not_lose_the_others(monkeypatch, capsys):
-    ran = []
+    ran, threads_of = [], {}
 
-    def apart(name, options):
+    def apart(name, options, threads):
         ran.append(name)
+        threads_of[name] = threads
         if name == "solver":
             raise CaseFailedError("solver ended with exit code 1")
         return Result([Table(["what"], [[name]])], [Asked("as quick as that", "slower", MISSED)])
@@ -55,6 +56,8 @@ def test_a_case_that_fails_does_not_lose_the_others(monkeypatch, capsys):
     # Cases that measure times come first and alone.
     assert ran[:2] == ["solver", "first_call"]
     assert set(ran[2:]) == {"ktc2023", "design_figures"}
+    # Cases side by side have one thread of linear algebra each, or they would wait for each other.
+    assert threads_of == {"solver": 2, "first_call": 2, "ktc2023": 1, "design_figures": 1}
     printed = capsys.readouterr()
     assert "| first_call |" in printed.out
     assert "solver ended" in printed.err
@@ -70,7 +73,7 @@ def test_a_quick_case_is_measured_and_not_judged():
 
 def test_a_case_in_a_process_of_its_own_may_fail():
     with pytest.raises(CaseFailedError, match="nonsense ended with exit code 1"):
-        run_apart("nonsense", Options(quick=True))
+        run_apart("nonsense", Options(quick=True), threads=1)
 
 
 def test_nothing_imports_the_tests():
