@@ -79,9 +79,10 @@ def run(options: Options) -> Result:
     tables.append(pairs)
     shapes, share = _shapes(ways, judged_by, noise, places, 5 if quick else 60, nominal_skin, options.output)
     tables.append(shapes)
-    each, batch = _times(networks, frames, 50 if quick else 1000)
+    many = 50 if quick else 1000
+    each, batch = _times(networks, frames, many)
     rows = [[name, f"{1e3 * each[name]:.2f} ms", f"{1e3 * batch[name]:.3f} ms"] for name in networks]
-    tables.append(Table(["network", "one frame", "each of 1,000"], rows, "Time", "The least of several calls."))
+    tables.append(Table(["network", "one frame", f"each of {many:,}"], rows, "Time", "The least of several calls."))
     ours, paper, rival = (mean[one] for one in ("network, unrolled", "network, three-stages", "Tikhonov, Laplace"))
     asked = [
         judged("mean ≤ 4.2 mm", f"{1e3 * ours:.2f} mm", ours <= ASKED_MEAN),
