@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
+from typing import ParamSpec, TypeVar
 
 import jax
 import numpy as np
@@ -24,6 +26,39 @@ from jeit_solvers.engines import as_array
 # positions are used if the ratios of the misfit with estimated to the misfit with described positions are below these
 # limits: with each channel relative to its noise, and with equal weights.
 _MAX_EXACT_MISFIT, _MAX_RELATIVE_RATIO, _MAX_MISFIT_RATIO = 0.01, 0.7, 2.0
+
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
+
+
+def keep_last_result(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Decorator: store the result of the last call of a function, and return it for equal arguments.
+
+    For frames that are imaged one after the other, mesh and calibration are thus computed once per reference. Arguments
+    are compared by value, with copies of arrays of NumPy, which the caller may modify.
+    """
+    last: tuple | None = None
+
+    @functools.wraps(function)
+    def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        nonlocal last
+        leaves, structure = jax.tree.flatten((args, kwargs))
+        kept = last
+        if kept is None or kept[1] != structure or not all(map(_is_same, kept[0], leaves)):
+            copies = [leaf.copy() if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
+            last = kept = copies, structure, function(*args, **kwargs)
+        return kept[2]
+
+    return call
+
+
+def _is_same(first, second) -> bool:
+    """Whether two leaves of arguments are the same object, or arrays or numbers of equal types and values."""
+    if first is second:
+        return True
+    same_type = type(first) is type(second) and getattr(first, "dtype", None) == getattr(second, "dtype", None)
+    return same_type and np.array_equal(first, second)
 
 
 class Clock:
@@ -67,20 +102,26 @@ def calibrated_model(
     """
     clock = Clock(None) if clock is None else clock
     with clock("calibrate"), threads_for(model.mesh):
-        contact_method = contact or default_contact(base)
-        voltages, mask = np.asarray(base.voltages)[0], np.asarray(base.mask)[0]
+        return _calibrate(model, base, contact)
+
+
+@keep_last_result
+def _calibrate(model: ForwardModel, base: Measurement, contact: str | None) -> tuple[Calibration, str]:
+    """Calibrate the forward model, see `calibrated_model`."""
+    contact_method = contact or default_contact(base)
+    voltages, mask = np.asarray(base.voltages)[0], np.asarray(base.mask)[0]
+    calibration = calibrate(model, voltages, mask=mask, contact=contact_method)
+    if contact is None and contact_method == "each" and not calibration.distinguishes_contacts:
+        contact_method = "common"  # the data do not determine one impedance per electrode
         calibration = calibrate(model, voltages, mask=mask, contact=contact_method)
-        if contact is None and contact_method == "each" and not calibration.distinguishes_contacts:
-            contact_method = "common"  # the data do not determine one impedance per electrode
-            calibration = calibrate(model, voltages, mask=mask, contact=contact_method)
-        position = (base.uncertainty or Uncertainty()).position_on(model.mesh)
-        calibration = _with_estimated_positions(calibration, model, voltages, mask, position)
-        calibration = jax.block_until_ready(calibration)
-        if not np.isfinite(calibration.misfit):
-            raise ValueError(
-                f"'{base.name}': calibration on it failed ({calibration.reason}); is this a frame of the empty body, "
-                "and are geometry and protocol right?"
-            )
+    position = (base.uncertainty or Uncertainty()).position_on(model.mesh)
+    calibration = _with_estimated_positions(calibration, model, voltages, mask, position)
+    calibration = jax.block_until_ready(calibration)
+    if not np.isfinite(calibration.misfit):
+        raise ValueError(
+            f"'{base.name}': calibration on it failed ({calibration.reason}); is this a frame of the empty body, "
+            "and are geometry and protocol right?"
+        )
     return calibration, contact_method
 
 
@@ -132,6 +173,7 @@ def relative_misfit(predicted, measured, mask) -> float:
     return float(np.linalg.norm(errors / noise) / np.linalg.norm(measured[mask] / noise))
 
 
+@keep_last_result
 def estimated_positions(model: ForwardModel, voltages, mask, deviation: float) -> Placement | None:
     """Estimate electrode positions from a reference frame; None if the positions cannot be estimated. `deviation`:
     standard deviation of the described positions, metres."""

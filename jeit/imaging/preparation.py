@@ -17,7 +17,7 @@ from jeit.data.transfer import as_driven
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.face_patches import body_mesh
 from jeit.forward import ForwardModel
-from jeit.imaging.calibration import Clock, calibrated_model, estimated_positions, relative_misfit
+from jeit.imaging.calibration import Clock, calibrated_model, estimated_positions, keep_last_result, relative_misfit
 from jeit.imaging.wiring import Wiring, exchanges_message, find_wiring
 from jeit.inverse import relative_noise
 from jeit.inverse.calibration import Calibration
@@ -25,6 +25,7 @@ from jeit.inverse.channels import electrode_misfits
 from jeit.inverse.placement import Uncertainty
 from jeit.inverse.shapes.quantities import Accuracy
 from jeit.mesh import Body, Mesh, OwnMesh, Solid
+from jeit.protocol import Protocol
 from jeit_solvers.engines import as_array
 
 
@@ -269,7 +270,7 @@ def prepare_difference(
         if not as_is and (exchange_message := exchanges_message(frame_data, base)):
             raise ValueError(f"'{frame_data.name}' does not fit its reference: {exchange_message}")
     with clock("mesh"):
-        model = ForwardModel(imaging_mesh(domain, electrodes, num_points), electrodes, base.protocol)
+        model = _described_model(domain, electrodes, base.protocol, num_points)
     with clock("wiring"):
         wiring = find_wiring(model, base)
         # For data that cannot be imaged, a wiring error is reported only if a different wiring explains the data: pure
@@ -293,6 +294,14 @@ def prepare_difference(
         number,
         measurement.num_frames,
     )
+
+
+@keep_last_result
+def _described_model(
+    domain: Body, electrodes: AbstractElectrodes, protocol: Protocol, num_points: int | None
+) -> ForwardModel:
+    """Forward model of the body as it is described."""
+    return ForwardModel(imaging_mesh(domain, electrodes, num_points), electrodes, protocol)
 
 
 def check_wiring(wiring: Wiring, reference: Measurement, as_is: bool) -> None:
