@@ -85,9 +85,10 @@ def with_quantities(
         problem = problem.with_errors(np.asarray(problem.data.weight)[:, None] * rows)
     shown_centroids = [fit.bodies.body(int(k), fit.coefficients).centroid for k in order]
     fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
+    explored = {int(k): explore_contrast(problem, fit, int(k)) for k in np.unique(fit.bodies.first)}  # by material
     return [
         replace(
-            quantify(problem, fit, int(k), float(unmodelled[k]), accuracy),
+            quantify(problem, explored[int(fit.bodies.first[k])], int(k), float(unmodelled[k]), accuracy),
             centroid_radius=centroid_radius(problem, fit, int(k), centroid, accuracy),
         )
         for k, centroid in zip(order, shown_centroids, strict=True)
@@ -149,8 +150,22 @@ def _interval_hull(interval: Interval, values: Sequence[float]) -> Interval:
     return None if low is None else min(low, *values), None if high is None else max(high, *values)
 
 
+class ExploredContrast(NamedTuple):
+    """A fit in which the contrast of one material is fixed. **Fields**: `log_contrast`: logarithm of the fixed
+    contrast; `negative_log_likelihood`: -log likelihood, with all other coefficients integrated out; `fit`: the fit."""
+
+    log_contrast: float
+    negative_log_likelihood: float
+    fit: Fit
+
+    @property
+    def negative_log_evidence(self) -> float:
+        """Negative log posterior density of the logarithm of the contrast, up to a constant."""
+        return self.negative_log_likelihood + _contrast_prior(self.log_contrast)
+
+
 class _FixedContrastFit(NamedTuple):
-    """A fit in which the contrast of one body is fixed. **Fields**: `log_contrast`: logarithm of the fixed contrast;
+    """A body in a fit in which its contrast is fixed. **Fields**: `log_contrast`: logarithm of the fixed contrast;
     `negative_log_likelihood`: -log likelihood, with all other coefficients integrated out; `log_measure`: logarithm of
     the body's area or volume; `deviation`: standard deviation of `log_measure`."""
 
@@ -160,42 +175,46 @@ class _FixedContrastFit(NamedTuple):
     deviation: float
 
 
-def quantify(problem: ShapeProblem, fit: Fit, k: int, unmodelled: float, accuracy: Accuracy) -> Quantities:
-    """Compute the quantities of body k of a `fit`. The body's contrast is explored in both directions until it is
-    improbable or at a bound.
-
-    `unmodelled`: standard deviation of the contrast due to errors that the problem does not contain; these errors do
-    not change the strength.
-    """
+def explore_contrast(problem: ShapeProblem, fit: Fit, k: int) -> list[ExploredContrast]:
+    """Explore the contrast of body k of a `fit`, and of all bodies of its material, in both directions until it is
+    improbable or at a bound. Returns the fits in ascending order of contrast."""
     bodies = fit.bodies
     contrast, slope = bodies.contrast(k, bodies.rows(fit.coefficients)[k])
     first_log_contrast = float(np.clip(np.log(contrast), *_LOG_CONTRAST_BOUNDS))
     deviation = problem.deviations(fit)[_radius_and_contrast_index(bodies, k)[1]] * abs(slope) / contrast
-    middle_fit, middle_coefficients = _fit_with_fixed_contrast(
-        problem, bodies, fit.coefficients, k, np.log(contrast), first_log_contrast, accuracy
-    )
-    fixed_fits, max_drop = [middle_fit], _LOG_POSTERIOR_DROP[bodies.dimension]
+    middle_fit = _fit_with_fixed_contrast(problem, bodies, fit.coefficients, k, np.log(contrast), first_log_contrast)
+    explored, max_drop = [middle_fit], _LOG_POSTERIOR_DROP[bodies.dimension]
     for direction in (-1, 1):
-        log_contrast, coefficients, step = (
-            first_log_contrast,
-            middle_coefficients,
-            float(np.clip(deviation, *_FIRST_STEP_LIMITS)),
-        )
-        while (
-            fixed_fits[-1 if direction > 0 else 0].negative_log_likelihood + _contrast_prior(log_contrast)
-            < min(map(_negative_log_evidence, fixed_fits)) + max_drop
-        ):
-            last_log_contrast, log_contrast = (
-                log_contrast,
-                float(np.clip(log_contrast + direction * step, *_LOG_CONTRAST_BOUNDS)),
-            )
-            if log_contrast == last_log_contrast:
+        last_fit, step = middle_fit, float(np.clip(deviation, *_FIRST_STEP_LIMITS))
+        while last_fit.negative_log_evidence < min(one.negative_log_evidence for one in explored) + max_drop:
+            log_contrast = float(np.clip(last_fit.log_contrast + direction * step, *_LOG_CONTRAST_BOUNDS))
+            if log_contrast == last_fit.log_contrast:
                 break
-            fixed_fit, coefficients = _fit_with_fixed_contrast(
-                problem, bodies, coefficients, k, last_log_contrast, log_contrast, accuracy
+            last_fit = _fit_with_fixed_contrast(
+                problem, bodies, last_fit.fit.coefficients, k, last_fit.log_contrast, log_contrast
             )
-            fixed_fits.insert(len(fixed_fits) if direction > 0 else 0, fixed_fit)
+            explored.insert(len(explored) if direction > 0 else 0, last_fit)
             step *= _STEP_GROWTH
+    return explored
+
+
+def quantify(
+    problem: ShapeProblem, explored: Sequence[ExploredContrast], k: int, unmodelled: float, accuracy: Accuracy
+) -> Quantities:
+    """Compute the quantities of body k from the `explored` contrasts of its material.
+
+    `unmodelled`: standard deviation of the contrast due to errors that the problem does not contain; these errors do
+    not change the strength.
+    """
+    bodies, fixed_fits = explored[0].fit.bodies, []
+    for log_contrast, negative_log_likelihood, fit in explored:
+        deviation = bodies.prior.radius_spread * float(
+            problem.deviations(fit)[_radius_and_contrast_index(bodies, k)[0]]
+        )
+        deviation = float(np.hypot(bodies.bounded_axes(k) * np.hypot(deviation, accuracy.size), accuracy.strength))
+        measure = fit.bodies.body(k, fit.coefficients).measure
+        log_measure = float(np.log(max(measure, TINY)))
+        fixed_fits.append(_FixedContrastFit(log_contrast, negative_log_likelihood, log_measure, deviation))
     return _summary(int(bodies.sign[k]), bodies.bounded_axes(k), unmodelled, fixed_fits)
 
 
@@ -206,17 +225,11 @@ def _radius_and_contrast_index(bodies: Bodies, k: int) -> tuple[int, int]:
 
 
 def _fit_with_fixed_contrast(
-    problem: ShapeProblem,
-    bodies: Bodies,
-    coefficients,
-    k: int,
-    last_log_contrast: float,
-    log_contrast: float,
-    accuracy: Accuracy,
-):
-    """Fit the bodies with the log contrast of body k, and of all other bodies of its material, fixed at `log_contrast`;
-    returns the fit and its coefficients. The fit starts from `coefficients` of a fit at `last_log_contrast`, with radii
-    changed so that the strengths stay the same."""
+    problem: ShapeProblem, bodies: Bodies, coefficients, k: int, last_log_contrast: float, log_contrast: float
+) -> ExploredContrast:
+    """Fit the bodies with the log contrast of body k, and of all other bodies of its material, fixed at `log_contrast`.
+    The fit starts from `coefficients` of a fit at `last_log_contrast`, with radii changed so that the strengths stay
+    the same."""
     start, same_material, sign = coefficients.copy(), bodies.first == bodies.first[k], bodies.sign[k]
     for body_index in np.flatnonzero(same_material).tolist():
         axes = bodies.bounded_axes(body_index)
@@ -225,19 +238,7 @@ def _fit_with_fixed_contrast(
     start[_radius_and_contrast_index(bodies, k)[1]] = 0.0
     fixed_contrast = np.where(same_material, np.exp(log_contrast), bodies.fixed_contrast)
     fixed_fit = problem.fit(replace(bodies, fixed_contrast=fixed_contrast), start, *_FIT_LIMITS[bodies.dimension])
-    deviation = bodies.prior.radius_spread * float(
-        problem.deviations(fixed_fit)[_radius_and_contrast_index(bodies, k)[0]]
-    )
-    deviation = float(np.hypot(bodies.bounded_axes(k) * np.hypot(deviation, accuracy.size), accuracy.strength))
-    measure = fixed_fit.bodies.body(k, fixed_fit.coefficients).measure
-    return _FixedContrastFit(
-        log_contrast, problem.surprise(fixed_fit), float(np.log(max(measure, TINY))), deviation
-    ), fixed_fit.coefficients
-
-
-def _negative_log_evidence(fixed_fit: _FixedContrastFit) -> float:
-    """Negative log posterior density of the logarithm of a fixed contrast, up to a constant."""
-    return fixed_fit.negative_log_likelihood + _contrast_prior(fixed_fit.log_contrast)
+    return ExploredContrast(log_contrast, problem.surprise(fixed_fit), fixed_fit)
 
 
 def _contrast_prior(log_contrast):
