@@ -97,7 +97,8 @@ def test_the_kind_of_bodies_can_be_given(coarse):
     columns, point = bodies.with_other_kind([0], bodies.of_radii([RADIUS]))
     assert columns.odds == 0
     problem: Any = None
-    assert search._alternative_fits(problem, Fit(bodies, point, 1.0, ROWS)) is None  # pyright: ignore
+    result = search._SearchResult(Fit(bodies, point, 1.0, ROWS), [9.0], ())  # pyright: ignore
+    assert search._alternative_fits(problem, result)[1] is None
     assert ellipsoid.alternatives(problem, Fit(columns, point, 1.0, ROWS)) == [
         (None, pytest.approx(np.nan, nan_ok=True))
     ]
@@ -260,6 +261,35 @@ def test_an_alternative_kind_depends_on_the_data_alone_and_has_its_own_deviation
         (own,) = ellipsoid.contrast_deviations(problem, fitted)  # pyright: ignore
         assert other.column != column
         assert deviation**2 - 0.01 == pytest.approx(4 * (own**2 - 0.01))
+
+
+def test_a_kind_that_the_data_exclude_by_far_is_not_tried_again(coarse):
+    bodies = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [[0.0, 0.0, 0.05], [0.03, 0.0, 0.04]], [1, 1])
+    tried = []
+
+    class Evidence:
+        """The first body as a column costs 200 times as much; the second one costs 20 times as much."""
+
+        def fit(self, bodies, coefficients, *steps):
+            tried.append(bodies.is_other_kind.tolist())
+            return Fit(bodies, coefficients, 200.0 if bodies.is_other_kind[0] else 20.0, ROWS)
+
+        def surprise(self, fit):
+            return fit.bodies.odds + fit.cost
+
+    problem: Any = Evidence()
+    found = search._SearchResult(Fit(bodies, bodies.of_radii([0.02, 0.02]), 1.0, ROWS), [9.0, 9.0], ())  # pyright: ignore
+    found, change = search._alternative_fits(problem, found)
+    assert change is None
+    assert tried == [[True, False], [False, True], [True, True]]
+    assert found.fit.bodies.is_kind_certain.tolist() == [True, False]
+    tried.clear()
+    assert search._alternative_fits(problem, found)[1] is None
+    ellipsoid.alternatives(problem, found.fit)
+    assert tried == [[False, True], [False, True]]
+    on_another_mesh = found.fit.bodies.on(coarse.mesh)  # type: ignore[attr-defined]
+    assert on_another_mesh.subset([1, 0]).is_kind_certain.tolist() == [False, True]
+    assert found.fit.bodies.split(0, found.fit.coefficients, 0)[0].is_kind_certain.tolist() == [False] * 3
 
 
 def test_balls_keep_their_volume_on_any_mesh(coarse):

@@ -22,7 +22,7 @@ from jeit.arguments import describe, is_number
 from jeit.arguments.checks import Interval
 
 # Fields of `Bodies`, except `start`, that have one value per body.
-_FIELDS_PER_BODY = ("sign", "is_other_kind", "same_material", "fixed_contrast")
+_FIELDS_PER_BODY = ("sign", "is_other_kind", "is_kind_certain", "same_material", "fixed_contrast")
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,8 @@ class Bodies(abc.ABC):
     **Fields**: `prior`: prior of every body; `weight` (m,): measure of each cell as a fraction of the domain; `span`:
     longest side of the domain, metres; `start` (k, d): starting centres, metres; `sign` (k,): +1 for bodies more
     conductive than the bath, -1 for less; `is_other_kind` (k,): whether a body is of the other kind (weak for stars, a
-    column for ellipsoids); `same_material` (k,): whether a body is of the same material as all other marked bodies of
+    column for ellipsoids); `is_kind_certain` (k,): whether the data exclude the body of the other kind, so that it is
+    not tried again; `same_material` (k,): whether a body is of the same material as all other marked bodies of
     its sign, in which case the contrast coefficient of the first such body applies to all of them; `fixed_contrast`
     (k,): contrast that replaces the one from the coefficient, NaN where the contrast is estimated.
     """
@@ -174,6 +175,7 @@ class Bodies(abc.ABC):
     start: Float[np.ndarray, "k d"]
     sign: Float[np.ndarray, " k"]
     is_other_kind: Bool[np.ndarray, " k"]
+    is_kind_certain: Bool[np.ndarray, " k"]
     same_material: Bool[np.ndarray, " k"]
     fixed_contrast: Float[np.ndarray, " k"]
 
@@ -299,6 +301,7 @@ class Bodies(abc.ABC):
         other_fields = {
             name: np.append(getattr(others, name), [getattr(self, name)[k]] * 2) for name in _FIELDS_PER_BODY
         }
+        other_fields["is_kind_certain"][-2:] = False
         return replace(self, start=start, **other_fields), np.concatenate([remaining, half_row, half_row])
 
     def with_modes(self, modes: int, coefficients) -> tuple[Self, Float[np.ndarray, " n"]]:

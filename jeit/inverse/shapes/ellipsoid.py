@@ -71,6 +71,9 @@ def alternatives(problem: ShapeProblem, fitted: Fit) -> list[tuple[Ellipsoid | N
         return [(None, np.nan)] * num_bodies
     max_surprise, pairs = problem.surprise(fitted) - bodies.odds + _UNDECIDED_ODDS, []
     for k in range(num_bodies):
+        if bodies.is_kind_certain[k]:
+            pairs.append((None, np.nan))
+            continue
         other_fit = problem.fit(*bodies.with_other_kind([k], fitted.coefficients), _STEPS, _COARSE_TOLERANCE)
         if problem.surprise(other_fit) - other_fit.bodies.odds < max_surprise:
             pairs.append((other_fit.bodies.body(k, other_fit.coefficients), contrast_deviations(problem, other_fit)[k]))
@@ -265,7 +268,19 @@ class Ellipsoids(Bodies):
         nans = np.full(len(start), np.nan)
         span, ends = float(np.ptp(points, axis=0).max()), (float(points[:, 2].min()), float(points[:, 2].max()))
         return cls(
-            prior, volume / total, span, start, sign, false, false, nans, samples, _BLUR * np.cbrt(volume), total, ends
+            prior,
+            volume / total,
+            span,
+            start,
+            sign,
+            false,
+            false,
+            false,
+            nans,
+            samples,
+            _BLUR * np.cbrt(volume),
+            total,
+            ends,
         )
 
     def bounded_axes(self, k: int) -> int:
@@ -333,7 +348,8 @@ class Ellipsoids(Bodies):
     def on(self, mesh: Mesh) -> Ellipsoids:
         """Copy of the bodies on another mesh of the same domain."""
         bodies = Ellipsoids.create(mesh, self.prior, self.start, self.sign)
-        return replace(bodies, is_other_kind=self.is_other_kind, same_material=self.same_material, span=self.span)
+        names = "is_other_kind", "is_kind_certain", "same_material", "span"
+        return replace(bodies, **{name: getattr(self, name) for name in names})
 
     def edges(self, coefficients, edge: float, corners: Float[np.ndarray, "m 4 3"]) -> Float[np.ndarray, " m"]:
         """Maximum edge length in metres of cells with these `corners`: `edge` times the shortest half axis at the

@@ -45,6 +45,9 @@ _COARSE_TOLERANCE = 1e-2
 _MAX_UNSUPPORTED = 2
 # A body is beyond doubt if the objective without it is larger by more than this factor.
 _CERTAIN_RISE = 10.0
+# The data exclude a change of a body's kind if it raises the objective, after a few steps of the fit, by more than this
+# factor: on finer meshes the factor increases, because the objective of the right kind decreases.
+_EXCLUDED_RISE = 100.0
 # Maximum number of changes of the number or kind of bodies in a search.
 _MAX_CHANGES = 10
 # Maximum number of times that the mesh is refined at the bodies, which move as a result. Edge lengths on the bodies'
@@ -385,8 +388,10 @@ def _refine_meshes(
         problem = setting.problem(level)
         fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
         result = _remove_unsupported(problem, fit, doubtful, least_rise, costs)
-        if refinement < _MAX_REFINEMENTS - 1 and (other_fit := _alternative_fits(problem, result.fit)):
-            result = _remove_unsupported(problem, other_fit, result.doubtful, least_rise)
+        if refinement < _MAX_REFINEMENTS - 1:
+            result, other_fit = _alternative_fits(problem, result)
+            if other_fit is not None:
+                result = _remove_unsupported(problem, other_fit, result.doubtful, least_rise)
         state, new_fit = _SearchState(setting, level, result), result.fit
         if refinement and not bodies.left_refined_cells(coefficients, new_fit.bodies, new_fit.coefficients):
             break
@@ -431,17 +436,28 @@ def _split_bodies(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit 
         for k in range(len(bodies.sign))
         for number in range(bodies.num_splits)
     ]
-    split = _best_fit(problem, fitted, starts)
+    split = _best_fit(problem, fitted, _trial_fits(problem, starts))
     return split if split and cost >= least_rise * split.cost and _is_supported(problem, fitted, split) else None
 
 
-def _alternative_fits(problem: ShapeProblem, fitted: Fit) -> Fit | None:
-    """Fit the bodies with one or all of them changed to the other kind (weak star or column); None if the data support
-    no change."""
-    first_kind = np.flatnonzero(~fitted.bodies.is_other_kind & (not fitted.bodies.prior.is_of_one_kind))
-    groups = [[k] for k in first_kind] + [first_kind] * (len(first_kind) > 1)
-    change = _best_fit(problem, fitted, [fitted.bodies.with_other_kind(group, fitted.coefficients) for group in groups])
-    return change if change and _is_supported(problem, fitted, change) else None
+def _alternative_fits(problem: ShapeProblem, result: _SearchResult) -> tuple[_SearchResult, Fit | None]:
+    """Fit the bodies with one or all of them changed to the other kind (weak star or column).
+
+    Returns the `result`, with those bodies marked whose kind is certain, and the fit; None if the data support no
+    change.
+    """
+    fitted = result.fit
+    bodies = fitted.bodies
+    can_change = ~bodies.is_other_kind & ~bodies.is_kind_certain & (not bodies.prior.is_of_one_kind)
+    indices = np.flatnonzero(can_change)
+    groups = [[k] for k in indices] + [indices] * (len(indices) > 1)
+    trials = _trial_fits(problem, [bodies.with_other_kind(group, fitted.coefficients) for group in groups])
+    is_kind_certain = bodies.is_kind_certain.copy()
+    for k, trial in zip(indices, trials, strict=False):
+        is_kind_certain[k] = trial.cost > _EXCLUDED_RISE * fitted.cost
+    result = result._replace(fit=fitted._replace(bodies=replace(bodies, is_kind_certain=is_kind_certain)))
+    change = _best_fit(problem, fitted, trials)
+    return result, change if change and _is_supported(problem, fitted, change) else None
 
 
 def _with_common_contrast(problem: ShapeProblem, fitted: Fit) -> Fit:
@@ -454,12 +470,14 @@ def _with_common_contrast(problem: ShapeProblem, fitted: Fit) -> Fit:
     return fitted
 
 
-def _best_fit(
-    problem: ShapeProblem, fitted: Fit, starts: Sequence[tuple[Bodies, Float[np.ndarray, " n"]]]
-) -> Fit | None:
-    """Make a few steps from each of several starts, and fit from the best start to convergence. None if the cost after
-    the few steps is more than `_CERTAIN_RISE` times that of `fitted`."""
-    trial_fits = [problem.fit(*start, _TRIAL_STEPS, _COARSE_TOLERANCE) for start in starts]
+def _trial_fits(problem: ShapeProblem, starts: Sequence[tuple[Bodies, Float[np.ndarray, " n"]]]) -> list[Fit]:
+    """Make a few steps of the fit from each of several starts."""
+    return [problem.fit(*start, _TRIAL_STEPS, _COARSE_TOLERANCE) for start in starts]
+
+
+def _best_fit(problem: ShapeProblem, fitted: Fit, trial_fits: Sequence[Fit]) -> Fit | None:
+    """Fit to convergence from the best of several trial fits. None if its cost is more than `_CERTAIN_RISE` times that
+    of `fitted`."""
     best_trial = min(trial_fits, key=lambda trial: trial.cost, default=None)
     if best_trial is None or best_trial.cost > _CERTAIN_RISE * fitted.cost:
         return None
@@ -474,8 +492,10 @@ def _is_supported(problem: ShapeProblem, simple_fit: Fit, other_fit: Fit) -> boo
 def _improve_fit(problem: ShapeProblem, result: _SearchResult, least_rise: float) -> _SearchResult:
     """Search for likelier bodies, starting once with a split and once with a change of kind. Returns the likelier
     result, or `result` if the data support neither change."""
-    changes = [_split_bodies(problem, result.fit, least_rise), _alternative_fits(problem, result.fit)]
-    results = [_search_until_stable(problem, result, fit, least_rise) for fit in changes if fit is not None] or [result]
+    split = _split_bodies(problem, result.fit, least_rise)
+    result, other_fit = _alternative_fits(problem, result)
+    starts = [fit for fit in (split, other_fit) if fit is not None]
+    results = [_search_until_stable(problem, result, start, least_rise) for start in starts] or [result]
     return min(results, key=lambda candidate: problem.surprise(candidate.fit))
 
 
@@ -484,7 +504,9 @@ def _search_until_stable(problem: ShapeProblem, result: _SearchResult, start: Fi
     change the kind of a body, until the data support no change."""
     for _ in range(_MAX_CHANGES):
         result = _remove_unsupported(problem, start, result.doubtful, least_rise)
-        next_fit = _split_bodies(problem, result.fit, least_rise) or _alternative_fits(problem, result.fit)
+        next_fit = _split_bodies(problem, result.fit, least_rise)
+        if next_fit is None:
+            result, next_fit = _alternative_fits(problem, result)
         if next_fit is None:
             break
         start = next_fit

@@ -194,7 +194,18 @@ class Stars(Bodies):
         sign, all_false = np.asarray(sign, float), np.zeros(len(start), bool)
         not_fixed = np.full(len(start), np.nan)
         return cls(
-            prior, weight, span, start, sign, all_false, all_false, not_fixed, corners @ _SAMPLES.T, width, edges
+            prior,
+            weight,
+            span,
+            start,
+            sign,
+            all_false,
+            all_false,
+            all_false,
+            not_fixed,
+            corners @ _SAMPLES.T,
+            width,
+            edges,
         )
 
     @property
