@@ -6,7 +6,7 @@ import pytest
 
 from jeit.electrodes import FacePatches
 from jeit.electrodes.face_patches import body_mesh
-from jeit.electrodes.facets import covered_moments
+from jeit.electrodes.facets import _clipped_moments, covered_moments
 from jeit.forward import ForwardModel
 from jeit.mesh import Disk, Rectangle, Solid, layer, measures, rectangle
 from jeit.protocol import adjacent
@@ -24,6 +24,13 @@ def test_moments_of_a_clipped_triangle_by_sampling():
         assert single == pytest.approx(inside @ weights, abs=3e-3)
         assert double == pytest.approx((weights.T * inside) @ weights, abs=3e-3)
     assert twice.sum(axis=-1) == pytest.approx(once, abs=1e-9)
+
+
+def test_triangles_inside_and_outside_of_a_rectangle_need_not_be_clipped():
+    corners = np.random.default_rng(1).normal(size=(500, 3, 2))
+    for got, clipped in zip(covered_moments(corners, np.ones(2)), _clipped_moments(corners, np.ones(2)), strict=True):
+        np.testing.assert_allclose(got, clipped, atol=1e-7)  # thin triangles are rounded when clipped
+    assert 20 < (np.abs(corners) <= 1).all(axis=(1, 2)).sum() < 100
 
 
 def test_moments_of_a_whole_triangle():
