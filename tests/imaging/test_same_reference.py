@@ -38,6 +38,10 @@ def test_arguments_are_compared_by_value():
     assert total(values.astype(np.float32), 2, name="other") == 8
     assert total(values[:2], 2, name="other") == 4
     assert len(calls) == 5
+    masked = np.array([np.nan, 1.0])
+    assert np.isnan(total(masked, 2))
+    assert np.isnan(total(masked.copy(), 2))
+    assert len(calls) == 6
 
 
 def test_an_error_is_raised_again():
