@@ -1,5 +1,6 @@
 """Bodies in a solid as ellipsoids: derivatives, geometry, and estimates in a box solved on another mesh."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,16 @@ from jeit.electrodes import CombinedElectrodes, plates
 from jeit.forward import ForwardModel
 from jeit.inverse import Gaussian, TotalVariation, reconstruct
 from jeit.inverse.nonlinear.problem import independent_data
-from jeit.inverse.shapes import EllipsoidPrior, StarPrior, ellipsoid, reconstruct_shapes, search
+from jeit.inverse.shapes import (
+    Accuracy,
+    EllipsoidPrior,
+    Quantities,
+    StarPrior,
+    ellipsoid,
+    quantities,
+    reconstruct_shapes,
+    search,
+)
 from jeit.inverse.shapes.ellipsoid import Ellipsoids
 from jeit.inverse.shapes.finer import refine_at_surfaces
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
@@ -52,6 +62,29 @@ def test_derivatives_equal_finite_differences(ellipsoids, coarse):
     np.testing.assert_allclose(change, (ahead.image - behind.image) / (2 * step), rtol=1e-6, atol=1e-6)
     assert here.overlap.min() > 1e-5
     np.testing.assert_allclose(here.overlap_slope @ along, (ahead.overlap - behind.overlap) / (2 * step), rtol=1e-5)
+
+
+def test_the_contrast_is_explored_once_for_each_material(ellipsoids, monkeypatch):
+    same, point = ellipsoids.of_one_material(1, ellipsoids.of_radii([0.03, 0.02, 0.03]))
+    assert same.first.tolist() == [0, 1, 0]
+    explored = []
+
+    def explore(problem, fit, k):
+        explored.append(k)
+        return [f"material of body {k}"]
+
+    def quantify(problem, explored, k, unmodelled, accuracy):
+        return Quantities(k, explored[0], unmodelled, (None, None), 0.0, (0.0, 0.0))
+
+    monkeypatch.setattr(quantities, "explore_contrast", explore)
+    monkeypatch.setattr(quantities, "quantify", quantify)
+    monkeypatch.setattr(quantities, "centroid_radius", lambda *_: 0.0)
+    problem: Any = SimpleNamespace(fit=lambda bodies, coefficients, steps: Fit(bodies, coefficients, 1.0, ROWS))
+    fit = Fit(same, point, 1.0, ROWS)
+    found = quantities.with_quantities(problem, fit, Accuracy(np.ones(3)), [0.1, 0.2, 0.3], [2, 0, 1])  # pyright: ignore
+    materials = [(one.change, one.change_interval, one.measure) for one in found]
+    assert materials == [(2, "material of body 0", 0.3), (0, "material of body 0", 0.1), (1, "material of body 1", 0.2)]
+    assert explored == [0, 1]
 
 
 def test_bodies_of_one_material_have_the_contrast_of_the_first(ellipsoids, coarse):
