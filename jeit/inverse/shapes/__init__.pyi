@@ -1,7 +1,8 @@
 from .bodies import Quantities
 from .ellipsoid import KINDS, Ellipsoid, EllipsoidPrior
 from .quantities import Accuracy
-from .search import LEAST_RISE, ShapeReconstruction, reconstruct_shapes
+from .reconstruction import ShapeReconstruction
+from .search import LEAST_RISE, reconstruct_shapes
 from .star import Star, StarPrior
 
 __all__ = [

@@ -164,9 +164,9 @@ class Bodies(abc.ABC):
     longest side of the domain, metres; `start` (k, d): starting centres, metres; `sign` (k,): +1 for bodies more
     conductive than the bath, -1 for less; `is_other_kind` (k,): whether a body is of the other kind (weak for stars, a
     column for ellipsoids); `is_kind_certain` (k,): whether the data exclude the body of the other kind, so that it is
-    not tried again; `same_material` (k,): whether a body is of the same material as all other marked bodies of
-    its sign, in which case the contrast coefficient of the first such body applies to all of them; `fixed_contrast`
-    (k,): contrast that replaces the one from the coefficient, NaN where the contrast is estimated.
+    not tried again; `same_material` (k,): whether a body is of the same material as all other marked bodies of its
+    sign, in which case the contrast coefficient of the first such body applies to all of them; `fixed_contrast` (k,):
+    contrast that replaces the one from the coefficient, NaN where the contrast is estimated.
     """
 
     prior: Any

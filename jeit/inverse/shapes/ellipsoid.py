@@ -267,21 +267,8 @@ class Ellipsoids(Bodies):
         sign, false = np.asarray(sign, float), np.zeros(len(start), bool)
         nans = np.full(len(start), np.nan)
         span, ends = float(np.ptp(points, axis=0).max()), (float(points[:, 2].min()), float(points[:, 2].max()))
-        return cls(
-            prior,
-            volume / total,
-            span,
-            start,
-            sign,
-            false,
-            false,
-            false,
-            nans,
-            samples,
-            _BLUR * np.cbrt(volume),
-            total,
-            ends,
-        )
+        width = _BLUR * np.cbrt(volume)
+        return cls(prior, volume / total, span, start, sign, false, false, false, nans, samples, width, total, ends)
 
     def bounded_axes(self, k: int) -> int:
         """Number of axes along which body k is bounded: 2 for a column, else 3."""

@@ -18,7 +18,6 @@ from jeit.inverse.nonlinear.problem import check_background, check_frame, check_
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes.bodies import Bodies, BodyPrior
 from jeit.inverse.shapes.ellipsoid import (
-    Ellipsoid,
     EllipsoidPrior,
     Ellipsoids,
     alternatives,
@@ -27,11 +26,11 @@ from jeit.inverse.shapes.ellipsoid import (
 )
 from jeit.inverse.shapes.problem import Fit, ShapeProblem, SmoothField
 from jeit.inverse.shapes.quantities import Accuracy, include_deviation, with_quantities
-from jeit.inverse.shapes.star import Star, StarPrior, Stars
+from jeit.inverse.shapes.reconstruction import Body, FinerImage, ShapeReconstruction
+from jeit.inverse.shapes.star import StarPrior, Stars
 from jeit.mesh import check_flat
 from jeit_solvers import one_thread_of_blas
 from jeit_solvers.engines import as_array
-from jeit_solvers.module import Module
 
 if TYPE_CHECKING:
     from jeit.inverse.shapes.finer import FinerModel
@@ -56,68 +55,6 @@ _MAX_CHANGES = 10
 _MAX_REFINEMENTS, _EDGE_LENGTHS = 3, ((0.7,), (0.25, 0.35, 0.5, 0.7))
 # Minimum gain of log evidence with which a description of the bodies with more parameters is accepted.
 _MIN_EVIDENCE_GAIN = 2.0
-
-
-Body = Star | Ellipsoid
-
-
-class FinerImage(Module):
-    """Conductivity of reconstructed bodies on a refined mesh, for display.
-
-    **Fields**: `model`: forward model on the refined mesh, with the same electrodes and a protocol of independent
-    channels; `conductivity` (c,): conductivity of the refined cells, S/m.
-    """
-
-    model: ForwardModel
-    conductivity: Float[Array, " c"]
-
-
-class ShapeReconstruction(Module):
-    """Result of `reconstruct_shapes`.
-
-    **Fields**: `bodies`: `Star`s in a sheet, `Ellipsoid`s in a solid, in descending order of `rise`; `conductivity`
-    (m,): S/m (2-D: S), in partly covered cells of a solid the geometric mean of body and bath; `voltages` (M,):
-    voltages predicted for the bodies; `misfit`: root mean square of predicted - measured voltages over the channels
-    used, in standard deviations; `drift`: relative difference of the bath's conductivity from `background`; `doubtful`:
-    bodies that were removed because their `rise` is too small; `contrast_deviations`: standard deviation of each body's
-    contrast in log σ, due to noise and to the mesh (the mesh contributes 0.03, in solids 0.1); `alternatives`: for each
-    body of a solid, the body of the other kind (ellipsoid or column) if the data do not determine the kind, else None;
-    `alternative_deviations`: standard deviations of the contrasts of the alternatives, or NaN; `finer`: for a solid
-    with bodies, the conductivity on the last refined mesh, for display.
-
-    **Example:**
-
-    ```python
-    found = reconstruct_shapes(model, voltages, 1.0, start=[(1, (0.04, 0.0), 0.03)])
-    found.bodies, found.misfit
-    ```
-    """
-
-    bodies: tuple[Body, ...]
-    conductivity: Float[Array, " m"]
-    voltages: Float[Array, " M"]
-    misfit: Float[Array, ""]
-    drift: float
-    doubtful: tuple[Body, ...]
-    contrast_deviations: tuple[float, ...]
-    alternatives: tuple[Ellipsoid | None, ...]
-    alternative_deviations: tuple[float, ...]
-    finer: FinerImage | None = None
-
-    @property
-    def hyperparameter(self) -> float:
-        """Hyperparameter: NaN, because the prior of shapes has no hyperparameter."""
-        return float("nan")
-
-    @property
-    def rule(self) -> str:
-        """Rule that chose the hyperparameter: "none", as there is no hyperparameter."""
-        return "none"
-
-    @property
-    def choice(self) -> None:
-        """Choice of the hyperparameter: None, as there is no hyperparameter."""
-        return None
 
 
 @one_thread_of_blas()  # several threads would only wait for each other in its small products

@@ -191,22 +191,10 @@ class Stars(Bodies):
         area = np.asarray(measures(mesh))
         start = np.reshape(np.asarray(start, float), (-1, 2))
         width, weight = _BLUR * np.sqrt(area), area / area.sum()
-        sign, all_false = np.asarray(sign, float), np.zeros(len(start), bool)
-        not_fixed = np.full(len(start), np.nan)
-        return cls(
-            prior,
-            weight,
-            span,
-            start,
-            sign,
-            all_false,
-            all_false,
-            all_false,
-            not_fixed,
-            corners @ _SAMPLES.T,
-            width,
-            edges,
-        )
+        sign, false = np.asarray(sign, float), np.zeros(len(start), bool)
+        nans = np.full(len(start), np.nan)
+        points = corners @ _SAMPLES.T
+        return cls(prior, weight, span, start, sign, false, false, false, nans, points, width, edges)
 
     @property
     def odds(self) -> float:
