@@ -20,10 +20,12 @@ from jeit.arguments import counted
 from jeit.cli.console import Steps
 from jeit.cli.options import remove_empty_folders
 
-# Minimum waiting time after which a frame counts as live, as a fraction of the usual interval between frames; number of
-# consecutive live frames after which no earlier frames are assumed to remain; and maximum time in seconds for reading
-# earlier frames.
-_MIN_WAIT_SHARE, _NUM_LIVE_FRAMES, _MAX_CATCH_UP_SECONDS = 0.4, 3, 5.0
+# Minimum waiting time after which a frame counts as live, as a fraction of the usual interval between frames.
+_MIN_WAIT_SHARE = 0.4
+# Number of consecutive live frames after which no earlier frames are assumed to remain.
+_NUM_LIVE_FRAMES = 3
+# Maximum time in seconds for reading earlier frames.
+_MAX_CATCH_UP_SECONDS = 5.0
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _END_OF_FRAMES = object()
 # Interval in seconds between reports of the number of frames received.

@@ -67,9 +67,12 @@ def _max_gigabytes() -> float:
 
 MAX_KEY_LENGTH = 40
 """Maximum number of characters of a key in a message."""
-# Maximum number of characters of a message; of faults that are described in sentences; and of further faults that are
-# listed by their keys.
-_MAX_MESSAGE, _MAX_SENTENCES, _MAX_KEYS = 390, 4, 10
+# Maximum number of characters of a message.
+_MAX_MESSAGE = 390
+# Maximum number of faults that are described in sentences.
+_MAX_SENTENCES = 4
+# Maximum number of further faults that are listed by their keys.
+_MAX_KEYS = 10
 WORD_LIST_PREFIX = "; there are "
 """Text that precedes a list of all valid words in a message."""
 
@@ -143,8 +146,10 @@ def error_text(error: Exception) -> str:
     return text if len(text) <= _MAX_REASON else f"{text[: _MAX_REASON - 1]}…"
 
 
-# Maximum size in bytes of a hand-written TOML file; and bytes of memory per byte of text.
-_MAX_TOML_BYTES, _BYTES_PER_CHARACTER = 2**22, 4
+# Maximum size in bytes of a hand-written TOML file.
+_MAX_TOML_BYTES = 2**22
+# Bytes of memory per byte of text.
+_BYTES_PER_CHARACTER = 4
 # Maximum number of parts of a dotted key.
 _MAX_KEY_PARTS = 32
 

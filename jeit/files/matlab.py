@@ -19,9 +19,10 @@ import scipy.io
 from jeit.arguments import names_text
 from jeit.files.limits import check_memory, read_as
 
-# Length in bytes of the file header, and of the beginning of an element, which contains flags, shape and name; then the
-# type numbers of array elements and of compressed elements.
-_HEADER_BYTES, _PREFIX_BYTES = 128, 4096
+# Length of the file header, bytes.
+_HEADER_BYTES = 128
+# Length of the beginning of an element, which contains flags, shape and name, bytes.
+_PREFIX_BYTES = 4096
 _MATRIX_TYPE, _COMPRESSED_TYPE = 14, 15
 # Numbers that identify classes of arrays in the file: the class number of sparse arrays, and, for each class number of
 # numeric arrays, the NumPy type.

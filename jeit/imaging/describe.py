@@ -38,14 +38,17 @@ _MIN_ELECTRODES, _MAX_ELECTRODES, _NODES = 4, 64, {2: 700, 3: 4000}
 # Unexplained share of the empty body's voltages above which the best protocol is refused: in general; and if its kind
 # is known, or if the channels in a different order would leave `_MIN_ORDER_RATIO` times as much unexplained.
 _MAX_UNEXPLAINED, _MAX_UNEXPLAINED_KNOWN, _MIN_ORDER_RATIO = 0.25, 0.5, 2.0
-# Maximum spread of the frames of an empty body; minimum number of channels for each electrode.
-_MAX_SPREAD, _MIN_CHANNELS = 0.2, 2
+# Maximum spread of the frames of an empty body.
+_MAX_SPREAD = 0.2
+# Minimum number of channels for each electrode.
+_MIN_CHANNELS = 2
 # Maximum number of candidate protocols whose misfit is computed. A candidate is ruled out if its unexplained share is
 # at least `_RIVAL_RATIO` times that of the best candidate plus `_RIVAL_MARGIN`.
 _MAX_COMPARED, _RIVAL_RATIO, _RIVAL_MARGIN = 12, 1.3, 0.01
-# Minimum reciprocity error for which gains are estimated; maximum ratio of the error after the correction by these
-# gains to the error before.
-_MIN_GAIN_ERROR, _MAX_GAIN_RATIO = 0.03, 0.4
+# Minimum reciprocity error for which gains are estimated.
+_MIN_GAIN_ERROR = 0.03
+# Maximum ratio of the reciprocity error after the correction by estimated gains to the error before.
+_MAX_GAIN_RATIO = 0.4
 # Layout of a table of numbers about which nothing is known.
 _UNKNOWN_LAYOUT = TableLayout()
 # Contact impedance of a new description, times conductivity, divided by the size of the body.

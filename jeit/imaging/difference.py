@@ -41,11 +41,15 @@ _SEGMENTATION_LEVEL = 0.5
 _MIN_RELATIVE_WIDTH, _MIN_SUSPICIOUS_MISFIT, _MAX_EXCHANGED_MISFIT = 0.005, 0.1, 0.5
 # Maximum misfit of an image's voltages, in standard deviations, that raises no doubt.
 _MISFIT = 3.0
-# Minimum share of usable voltages that raises no doubt, and ranges of plausible conductivities: of solids in S/m, from
-# tap water and fat to brine, with a margin on both sides; of sheets in S, from a megohm a square to metal.
-_MIN_USABLE_SHARE, _CONDUCTIVITIES = 0.5, {2: (1e-6, 1e5), 3: (1e-3, 30.0)}
-# Voltage above the range of an EIT instrument's amplifiers; and units smaller than a volt, with their number per volt.
-_MAX_VOLTS, _SMALLER_UNITS = 60.0, (("mV", 1e3), ("uV", 1e6))
+# Minimum share of usable voltages that raises no doubt.
+_MIN_USABLE_SHARE = 0.5
+# Ranges of plausible conductivities: of sheets in S, from a megohm a square to metal; of solids in S/m, from tap water
+# and fat to brine, with a margin on both sides.
+_CONDUCTIVITIES = {2: (1e-6, 1e5), 3: (1e-3, 30.0)}
+# Voltage above the range of an EIT instrument's amplifiers.
+_MAX_VOLTS = 60.0
+# Units smaller than a volt, with their number per volt.
+_SMALLER_UNITS = (("mV", 1e3), ("uV", 1e6))
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,10 @@ _COMMENT_PREFIXES = ("#", "%", "//")
 # Maximum number of characters that are stored of a line that is not a frame.
 _MAX_TEXT_LENGTH = 400
 # Maximum relative difference from the reference for which a number is considered complete, and for which a frame is
-# used to determine the factors from numbers to volts; maximum number of frames from which the factors are determined.
-_MAX_DIFFERENCE, _MAX_FACTOR_FRAMES = 0.5, 20
+# used to determine the factors from numbers to volts.
+_MAX_DIFFERENCE = 0.5
+# Maximum number of frames from which the factors are determined.
+_MAX_FACTOR_FRAMES = 20
 
 
 class LineBuffer:

@@ -25,9 +25,11 @@ from jeit.live.views.conductivity import ConductivityView
 _NETWORK_FILE, _SKIN_FILE, _GESTURES_FILE = "network.jeit", "skin.skops", "gestures.skops"
 # Minimum and maximum number of frames of the undisturbed sensor from which a reference is computed.
 _MIN_FRAMES, _MAX_FRAMES = 3, 10_000
-# Period in seconds with which the connection of a source is checked; time in seconds, from the arrival of the first
-# frame, in which frames are attributed to lines that were sent before the program could read them.
-_POLL_PERIOD, _BURST_TIME = 0.3, 0.05
+# Period in seconds with which the connection of a source is checked.
+_POLL_PERIOD = 0.3
+# Time in seconds, from the arrival of the first frame, in which frames are attributed to lines that were sent before
+# the program could read them.
+_BURST_TIME = 0.05
 
 
 class Prepared(NamedTuple):

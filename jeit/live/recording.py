@@ -34,9 +34,10 @@ _MAX_WAITING_BYTES, _RETRY_PERIOD, _SYNC_PERIOD, _END_TIMEOUT = 64_000_000, 1.0,
 # Maximum size in bytes of a file of frames. Readers need memory of eight times the file size, which this limit keeps
 # below a gigabyte.
 _MAX_FILE_SIZE = 100_000_000
-# Prefix of the names of files of frames; number of successive frames with a different number of channels after which a
-# new file is begun.
-_FRAMES_PREFIX, _NUM_OTHER_LENGTHS = "frames", 3
+# Prefix of the names of files of frames.
+_FRAMES_PREFIX = "frames"
+# Number of successive frames with a different number of channels after which a new file is begun.
+_NUM_OTHER_LENGTHS = 3
 _BINARY = getattr(os, "O_BINARY", 0)  # prevents Windows from changing line ends
 
 

@@ -22,19 +22,27 @@ from jeit.live.sources import ENDED, MAX_MESSAGES, AbstractSource
 
 # Maximum time in seconds for which frames wait to be imaged. Older frames are not imaged.
 _MAX_WAIT = 0.05
-# Maximum memory in bytes of the stored results; maximum number of waiting frames; maximum number of different reasons
-# for refusing frames that are counted separately.
-_MAX_BYTES, _MAX_WAITING, _MAX_REASONS = 128_000_000, 256, 30
+# Maximum memory in bytes of the stored results.
+_MAX_BYTES = 128_000_000
+# Maximum number of waiting frames.
+_MAX_WAITING = 256
+# Maximum number of different reasons for refusing frames that are counted separately.
+_MAX_REASONS = 30
 _NUMBER_PATTERN = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
-# Number of frames over which the latency is computed; time in seconds over which the frame rate is measured; period in
-# seconds with which the quality of the frames is computed.
-_NUM_LATENCIES, _RATE_SPAN, _QUALITY_PERIOD = 600, 2.0, 0.5
-# Number of successive frames with a different number of channels after which the change is reported; maximum number of
-# frames of a reference.
-_NUM_OTHER_LENGTHS, _MAX_REFERENCE_FRAMES = 3, 10_000
-# Maximum length of the name of an event; time in seconds for which the events of skipped frames are stored for a busy
-# program.
-_MAX_LABEL_LENGTH, _EVENT_HISTORY = 200, 30.0
+# Number of frames over which the latency is computed.
+_NUM_LATENCIES = 600
+# Time in seconds over which the frame rate is measured.
+_RATE_SPAN = 2.0
+# Period in seconds with which the quality of the frames is computed.
+_QUALITY_PERIOD = 0.5
+# Number of successive frames with a different number of channels after which the change is reported.
+_NUM_OTHER_LENGTHS = 3
+# Maximum number of frames of a reference.
+_MAX_REFERENCE_FRAMES = 10_000
+# Maximum length of the name of an event.
+_MAX_LABEL_LENGTH = 200
+# Time in seconds for which the events of skipped frames are stored for a busy program.
+_EVENT_HISTORY = 30.0
 
 
 @dataclass(frozen=True)

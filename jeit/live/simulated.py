@@ -17,9 +17,10 @@ from jeit.live.pictures import LiveFrame
 from jeit.live.sources import ENDED, AbstractSource
 from jeit.mesh import Disk, centroids
 
-# Number of frames of the reference; standard deviation of the noise of a voltage, relative to the root mean square of a
-# frame.
-_NUM_REFERENCE_FRAMES, _RELATIVE_NOISE = 50, 1e-4
+# Number of frames of the reference.
+_NUM_REFERENCE_FRAMES = 50
+# Standard deviation of the noise of a voltage, relative to the root mean square of a frame.
+_RELATIVE_NOISE = 1e-4
 # Number of nodes of the meshes on which frames are simulated.
 _NUM_NODES = 1800
 # Tank: radius of the rod and of its path in metres; conductivity of the rod, relative to that of the water; time of a

@@ -24,10 +24,12 @@ ENDED, CONNECTED = "ended", "connected"
 MAX_MESSAGES, _MAX_MESSAGE_LENGTH = 50, 300
 # Frame rate of a recording without times, in frames/s.
 _DEFAULT_RATE = 10.0
-# Minimum pause in seconds between two listings of the folder; minimum ratio of the pause to the duration of a listing,
-# for folders of many files; and time in seconds after which an unreadable file is refused (earlier, the instrument may
-# still be writing it).
-_MIN_PAUSE, _PAUSE_FACTOR, _READ_TIMEOUT = 0.02, 4.0, 2.0
+# Minimum pause in seconds between two listings of the folder.
+_MIN_PAUSE = 0.02
+# Minimum ratio of the pause to the duration of a listing, for folders of many files.
+_PAUSE_FACTOR = 4.0
+# Time in seconds after which an unreadable file is refused (earlier, the instrument may still be writing it).
+_READ_TIMEOUT = 2.0
 
 
 class AbstractSource(abc.ABC):

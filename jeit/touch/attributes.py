@@ -20,8 +20,10 @@ from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.touch.contacts import Contact, ImageNoise, find_contacts
 from jeit.touch.contacts.finder import AbstractFinder
 
-# Minimum number of different loads; minimum number of touches with each load.
-_MIN_LOADS, _MIN_REPETITIONS = 3, 3
+# Minimum number of different loads.
+_MIN_LOADS = 3
+# Minimum number of touches with each load.
+_MIN_REPETITIONS = 3
 # Fractions of the maximum response between which rise and fall times are measured.
 _RISE_START, _RISE_END = 0.1, 0.9
 
@@ -179,9 +181,14 @@ def _check_pair(
     return first_values, second_values
 
 
-# Number of untouched frames; number of repetitions of each load and of each area; number of places; number of trials of
-# each separation.
-_NUM_UNTOUCHED_FRAMES, _NUM_REPETITIONS, _NUM_PLACES, _NUM_TRIALS = 50, 8, 40, 8
+# Number of untouched frames.
+_NUM_UNTOUCHED_FRAMES = 50
+# Number of repetitions of each load and of each area.
+_NUM_REPETITIONS = 8
+# Number of places.
+_NUM_PLACES = 40
+# Number of trials of each separation.
+_NUM_TRIALS = 8
 # Loads at which Weber's ratio is measured, relative to the usual load; distances between the centres of two discs,
 # relative to the usual diameter; diameters of discs under the same pressure, relative to the usual diameter.
 _RELATIVE_LOADS = np.geomspace(0.25, 4.0, 7)

@@ -118,9 +118,12 @@ _MAX_SHARED_ITERATIONS, _MAX_INDIVIDUAL_ITERATIONS = 6, 12
 _T_FREEDOM = 5.0
 # Ratio of the mean square residual of a tap to the median over all taps, above which the tap is excluded as an outlier.
 _OUTLIER_RATIO = 12.0
-# Standard deviation of the logarithms of the shape parameters over the array: in the fit with a shared shape; initially
-# in the fit with individual shapes; minimum; maximum.
-_SHARED_SPREAD, _INITIAL_SPREAD, _MIN_SPREAD, _MAX_SPREAD = 0.03, 0.5, 0.1, 1.0
+# Standard deviation of the logarithms of the shape parameters over the array: in the fit with a shared shape.
+_SHARED_SPREAD = 0.03
+# Standard deviation at the start of the fit with individual shapes, and its limits.
+_INITIAL_SPREAD = 0.5
+_MIN_SPREAD = 0.1
+_MAX_SPREAD = 1.0
 # Maximum displacement of a microphone along each coordinate, in units of `place_error`.
 _MAX_DISPLACEMENT = 4.0
 # Relative standard error of the shape at or above which a microphone's own taps are considered not to determine the

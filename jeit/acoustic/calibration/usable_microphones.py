@@ -132,9 +132,11 @@ def _response_decrease(fit: TapFit) -> Float[np.ndarray, " M"]:
 
 # Number of folds in the cross-validation.
 _NUM_FOLDS = 4
-# Minimum relative error of the decay models that is assumed when the likelihood is evaluated on a raster of positions;
-# maximum number of steps of a minimisation.
-_SCREENING_ERROR, _MAX_STEPS = 0.2, 30
+# Minimum relative error of the decay models that is assumed when the likelihood is evaluated on a raster of
+# positions.
+_SCREENING_ERROR = 0.2
+# Maximum number of steps of a minimisation.
+_MAX_STEPS = 30
 # Minimum number of located taps for an estimate of `widening`; fraction of the taps that the error ellipses must
 # contain; quantile of χ² with two degrees of freedom for this fraction.
 _MIN_LOCATED, _CONTAINED_SHARE = 10, 0.9

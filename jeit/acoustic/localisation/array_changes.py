@@ -39,21 +39,28 @@ from jeit_solvers.engines import as_array, host, on_device, on_host, slopes
 # source explains half of the frames. The other factors are accepted only if one source explains nearly all frames,
 # since large changes of the gains let one source explain some pairs of touches too.
 _DEVIATION_FACTORS, _MIN_EXPLAINED_FIRST, _MIN_EXPLAINED_LATER = (1.0, 2.0, 4.0), 0.5, 0.9
-# Maximum number of iterations; change of the estimated logarithms below which the iteration ends.
-_MAX_ITERATIONS, _CONVERGED_CHANGE = 4, 0.05
+# Maximum number of iterations of the estimate.
+_MAX_ITERATIONS = 4
+# Change of the estimated logarithms below which the iteration ends.
+_CONVERGED_CHANGE = 0.05
 # Side of square cells of the skin, as a fraction of the skin's size. All frames with positions in one cell together
 # have the weight of one frame, since the errors of a decay model are similar at neighbouring positions.
 _CELL_SIZE = 0.3
-# Probability that estimated changes are significant although the gains have not changed; relative tolerance of the rank
-# of A.
-_FALSE_CHANGE, _RANK_TOLERANCE = 0.01, 1e-8
+# Probability that estimated changes are significant although the gains have not changed.
+_FALSE_CHANGE = 0.01
+# Relative tolerance of the rank of A.
+_RANK_TOLERANCE = 1e-8
 # Fraction of the trace of a frame's Fisher matrix that is added to the diagonal of this matrix, which is singular where
 # few microphones respond.
 _RIDGE = 1e-12
-# Number of the loudest frames, in which changes of the setup are searched for; misfit per degree of freedom above which
-# the search begins; value at which the misfit per degree of freedom is clipped; maximum ratio of the misfits after and
-# before an accepted change.
-_NUM_FRAMES, _LARGE_MISFIT, _MAX_MISFIT, _MAX_MISFIT_RATIO = 24, 3.0, 100.0, 0.7
+# Number of the loudest frames, in which changes of the setup are searched for.
+_NUM_FRAMES = 24
+# Misfit per degree of freedom above which the search begins.
+_LARGE_MISFIT = 3.0
+# Value at which the misfit per degree of freedom is clipped.
+_MAX_MISFIT = 100.0
+# Maximum ratio of the misfits after and before an accepted change.
+_MAX_MISFIT_RATIO = 0.7
 # Maximum number of changes of the setup that are searched for.
 _MAX_CHANGES = 4
 # Leaving out one microphone is a candidate change only if more than this number of microphones are in no accepted

@@ -180,9 +180,12 @@ class Consistency(Module):
 _OUTLINE_CANDIDATES = 240
 # Distance, as a fraction of the skin's size, below which two minima are considered the same.
 _MIN_VALLEY_DISTANCE = 0.05
-# Number of steps in the second valley before its cost is compared with that of the first valley; maximum difference of
-# cost for which the minimisation in the second valley continues; maximum number of steps of a minimisation.
-_TRIAL_STEPS, _MAX_EXCESS, _MAX_STEPS = 8, 8.0, 30
+# Number of steps in the second valley before its cost is compared with that of the first valley.
+_TRIAL_STEPS = 8
+# Maximum difference of cost for which the minimisation in the second valley continues.
+_MAX_EXCESS = 8.0
+# Maximum number of steps of a minimisation.
+_MAX_STEPS = 30
 # Tolerance of the minimisation: predicted decrease of the cost in the next step, relative to 1 + |cost|.
 _TOLERANCE = 1e-12
 

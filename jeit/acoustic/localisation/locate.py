@@ -36,9 +36,10 @@ _FALSE_ALARM, _FALSE_MISFIT = 1e-6, 1e-4
 # Detection threshold of touches in standard deviations of the noise, if the distribution of the noise is unknown.
 _ALARM_DEVIATIONS = 6.0
 # Thresholds of differences of −2 log-likelihood: a frame is "outside" if a position beyond the outline is better by
-# more than 9 (three standard deviations); a frame is "ambiguous" if its second valley is worse by less than 4 (two
-# standard deviations).
-_MIN_OUTSIDE_EXCESS, _MAX_AMBIGUOUS_DIFFERENCE = 9.0, 4.0
+# more than 9 (three standard deviations).
+_MIN_OUTSIDE_EXCESS = 9.0
+# A frame is "ambiguous" if its second valley is worse by less than 4 (two standard deviations).
+_MAX_AMBIGUOUS_DIFFERENCE = 4.0
 # Thresholds for accepting two sources whose misfit is statistically significant: maximum ratio of the misfit of two
 # sources to that of one source, and maximum misfit per degree of freedom. Minimum ratio of the strengths of two
 # sources, since errors of the decay models look like a weak second source.

@@ -16,8 +16,10 @@ from jeit_solvers import inverse_small, minimise_small
 from jeit_solvers.engines import evaluate_in_numpy, has_values, namespace, on_device, on_host, scan
 from jeit_solvers.module import Module
 
-# Approximate number of grid positions, all pairs of which are screened; number of pairs of positions that are refined.
-_NUM_PIXELS, _NUM_STARTS = 150, 3
+# Approximate number of grid positions, all pairs of which are screened.
+_NUM_PIXELS = 150
+# Number of pairs of positions that are refined.
+_NUM_STARTS = 3
 
 
 class TwoSources(Module):

@@ -28,9 +28,11 @@ _STATUS_MARKERS = {
     LocationStatus.MISFIT: "X",
     LocationStatus.AMBIGUOUS: "P",
 }
-# Thresholds of motion below which a touch is drawn as a single position: the distance of the touch's path from the mean
-# of the path, in standard deviations; and the diameter of the path, as a fraction of the size of the surface.
-_MIN_MOTION_DEVIATIONS, _MIN_MOTION_SHARE = 4.0, 0.05
+# Distance of a touch's path from the mean of the path, in standard deviations, below which the touch is drawn as a
+# single position.
+_MIN_MOTION_DEVIATIONS = 4.0
+# Diameter of the path, as a fraction of the size of the surface, below which a touch is drawn as a single position.
+_MIN_MOTION_SHARE = 0.05
 
 
 def plot_track(

@@ -82,9 +82,10 @@ MODALITIES = tuple(SOUND_MANNERS)
 # Standard deviations between the taps of one clip: of the logarithm of the strength, and of the logarithm of the
 # interval between taps; and maximum distance in metres of a pat from the mean position of the pats.
 _STRENGTH_SPREAD, _RHYTHM_SPREAD, _PAT_RADIUS = 0.25, 0.12, 4e-3
-# Minimum distance of the centre of a touch from the edge of the skin, in metres; minimum speed of a stroking hand at a
-# turn, divided by the hand's mean speed.
-_EDGE_MARGIN, _MIN_SPEED_RATIO = 0.02, 0.1
+# Minimum distance of the centre of a touch from the edge of the skin, in metres.
+_EDGE_MARGIN = 0.02
+# Minimum speed of a stroking hand at a turn, divided by the hand's mean speed.
+_MIN_SPEED_RATIO = 0.1
 # Minimum length of a burst of sound in seconds, which limits random lengths.
 _MIN_BURST_LENGTH = 0.01
 

@@ -29,9 +29,11 @@ from jeit.mesh import Mesh, centroids, check_flat, measures
 _EDGE_HALF_WIDTH = 0.25
 # Sampling points along the radius of a target, by dimension: about 50 points in a disc, about 60 in a ball.
 _SAMPLES_PER_RADIUS = {2: 4.0, 3: 2.5}
-# Number of sampling points processed at a time; search distance around the centre of a ball, in radii, slightly above 1
-# so that rounding excludes no point of the ball.
-_SAMPLES_AT_ONCE, _SEARCH_RADII = 500_000, 1 + 1e-9
+# Number of sampling points processed at a time.
+_SAMPLES_AT_ONCE = 500_000
+# Search distance around the centre of a ball, in radii, slightly above 1 so that rounding excludes no point of the
+# ball.
+_SEARCH_RADII = 1 + 1e-9
 # Minimum fraction of a training target that must lie in the body.
 _MIN_INSIDE_FRACTION = 0.9
 # Approximate number of cells over which the signal and noise in the noise figure are averaged.

@@ -206,8 +206,10 @@ def _pivots(scaled, tolerance: float, max_rank: int):
     return pivots, rank
 
 
-# Grid points per correlation length; number of grid points along an axis from which the cubic interpolates.
-_GRID_POINTS_PER_LENGTH, _CUBIC = 3, 4
+# Grid points per correlation length.
+_GRID_POINTS_PER_LENGTH = 3
+# Number of grid points along an axis from which the cubic interpolates.
+_CUBIC = 4
 # Maximum number of grid points, per point of the field and in total, up to which a grid saves time.
 _MAX_GRID_RATIO, _MAX_GRID_POINTS = 8, 500_000
 # Number of columns processed at a time, which limits the memory for values on the grid.

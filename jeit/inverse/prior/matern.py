@@ -30,9 +30,10 @@ from jeit_solvers.engines import has_values, host, on_host
 
 # Length in the Robin condition at the wall, in units of 1/κ.
 _ROBIN_COEFFICIENT = 1.42
-# Number of nodes up to which variances are computed exactly; number of random fields from which variances are estimated
-# on larger meshes.
-_MAX_EXACT_NODES, _NUM_SAMPLED_FIELDS = 3000, 400
+# Number of nodes up to which variances are computed exactly.
+_MAX_EXACT_NODES = 3000
+# Number of random fields from which variances are estimated on larger meshes.
+_NUM_SAMPLED_FIELDS = 400
 # Number of random fields processed at a time.
 _COLUMNS_AT_ONCE = 50
 

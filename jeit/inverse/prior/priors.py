@@ -62,11 +62,15 @@ def check_prior(prior: Any) -> None:
 
 # Number of rows of a dense covariance computed at a time.
 _ROWS_AT_ONCE = 512
-# Fraction of a Gaussian prior's variance that the shapes of its basis may leave out; maximum number of shapes.
-_OMITTED_VARIANCE, _MAX_SHAPES = 1e-3, 2000
+# Fraction of a Gaussian prior's variance that the shapes of its basis may leave out.
+_OMITTED_VARIANCE = 1e-3
+# Maximum number of shapes of the basis.
+_MAX_SHAPES = 2000
 # Number of cells above which images consist only of shapes that the data resolve, and the Laplace prior couples nodes
-# in place of cells; squared signal of a shape, relative to the largest, below which the data do not resolve the shape.
-_LARGE_MESH_CELLS, _MIN_SIGNAL = 30_000, 1e-12
+# in place of cells.
+_LARGE_MESH_CELLS = 30_000
+# Squared signal of a shape, relative to the largest, below which the data do not resolve the shape.
+_MIN_SIGNAL = 1e-12
 # Term added to the diagonal of a precision matrix that has constant images in its null space.
 _DIAGONAL_TERM = 1e-6
 

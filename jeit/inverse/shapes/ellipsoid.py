@@ -96,9 +96,10 @@ _BLUR = 0.1
 # a single exponent of 0.15, the change due to balls of 12 times the conductivity was 13 to 19 % too large, an error
 # proportional to the edge length.
 _POWERS = {1: -1.0, -1: 0.5}
-# Distance from a surface within which cells are refined, in units of the body's shortest half axis; lower limit of this
-# half axis, in units of the geometric mean of the three.
-_BAND, _MIN_AXIS_RATIO = 0.1, 0.6
+# Distance from a surface within which cells are refined, in units of the body's shortest half axis.
+_BAND = 0.1
+# Lower limit of the shortest half axis, in units of the geometric mean of the three.
+_MIN_AXIS_RATIO = 0.6
 # Distance from a surface, in widths of the blur, beyond which the covered share of a cell is less than 1e-8.
 _REACH = 20
 # Orthonormal basis of the symmetric matrices S of zero trace.

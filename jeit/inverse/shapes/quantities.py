@@ -32,9 +32,12 @@ _MEDIAN_LOG_CONTRAST, _LOG_CONTRAST_DEVIATION, _LOG_CONTRAST_BOUNDS = (
     1.2,
     (float(np.log(0.03)), float(np.log(4.5))),
 )
-# Maximum number of steps of the first fit; minimum and maximum of the first step along the logarithm of the contrast;
-# and the factor by which each step is longer than the last.
-_STEPS, _FIRST_STEP_LIMITS, _STEP_GROWTH = 8, (0.02, 0.35), 1.6
+# Maximum number of steps of the first fit.
+_STEPS = 8
+# Minimum and maximum of the first step along the logarithm of the contrast.
+_FIRST_STEP_LIMITS = (0.02, 0.35)
+# Factor by which each step along the logarithm of the contrast is longer than the last.
+_STEP_GROWTH = 1.6
 # By dimension of the mesh: maximum number of steps of each fit and its tolerance, and the drop of the log posterior at
 # which the exploration ends. A step of a fit in a solid takes a second.
 _FIT_LIMITS, _LOG_POSTERIOR_DROP = {2: (8, 1e-2), 3: (2, 5e-2)}, {2: 5.0, 3: 3.0}
@@ -43,9 +46,10 @@ _FIT_LIMITS, _LOG_POSTERIOR_DROP = {2: (8, 1e-2), 3: (2, 5e-2)}, {2: 5.0, 3: 3.0
 _OPEN_END_RISE = 1.0
 # Probabilities at the limits of an interval; numbers of contrasts and of normal deviates that sample the posterior.
 _INTERVAL_PROBABILITIES, _NUM_CONTRASTS, _NUM_NORMAL_DEVIATES = (0.16, 0.84), 240, 31
-# Probability that the circle about a centroid contains the true centroid; and the step of the finite differences of a
-# centroid, in standard deviations of a coefficient.
-_CENTROID_PROBABILITY, _CENTROID_STEP = 0.68, 0.1
+# Probability that the circle about a centroid contains the true centroid.
+_CENTROID_PROBABILITY = 0.68
+# Step of the finite differences of a centroid, in standard deviations of a coefficient.
+_CENTROID_STEP = 0.1
 # Standard deviation of a body's place due to an error of the fields, as a share of half the width of the domain times
 # the relative error: a body's voltages change by a factor of about e² over half the width, and a fifth of the error is
 # assumed to resemble a displacement.

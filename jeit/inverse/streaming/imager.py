@@ -34,8 +34,10 @@ from jeit_solvers.module import Module
 
 FRAME_STEPS = 4
 """Default maximum number of iterations per frame."""
-# Default tolerance of the solver; default minimum signal of a shape of the prior (see `Parametrisation.informative`).
-_RTOL, _MIN_SIGNAL = 1e-3, 0.03
+# Default tolerance of the solver.
+_RTOL = 1e-3
+# Default minimum signal of a shape of the prior (see `Parametrisation.informative`).
+_MIN_SIGNAL = 0.03
 # Ratio of the standard deviation assigned to masked channels to the largest noise. With a larger ratio, covariances of
 # combinations that only masked channels measure could not be inverted in double precision.
 _MASKED_NOISE_RATIO = 1e3

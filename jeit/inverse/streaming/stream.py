@@ -26,9 +26,10 @@ _LARGEST_DIFFERENCE = 0.5
 _SUSPECT_FACTOR, _MAX_REMAINING_SHARE, _MIN_DEAD_CHANGE = 0.15, 0.5, 0.5
 # Minimum number of channels with valid readings, as a fraction of the channels in use.
 _MIN_CHANNELS = 0.5
-# Minimum number of channels with equal readings, above or below all others, that count as saturated; relative
-# difference within which the undisturbed voltages of these channels count as equal.
-_MIN_SATURATED, _EQUAL_EXPECTED = 3, 1e-6
+# Minimum number of channels with equal readings, above or below all others, that count as saturated.
+_MIN_SATURATED = 3
+# Relative difference within which the undisturbed voltages of these channels count as equal.
+_EQUAL_EXPECTED = 1e-6
 # A frame differs from an undisturbed frame by more than noise if the correlation of the changes of reciprocal channels
 # exceeds that of independent noise. Threshold in standard deviations; minimum number of pairs; relative change below
 # which a frame counts as equal to an undisturbed frame.

@@ -27,9 +27,10 @@ from jeit.touch import (
 
 # Minimum number of frames of the reference from which the noise of images is estimated.
 _MIN_FRAMES = 10
-# Minimum difference in seconds of the times of successive frames in tracking, since frames may have equal times; time
-# in seconds for which the name of a gesture is shown on the image.
-_MIN_TIME_STEP, _LABEL_TIME = 1e-6, 1.5
+# Minimum difference in seconds of the times of successive frames in tracking, since frames may have equal times.
+_MIN_TIME_STEP = 1e-6
+# Time in seconds for which the name of a gesture is shown on the image.
+_LABEL_TIME = 1.5
 
 Item = TypeVar("Item")
 Output = TypeVar("Output")

@@ -19,10 +19,14 @@ from jeit.touch.networks import FrameDepth, ImageNetwork, resting_frame, stream_
 from jeit.touch.networks.linear_channels import depth_centroids
 from jeit.touch.simulate.contact.indent_sets import pixel_places
 
-# Radius that contains 68 % of an isotropic normal distribution of standard deviation 1; number of nodes of a mesh that
-# is only drawn; number of frames for which a label or key must last to be reported as an event; half the side in metres
-# of a skin of unknown size.
-_RADIUS_68, _NUM_NODES, _MIN_STEADY_FRAMES, _HALF_SIZE = float(np.sqrt(-2 * np.log(1 - 0.68))), 400, 2, 0.05
+# Radius that contains 68 % of an isotropic normal distribution of standard deviation 1.
+_RADIUS_68 = float(np.sqrt(-2 * np.log(1 - 0.68)))
+# Number of nodes of a mesh that is only drawn.
+_NUM_NODES = 400
+# Number of frames for which a label or key must last to be reported as an event.
+_MIN_STEADY_FRAMES = 2
+# Half the side in metres of a skin of unknown size.
+_HALF_SIZE = 0.05
 
 
 class LearntSkinView(AbstractView):

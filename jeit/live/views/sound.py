@@ -14,9 +14,10 @@ from jeit.inverse.streaming.stream import FrameStatus
 from jeit.live.pictures import AbstractView, LiveFrame, Marker, Picture, Scene
 from jeit.live.views.conductivity import mean_frame
 
-# Number of pixels along the longer side of the map; radius that contains 68 % of an isotropic normal distribution of
-# standard deviation 1.
-_NUM_PIXELS, _RADIUS_68 = 100, float(np.sqrt(-2 * np.log(1 - 0.68)))
+# Number of pixels along the longer side of the map.
+_NUM_PIXELS = 100
+# Radius that contains 68 % of an isotropic normal distribution of standard deviation 1.
+_RADIUS_68 = float(np.sqrt(-2 * np.log(1 - 0.68)))
 _LIKELIHOOD = "likelihood"
 
 

@@ -17,9 +17,12 @@ from jeit_solvers.module import Module
 
 # Minimum number of frames for estimating the standard deviation.
 _MIN_NUM_FRAMES = 10
-# For normal noise: ratio of the standard deviation to the median absolute value; number of standard deviations beyond
-# which cells are removed; ratio of the standard deviation of all cells to that of the remaining cells.
-_DEVIATION_PER_MEDIAN, _CLIPPING_DEVIATIONS, _CLIPPED_DEVIATION = 1.4826, 3.0, 1.0136
+# Ratio of the standard deviation of normal noise to its median absolute value.
+_DEVIATION_PER_MEDIAN = 1.4826
+# Number of standard deviations beyond which cells are removed.
+_CLIPPING_DEVIATIONS = 3.0
+# Ratio of the standard deviation of all cells to that of the cells that remain, for normal noise.
+_CLIPPED_DEVIATION = 1.0136
 # Maximum number of rounds of clipping.
 _MAX_ROUNDS = 20
 

@@ -88,9 +88,10 @@ class Reading:
 
 
 METHODS = ("auto", *GESTURE_CLASSIFIERS)
-# Maximum number of folds of the cross-validation of classifiers; fraction of held-out touches that are accepted as
-# similar to the training set.
-_MAX_FOLDS, _SIMILARITY_QUANTILE = 10, 0.99
+# Maximum number of folds of the cross-validation of classifiers.
+_MAX_FOLDS = 10
+# Fraction of held-out touches that are accepted as similar to the training set.
+_SIMILARITY_QUANTILE = 0.99
 # Number of touches whose distances from the training set are computed at once.
 _CHUNK_SIZE = 1000
 GESTURE_FILE = "gestures.skops"

@@ -165,9 +165,12 @@ def check_seconds(seconds: Float[np.ndarray, " F"], num_frames: int) -> Float[np
     return seconds
 
 
-# Minimum untouched time between two touches, seconds; minimum number of frames of a touch; tolerance for rounding of
-# times, seconds.
-_MIN_GAP, _MIN_TOUCH_FRAMES, _TIME_TOLERANCE = 0.1, 2, 1e-9
+# Minimum untouched time between two touches, seconds.
+_MIN_GAP = 0.1
+# Minimum number of frames of a touch.
+_MIN_TOUCH_FRAMES = 2
+# Tolerance for rounding of times, seconds.
+_TIME_TOLERANCE = 1e-9
 
 
 class StreamTouch(Module):

@@ -27,8 +27,10 @@ _MIN_GAP, _MIN_GAP_FRAMES, _SETTLING_TIME, _DRIFT_TIME_CONSTANT = 0.1, 2.5, 0.5,
 # Maximum fraction of the initial untouched frames that may exceed the touch level of the model.
 _MAX_FRACTION_ABOVE_LEVEL = 0.1
 # A change of the sign opposite to a touch shows that the skin was touched when its reference was recorded: minimum
-# ratio of this change to the touch level; minimum duration of this change, seconds.
-_MIN_OPPOSITE_RATIO, _MIN_OPPOSITE_TIME = 3.0, 0.5
+# ratio of this change to the touch level.
+_MIN_OPPOSITE_RATIO = 3.0
+# Minimum duration of an opposite change, seconds.
+_MIN_OPPOSITE_TIME = 0.5
 
 
 @dataclass(frozen=True)

@@ -18,31 +18,46 @@ from jeit.forward import ForwardModel
 from jeit.mesh import centroids
 from jeit.touch.health.local_change import LocalChange, finer_model
 
-# Starting points of the fit of a cut: number of directions; lengths divided by the skin's side; number of starting
-# points that are optimised; maximum number of steps of each optimisation.
-_NUM_DIRECTIONS, _RELATIVE_LENGTHS, _NUM_OPTIMISED_STARTS, _MAX_STEPS = 8, (0.08, 0.2), 2, 25
-# Added length across a cut, divided by the skin's side: maximum, for a cut through the whole depth; initial value in
-# the fit of a partial cut; minimum.
-_MAX_ADDED_LENGTH, _INITIAL_PARTIAL_LENGTH, _MIN_ADDED_LENGTH = 3.0, 0.02, 1e-4
+# Number of directions of the starting points of the fit of a cut.
+_NUM_DIRECTIONS = 8
+# Lengths of the starting points, divided by the skin's side.
+_RELATIVE_LENGTHS = (0.08, 0.2)
+# Number of starting points that are optimised.
+_NUM_OPTIMISED_STARTS = 2
+# Maximum number of steps of each optimisation.
+_MAX_STEPS = 25
+# Added length across a cut through the whole depth, divided by the skin's side; the maximum of the fit.
+_MAX_ADDED_LENGTH = 3.0
+# Initial added length in the fit of a partial cut, divided by the skin's side.
+_INITIAL_PARTIAL_LENGTH = 0.02
+# Minimum added length of the fit, divided by the skin's side.
+_MIN_ADDED_LENGTH = 1e-4
 # Radius of the region of refined mesh, and length of the mesh edges in the region, divided by the skin's side.
 _REFINED_RADIUS, _EDGE_LENGTH = 0.22, 0.0125
-# Half the width of the band of lost conductivity, in edges of the refined mesh; factor by which the band is narrower
-# beyond the ends of a path.
-_BAND_HALF_WIDTH, _END_NARROWING = 1.5, 2.0
+# Half the width of the band of lost conductivity, in edges of the refined mesh.
+_BAND_HALF_WIDTH = 1.5
+# Factor by which the band is narrower beyond the ends of a path.
+_END_NARROWING = 2.0
 # Spot of changed conductivity: initial and maximum radius, divided by the skin's side; extent, in radii; initial and
 # maximum depth, where depth is minus the logarithm of the fraction of conductivity that remains at the centre.
 _INITIAL_SPOT_RADIUS, _MAX_SPOT_RADIUS, _SPOT_EXTENT, _SPOT_DEPTHS, _MAX_SPOT_DEPTH = 0.05, 0.1, 3.0, (0.5, -0.5), 6.0
 # Initial offset of a bend from the middle of a straight path, divided by the length of the path.
 _BEND_OFFSET = 0.2
-# Maximum ratio of the misfit of a bent path to that of a straight path, for the bent path to be accepted; the same for
-# a partial cut and a cut through the whole depth.
-_MAX_BEND_RATIO, _MAX_PARTIAL_RATIO = 0.7, 0.4
-# Misfit below which a cut through the whole depth is certain; ratio of misfits above which the worse of the fits of a
-# complete and a partial cut is excluded; maximum standard deviation of an end of the path, in mesh edges.
-_CERTAIN_MISFIT, _DISTINCT_RATIO, _MAX_END_DEVIATION = 0.01, 4.0, 10.0
-# Model error, relative to a channel's change and to the root mean square of all changes; standard deviation of a
-# relative change common to all voltages.
-_MODEL_ERROR, _FACTOR_DEVIATION = 0.05, 0.1
+# Maximum ratio of the misfit of a bent path to that of a straight path, for the bent path to be accepted.
+_MAX_BEND_RATIO = 0.7
+# Maximum ratio of the misfit of a partial cut to that of a cut through the whole depth, for the partial cut to be
+# accepted.
+_MAX_PARTIAL_RATIO = 0.4
+# Misfit below which a cut through the whole depth is certain.
+_CERTAIN_MISFIT = 0.01
+# Ratio of misfits above which the worse of the fits of a complete and a partial cut is excluded.
+_DISTINCT_RATIO = 4.0
+# Maximum standard deviation of an end of the path, in mesh edges.
+_MAX_END_DEVIATION = 10.0
+# Model error, relative to a channel's change and to the root mean square of all changes.
+_MODEL_ERROR = 0.05
+# Standard deviation of a relative change common to all voltages.
+_FACTOR_DEVIATION = 0.1
 # Step of numerical derivatives with respect to places, divided by the skin's side.
 _DERIVATIVE_STEP = 1e-5
 

@@ -102,12 +102,15 @@ class HealthEvent(Module):
 # Minimum sharpness of a step: difference of the medians over a quarter of a window after and before the step, as a
 # fraction of the step; for a constant slope, it is a quarter.
 _MIN_SHARPNESS = 0.55
-# Fraction of a step that the median of each third of the frames after the step must exceed; fraction that the median of
-# no third of the frames before the step may exceed.
-_MIN_FRACTION_AFTER, _MAX_FRACTION_BEFORE = 0.5, 0.5
-# Fraction of a step below which the level of a frame counts as the level before the step; maximum fraction of frames on
-# one side of the step with the level of the other side, which touches of the opposite sign may cause.
-_BEFORE_LEVEL, _MAX_OUTLIER_FRACTION = 0.3, 0.1
+# Fraction of a step that the median of each third of the frames after the step must exceed.
+_MIN_FRACTION_AFTER = 0.5
+# Fraction of a step that the median of no third of the frames before the step may exceed.
+_MAX_FRACTION_BEFORE = 0.5
+# Fraction of a step below which the level of a frame counts as the level before the step.
+_BEFORE_LEVEL = 0.3
+# Maximum fraction of frames on one side of the step with the level of the other side, which touches of the opposite
+# sign may cause.
+_MAX_OUTLIER_FRACTION = 0.1
 # Exponent of the power mean over channels, large enough to detect a change of a single channel among many.
 _POWER_MEAN_EXPONENT = 4
 

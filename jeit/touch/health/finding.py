@@ -31,13 +31,18 @@ _PEAK_FRACTION = 0.5
 _MAX_MISFIT, _MAX_MISFIT_RATIO = 0.4, 0.6
 # Minimum distance of the fit's second starting point from the first, divided by the skin's side.
 _MIN_START_DISTANCE = 0.05
-# Maximum fraction of a change's energy (sum of squares over channels) that failing electrodes may leave unexplained;
-# minimum fraction of a failing electrode's channels that have changed; minimum change of a changed channel, divided by
-# its reading; maximum fraction of electrodes that may fail at once.
-_MAX_UNEXPLAINED, _MIN_CHANGED_FRACTION, _MIN_RELATIVE_CHANGE, _MAX_FAULTY_FRACTION = 0.1, 0.75, 0.12, 0.25
-# Maximum ratio of readings to reference readings for a torn wire; minimum ratio of noise to healthy noise for a loose
-# contact.
-_TORN_RATIO, _LOOSE_NOISE_RATIO = 0.2, 5.0
+# Maximum fraction of a change's energy (sum of squares over channels) that failing electrodes may leave unexplained.
+_MAX_UNEXPLAINED = 0.1
+# Minimum fraction of a failing electrode's channels that have changed.
+_MIN_CHANGED_FRACTION = 0.75
+# Minimum change of a changed channel, divided by its reading.
+_MIN_RELATIVE_CHANGE = 0.12
+# Maximum fraction of electrodes that may fail at once.
+_MAX_FAULTY_FRACTION = 0.25
+# Maximum ratio of readings to reference readings for a torn wire.
+_TORN_RATIO = 0.2
+# Minimum ratio of noise to healthy noise for a loose contact.
+_LOOSE_NOISE_RATIO = 5.0
 # Ratio of the standard deviation of a normal variable to the median magnitude of the difference of two independent
 # values.
 _DEVIATION_PER_MEDIAN_DIFFERENCE = 1.0484

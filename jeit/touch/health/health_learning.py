@@ -13,9 +13,12 @@ from jeit.data.description import Description
 from jeit.touch.gestures.touch_images import TouchImages
 from jeit.touch.health import SkinHealth
 
-# Minimum fraction of a frame's channels that have a reading; number of healthy frames below which drift is poorly
-# known; ratio of the readings of two recordings above which different units are suspected.
-_MIN_READ_FRACTION, _MIN_NUM_FRAMES, _MAX_UNIT_RATIO = 0.5, 250, 20.0
+# Minimum fraction of a frame's channels that have a reading.
+_MIN_READ_FRACTION = 0.5
+# Number of healthy frames below which drift is poorly known.
+_MIN_NUM_FRAMES = 250
+# Ratio of the readings of two recordings above which different units are suspected.
+_MAX_UNIT_RATIO = 20.0
 
 
 def learn_health(

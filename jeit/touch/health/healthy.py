@@ -16,12 +16,16 @@ from jaxtyping import Bool, Float
 
 from jeit.touch.health.event import change_size, channel_medians, lasting_step, window_change
 
-# Fraction of a window's changes, those of smallest magnitude, from which noise is estimated; minimum fraction of
-# changes that have readings.
-_SMALL_FRACTION, _MIN_READ_FRACTION = 0.5, 0.5
-# Limit of a variation measure: minimum, as a multiple of the usual value; multiple of the maximum among healthy
-# windows; increase of the second multiple, to be divided by the number of windows.
-_MIN_LIMIT_RATIO, _UNSTEADY_FACTOR, _UNSTEADY_INCREASE = 3.0, 2.0, 12.0
+# Fraction of a window's changes, those of smallest magnitude, from which noise is estimated.
+_SMALL_FRACTION = 0.5
+# Minimum fraction of changes that have readings.
+_MIN_READ_FRACTION = 0.5
+# Minimum limit of a variation measure, as a multiple of the usual value.
+_MIN_LIMIT_RATIO = 3.0
+# Limit of a variation measure, as a multiple of the maximum among healthy windows.
+_UNSTEADY_FACTOR = 2.0
+# Increase of `_UNSTEADY_FACTOR`, to be divided by the number of windows.
+_UNSTEADY_INCREASE = 12.0
 # Minimum fraction of steps in which a healthy channel changes; a channel that changes less often never counts as stuck.
 _MIN_MOVING_FRACTION = 0.6
 # Maximum fraction of channels that may be noisy or stuck at once.
@@ -140,36 +144,51 @@ def _usual_variation(measures: Float[np.ndarray, "n 2 M"], noise: Float[np.ndarr
     )
 
 
-# Maximum number of steps of a window (with more frames, several frames are averaged to a step); minimum number of
-# steps; minimum number of windows of a healthy recording.
-_MAX_WINDOW_STEPS, _MIN_WINDOW_STEPS, _MIN_NUM_WINDOWS = 48, 5, 8
+# Maximum number of steps of a window (with more frames, several frames are averaged to a step).
+_MAX_WINDOW_STEPS = 48
+# Minimum number of steps of a window.
+_MIN_WINDOW_STEPS = 5
+# Minimum number of windows of a healthy recording.
+_MIN_NUM_WINDOWS = 8
 # Minimum and maximum length of windows, in frames, for a healthy recording without a quiet interval.
 _MIN_WINDOW_FRAMES, _MAX_WINDOW_FRAMES = 12, 64
-# Default length of a window: the length as a multiple of the longest touch; its minimum as a fraction of the recording.
-_WINDOW_PER_TOUCH, _MIN_WINDOW_FRACTION = 3.0, 1 / 40
-# Limit of a change between windows: multiple of the maximum among healthy windows; minimum, in standard deviations of
-# healthy changes; increase of the multiple, to be divided by the number of windows.
-_CHANGE_FACTOR, _MIN_CHANGE_SIZE, _CHANGE_INCREASE = 2.0, 4.0, 20.0
-# Factor by which windows may be shorter than touches require; if windows are even shorter, touches appear to last, and
-# limits of changes are multiplied by the second factor.
-_SHORT_WINDOW_FACTOR, _BRIEF_LIMIT_FACTOR = 1.5, 2.0
+# Default length of a window, as a multiple of the longest touch.
+_WINDOW_PER_TOUCH = 3.0
+# Minimum of the default length of a window, as a fraction of the recording.
+_MIN_WINDOW_FRACTION = 1 / 40
+# Limit of a change between windows, as a multiple of the maximum among healthy windows.
+_CHANGE_FACTOR = 2.0
+# Minimum limit of a change between windows, in standard deviations of healthy changes.
+_MIN_CHANGE_SIZE = 4.0
+# Increase of `_CHANGE_FACTOR`, to be divided by the number of windows.
+_CHANGE_INCREASE = 20.0
+# Factor by which windows may be shorter than touches require.
+_SHORT_WINDOW_FACTOR = 1.5
+# Factor on the limits of changes if windows are even shorter, because touches then appear to last.
+_BRIEF_LIMIT_FACTOR = 2.0
 # Minimum fraction of a lasting step of the voltages that remains one window later.
 _MIN_REMAINING_FRACTION = 0.4
 # Limit of the change of voltages from the healthy recording to another recording, as a multiple of the maximum between
 # healthy windows.
 _LEVEL_FACTOR = 3.0
-# Minimum ratio of the change in a touched frame to the change in quiet frames; quantile of the changes of all frames
-# that estimates the change in quiet frames.
-_MIN_TOUCH_RATIO, _QUIET_QUANTILE = 3.0, 0.3
-# Maximum number of principal directions of touches; fraction of the touches' energy that the directions explain.
-_MAX_NUM_DIRECTIONS, _EXPLAINED_FRACTION = 40, 0.98
+# Minimum ratio of the change in a touched frame to the change in quiet frames.
+_MIN_TOUCH_RATIO = 3.0
+# Quantile of the changes of all frames that estimates the change in quiet frames.
+_QUIET_QUANTILE = 0.3
+# Maximum number of principal directions of touches.
+_MAX_NUM_DIRECTIONS = 40
+# Fraction of the touches' energy that the directions explain.
+_EXPLAINED_FRACTION = 0.98
 # A change is unlike touches if its fraction of energy outside of the directions of touches exceeds this quantile over
-# healthy touches; minimum energy of the healthy touches, relative to that of a strong touch.
-_OUTSIDE_QUANTILE, _MIN_STRONG_ENERGY = 0.99, 0.2
+# healthy touches.
+_OUTSIDE_QUANTILE = 0.99
+# Minimum energy of the healthy touches, relative to that of a strong touch.
+_MIN_STRONG_ENERGY = 0.2
 _MIN_NUM_FRAMES = 20
-# Fraction of the changes from frame to frame, those of smallest magnitude, that touches do not affect; mean magnitude
-# of the same fraction of the values of a standard normal variable.
-_UNTOUCHED_FRACTION, _NORMAL_MEAN_MAGNITUDE = 0.8, 0.5586
+# Fraction of the changes from frame to frame, those of smallest magnitude, that touches do not affect.
+_UNTOUCHED_FRACTION = 0.8
+# Mean magnitude of this fraction of the values of a standard normal variable, those of smallest magnitude.
+_NORMAL_MEAN_MAGNITUDE = 0.5586
 # Ratio of the standard deviation of a normal variable to its mean magnitude.
 _DEVIATION_PER_MEAN_MAGNITUDE = float(np.sqrt(np.pi / 2))
 

@@ -27,18 +27,22 @@ from jeit.touch.health.event import (
 from jeit.touch.health.finding import Finding, ImagedSkin, LastingChange, classify_change
 from jeit.touch.health.healthy import HealthyState, average_frames
 
-# Patience, a time longer than any touch is held: in seconds; as a number of windows for frames without times.
-PATIENCE, _PATIENCE_WINDOWS = 30.0, 3
+# Patience, a time longer than any touch is held, in seconds.
+PATIENCE = 30.0
+# Patience as a number of windows, for frames without times.
+_PATIENCE_WINDOWS = 3
 # Ratio of the patience to the length of a window of frames.
 _PATIENCE_PER_WINDOW = 3.0
 # Weight of the latest window in the update of the reference, every quarter of a window.
 _REFERENCE_WEIGHT = 0.1
-# Fraction of a change that must have disappeared for the change to count as gone; minimum fraction of channels with a
-# reading, below which a frame is refused.
-_MIN_DISAPPEARED_FRACTION, _MIN_READ_FRACTION = 0.6, 0.5
-# Multiple of the span of healthy changes beyond which a channel is faulty; maximum fraction of channels that may be
-# beyond this multiple at once.
-_SPAN_FACTOR, _MAX_OUTLIER_FRACTION = 3.0, 0.34
+# Fraction of a change that must have disappeared for the change to count as gone.
+_MIN_DISAPPEARED_FRACTION = 0.6
+# Minimum fraction of channels with a reading, below which a frame is refused.
+_MIN_READ_FRACTION = 0.5
+# Multiple of the span of healthy changes beyond which a channel is faulty.
+_SPAN_FACTOR = 3.0
+# Maximum fraction of channels that may be beyond this multiple of the span at once.
+_MAX_OUTLIER_FRACTION = 0.34
 
 # Appended to the reason of an event that is detected in the first window of frames.
 _FIRST_WINDOW_NOTE = (

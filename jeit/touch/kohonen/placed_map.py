@@ -249,9 +249,10 @@ def _fit_combination_shares(
     return shares[..., 0] + (1 - shares.sum(axis=1)) / num_neurons, residuals
 
 
-# Number of iterations of the spring layout; minimum distance between the frames of neighbours, relative to the median,
-# in the strength of a spring.
-_NUM_ITERATIONS, _MIN_RELATIVE_DISTANCE = 60, 1e-2
+# Number of iterations of the spring layout.
+_NUM_ITERATIONS = 60
+# Minimum distance between the frames of neighbours, relative to the median, in the strength of a spring.
+_MIN_RELATIVE_DISTANCE = 1e-2
 
 
 def drawn_map(learnt: SelfOrganisingMap, key: Array) -> Float[np.ndarray, "R C 2"]:

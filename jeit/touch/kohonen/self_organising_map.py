@@ -25,8 +25,10 @@ _INITIAL_DEVIATION = 1e-3
 _WINNER_ONLY_RADIUS = 0.01
 # Number of frames whose distances to all neurons are computed at once.
 _CHUNK_SIZE = 1024
-# For trustworthiness: maximum number of frames of which all pairs are compared; number of neighbours of each frame.
-_MAX_COMPARED_FRAMES, _NUM_NEIGHBOURS = 2000, 12
+# Maximum number of frames of which all pairs are compared to compute the trustworthiness of a map.
+_MAX_COMPARED_FRAMES = 2000
+# Number of neighbours of each frame, for the trustworthiness of a map.
+_NUM_NEIGHBOURS = 12
 
 
 @dataclass(frozen=True)

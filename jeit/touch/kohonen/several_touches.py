@@ -11,12 +11,15 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind, describe, is_number, real_array
 from jeit.touch.kohonen.placed_map import PlacedMap
 
-# Minimum strength of a touch, relative to the strongest touch; minimum distance between touches, relative to the extent
-# of the places of a map's neurons.
-_MIN_STRENGTH, _RELATIVE_SEPARATION = 0.08, 0.1
-# Minimum decrease of the residual sum of squares by each further touch, divided by the residual variance of a channel;
-# maximum number of touches in a frame.
-_MIN_RESIDUAL_DECREASE, _MAX_TOUCHES = 25.0, 6
+# Minimum strength of a touch, relative to the strongest touch.
+_MIN_STRENGTH = 0.08
+# Minimum distance between touches, relative to the extent of the places of a map's neurons.
+_RELATIVE_SEPARATION = 0.1
+# Minimum decrease of the residual sum of squares by each further touch, divided by the residual variance of a
+# channel.
+_MIN_RESIDUAL_DECREASE = 25.0
+# Maximum number of touches in a frame.
+_MAX_TOUCHES = 6
 
 
 @dataclass(frozen=True)

@@ -65,9 +65,12 @@ class Neighbourhood:
         return KDTree(self.scores)
 
 
-# Fraction of the variance of the channels that patterns leave to noise; maximum number of patterns; number of presses
-# required for each pattern.
-_NOISE_VARIANCE_FRACTION, _MAX_PATTERNS, _PRESSES_PER_PATTERN = 1e-3, 60, 4
+# Fraction of the variance of the channels that patterns leave to noise.
+_NOISE_VARIANCE_FRACTION = 1e-3
+# Maximum number of patterns.
+_MAX_PATTERNS = 60
+# Number of presses required for each pattern.
+_PRESSES_PER_PATTERN = 4
 # A channel is dead if its residual exceeds this factor times this quantile of the residuals of training presses.
 _RESIDUAL_FACTOR, _RESIDUAL_QUANTILE = 2.0, 0.999
 # Maximum distance of a working channel's reading from the range of its training readings, relative to the width of the

@@ -18,9 +18,10 @@ from jeit.mesh import centroids, measures
 from jeit.touch.learnt.extras import apply_in_parts
 from jeit_solvers.engines import as_array
 
-# A contact is the region of an image above this fraction of its peak, among the cells nearest to the peak; fraction of
-# all cells that count as nearest.
-_CONTACT_LEVEL, _NEIGHBOUR_FRACTION = 0.7, 0.2
+# A contact is the region of an image above this fraction of its peak, among the cells nearest to the peak.
+_CONTACT_LEVEL = 0.7
+# Fraction of all cells that count as nearest to a peak.
+_NEIGHBOUR_FRACTION = 0.2
 # Weight of each feature of the contact among image features, relative to one cell of the image.
 _CONTACT_WEIGHT = 3.0
 _CHUNK_SIZE = 128
@@ -196,8 +197,10 @@ def _group_equal_rows(targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return group.ravel(), count
 
 
-# Maximum number of principal components; number of presses required for each component.
-_MAX_COMPONENTS, _PRESSES_PER_COMPONENT = 60, 3
+# Maximum number of principal components.
+_MAX_COMPONENTS = 60
+# Number of presses required for each component.
+_PRESSES_PER_COMPONENT = 3
 
 
 def _divide_by_unit(changes, reference, unit):

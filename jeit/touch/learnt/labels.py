@@ -125,8 +125,10 @@ def _hold_out(method, form, forms: Forms, changes, reference, true_classes, fold
 _INVERSE_PENALTIES = (1e-3, 1e-2, 1e-1, 1.0)
 _KEY_FORMS = ("differences", "compressed")
 # Number of channels that the discriminant and the trees use for a key, selected for the best separation of the key's
-# presses from other presses; number of trees.
-_NUM_SELECTED_CHANNELS, _NUM_TREES = 200, 150
+# presses from other presses.
+_NUM_SELECTED_CHANNELS = 200
+# Number of trees.
+_NUM_TREES = 150
 _TREE_OPTIONS: dict[str, Any] = {"max_features": 0.3, "min_samples_leaf": 2, "random_state": 0}
 
 

@@ -39,9 +39,11 @@ from jeit.touch.learnt.presses import (
 # fraction of alive channels.
 _MAX_NOVELTY, _MIN_ALIVE = 2.0, 0.66
 _CHUNK_SIZE = 256
-# To propagate errors of readings to predictions: number of principal directions of the error of readings predicted for
-# dead channels; number of random draws of errors of all readings.
-_MAX_ERROR_DIRECTIONS, _NUM_DRAWS = 4, 4
+# Number of principal directions of the error of readings that are predicted for dead channels. These errors are
+# propagated to predictions.
+_MAX_ERROR_DIRECTIONS = 4
+# Number of random draws of the errors of all readings, which are propagated to predictions.
+_NUM_DRAWS = 4
 # Minimum number of touched frames for the detection of stuck channels.
 _MIN_TOUCHED_FRAMES = 20
 # Minimum cosine similarity of a reference frame to that of the training set; maximum ratio of their norms. A reference

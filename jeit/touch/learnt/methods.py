@@ -171,12 +171,14 @@ QUICK_METHODS = ("ridge", "neighbours")
 CHANNEL_METHODS = ("forest",)
 
 
-# For the ensembles of classifiers of Russo et al. (2017): number of members; maximum number of leaves of a boosted
-# tree.
-_NUM_MEMBERS, _MAX_LEAVES = 30, 21
-# Shrinkage of class covariances if a class has fewer presses than twice the number of features; minimum variance of a
-# class along a principal axis, relative to the maximum.
-_SHRINKAGE, _MIN_VARIANCE_RATIO = 0.1, 1e-4
+# Number of members of the ensembles of classifiers of Russo et al. (2017).
+_NUM_MEMBERS = 30
+# Maximum number of leaves of a boosted tree in these ensembles.
+_MAX_LEAVES = 21
+# Shrinkage of class covariances if a class has fewer presses than twice the number of features.
+_SHRINKAGE = 0.1
+# Minimum variance of a class along a principal axis, relative to the maximum.
+_MIN_VARIANCE_RATIO = 1e-4
 
 
 def fit_decision_tree(features, label) -> Any:

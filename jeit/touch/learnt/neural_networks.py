@@ -25,9 +25,12 @@ _FRAME_FEATURE_NOISE = 0.1
 _COURSE_HIDDEN_SIZE, _DENSE_SIZE, _KERNEL_SIZE = 24, 32, 5
 _NUM_NETWORKS, _NUM_COURSE_EPOCHS = 2, 45
 _COURSE_LEARNING_RATE, _COURSE_WEIGHT_DECAY = 3e-3, 2e-2
-# Standard deviation of the noise added to features in each batch, in the features' unit; amount of label smoothing;
-# dropout rate of the inputs of the dense layer.
-_COURSE_FEATURE_NOISE, _LABEL_SMOOTHING, _DROPOUT_RATE = 0.15, 0.05, 0.2
+# Standard deviation of the noise added to features in each batch, in the features' unit.
+_COURSE_FEATURE_NOISE = 0.15
+# Amount of label smoothing.
+_LABEL_SMOOTHING = 0.05
+# Dropout rate of the inputs of the dense layer.
+_DROPOUT_RATE = 0.2
 
 
 @dataclass(frozen=True)

@@ -123,9 +123,10 @@ def _calibration_factor(ratios: np.ndarray) -> float:
 
 BLEND = "blend"
 METHODS = ("auto", *REGRESSORS, BLEND)
-# Maximum number of methods in a blend, which averages their predictions; maximum error of a chosen blend, relative to
-# the error of the best single method.
-_MAX_BLENDED_METHODS, _MAX_BLEND_ERROR_RATIO = 3, 0.98
+# Maximum number of methods in a blend, which averages their predictions.
+_MAX_BLENDED_METHODS = 3
+# Maximum error of a chosen blend, relative to the error of the best single method.
+_MAX_BLEND_ERROR_RATIO = 0.98
 
 
 @dataclass(frozen=True)

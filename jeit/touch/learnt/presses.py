@@ -358,9 +358,12 @@ def _one_dimensional(name: str, values: ArrayLike) -> np.ndarray:
     return flat_values
 
 
-# Maximum lag of frames, in rows; number of similar frames whose places are averaged; number of principal components by
-# which frames are compared.
-_MAX_LAG, _NUM_NEIGHBOURS, _NUM_COMPONENTS = 2, 8, 12
+# Maximum lag of frames, in rows.
+_MAX_LAG = 2
+# Number of similar frames whose places are averaged.
+_NUM_NEIGHBOURS = 8
+# Number of principal components by which frames are compared.
+_NUM_COMPONENTS = 12
 # A lag is clear under three conditions: the mean error of places estimated with the lag is below this fraction of the
 # error of guessing the mean place; the mean error without lag is above this fraction; and with any other lag, the mean
 # error is larger by more than this number of standard errors.

@@ -30,13 +30,18 @@ from jeit.touch.listening.modality_network import (
 from jeit.touch.listening.window_features import Levels, sound_features, spectrum_features
 from jeit.touch.training import TrainingPlan
 
-# Boosted trees: number of rounds; number of leaves of a tree; minimum number of windows in a leaf in large sets.
-_NUM_ROUNDS, _NUM_LEAVES, _MIN_LEAF_WINDOWS = 100, 15, 10
+# Number of rounds in which trees are boosted.
+_NUM_ROUNDS = 100
+# Number of leaves of a boosted tree.
+_NUM_LEAVES = 15
+# Minimum number of windows in a leaf of a boosted tree, in large training sets.
+_MIN_LEAF_WINDOWS = 10
 BATCHES = 1500
 """Default of the maximum number of training batches."""
-# Limits for small training sets: maximum number of passes through the windows; number of batches that are allowed even
-# if they require more passes.
-_MAX_PASSES, _MIN_BATCHES = 40, 100
+# Maximum number of passes through the windows of a small training set.
+_MAX_PASSES = 40
+# Number of batches that are allowed even if they require more passes.
+_MIN_BATCHES = 100
 # One in this number of groups of clips of each class is held out for early stopping of the network's training.
 _STOPPING_RATIO = 6
 

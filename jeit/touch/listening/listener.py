@@ -28,12 +28,14 @@ METHODS = ("auto", *LEARNERS)
 # Methods that "auto" tries. The network with the training schedule of the paper is left out, since the schedule of this
 # library gives an equally good network in fewer batches.
 _AUTO_METHODS = tuple(name for name in LEARNERS if name != "paper-network")
-# Maximum number of folds in which clips are held out; power below which a window counts as quiet, relative to the power
-# of the quietest training window.
-_MAX_FOLDS, _QUIET_RATIO = 3, 0.25
-# Minimum ratio of a recording's loudness to that of the softest training clip that is attributed to a lower gain;
-# minimum number of windows for which a network is tried.
-_MIN_GAIN, _MIN_NETWORK_WINDOWS = 1 / 16, 3000
+# Maximum number of folds in which clips are held out.
+_MAX_FOLDS = 3
+# Power below which a window counts as quiet, relative to the power of the quietest training window.
+_QUIET_RATIO = 0.25
+# Minimum ratio of a recording's loudness to that of the softest training clip that is attributed to a lower gain.
+_MIN_GAIN = 1 / 16
+# Minimum number of windows for which a network is tried.
+_MIN_NETWORK_WINDOWS = 3000
 # Number of samples within which the readings of a working microphone change.
 _MAX_CHECKED_SAMPLES = 100_000
 _KIND, _VERSION = "a jeit listener", 2

@@ -28,9 +28,10 @@ from jeit_solvers.module import Module
 
 # Sizes of the kernels and of the pools in pixels, and numbers of channels, of the first and second layer.
 _KERNEL_SIZES, _POOL_SIZES, _NUM_CHANNELS = (5, 3), (3, 2), (32, 64)
-# Weight of the mean and variance of a batch in the update of the running mean and variance; constant added to
-# variances.
-_RUNNING_WEIGHT, _VARIANCE_FLOOR = 0.05, 1e-5
+# Weight of the mean and variance of a batch in the update of the running mean and variance.
+_RUNNING_WEIGHT = 0.05
+# Constant added to variances.
+_VARIANCE_FLOOR = 1e-5
 NOISE_DEVIATION, NUM_COPIES = 0.2, 5
 """Standard deviation of the normal noise added to images, whose own standard deviation is 1; number of noisy copies of
 each image in an epoch, as in the paper."""

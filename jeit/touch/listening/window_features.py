@@ -10,8 +10,10 @@ from jaxtyping import Float
 
 from jeit.touch.listening.feature_images import FRAME_INTERVAL, NUM_BANDS, NUM_FRAMES, SoundImages
 
-# Range of levels below the loudest level, decibels; quantile of the powers that counts as the loudest.
-_LEVEL_RANGE, _LOUDEST_QUANTILE = 60.0, 0.999
+# Range of levels below the loudest level, decibels.
+_LEVEL_RANGE = 60.0
+# Quantile of the powers that counts as the loudest.
+_LOUDEST_QUANTILE = 0.999
 
 
 @dataclass(frozen=True)
@@ -68,9 +70,12 @@ def _to_decibels(power, min_level: float) -> np.ndarray:
 
 # Minimum prominence of a peak of the loudness, decibels.
 _MIN_PROMINENCE = 6.0
-# Number of bands of the mean spectrum; number of bands whose decay is measured; number of frames after the loudest
-# frame over which the decay is measured.
-_NUM_SPECTRUM_BANDS, _NUM_DECAY_BANDS, _NUM_DECAY_FRAMES = 16, 4, 8
+# Number of bands of the mean spectrum.
+_NUM_SPECTRUM_BANDS = 16
+# Number of bands whose decay is measured.
+_NUM_DECAY_BANDS = 4
+# Number of frames after the loudest frame over which the decay is measured.
+_NUM_DECAY_FRAMES = 8
 _NUM_MODULATIONS = 8
 
 

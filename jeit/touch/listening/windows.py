@@ -62,9 +62,10 @@ MIN_RELATIVE_LOUDNESS = 0.01
 _MAX_PIECE_WINDOWS = 40
 # Duration beyond which a clip is cut into pieces; duration of the pieces of an uninterrupted sound; seconds.
 _MAX_CLIP_DURATION, _PIECE_DURATION = 4.0, 2.0
-# Maximum number of pieces of one clip; maximum number of groups of pieces that are held out in turn, if a class has
-# clips of one group only.
-_MAX_PIECES, _MAX_PIECE_GROUPS = 60, 6
+# Maximum number of pieces of one clip.
+_MAX_PIECES = 60
+# Maximum number of groups of pieces that are held out in turn, if a class has clips of one group only.
+_MAX_PIECE_GROUPS = 6
 
 
 @dataclass(frozen=True)

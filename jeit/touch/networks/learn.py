@@ -318,8 +318,12 @@ SHAPE = (48, 48)
 # Number of simulated touches of a chunk; seed offsets of the training, held-out and test sets. No choice depends on the
 # test set.
 _CHUNK_SIZE, _SEED_OFFSETS = 250, (0, 1, 2)
-# Evaluation with a ball: diameter, metres; depth, divided by the skin's thickness; number of places along a side.
-_BALL_DIAMETER, _BALL_DEPTH, _PLACES_PER_SIDE = 0.015, 0.75, 15
+# Diameter of the ball with which a network is evaluated, metres.
+_BALL_DIAMETER = 0.015
+# Depth to which the ball is pressed, divided by the skin's thickness.
+_BALL_DEPTH = 0.75
+# Number of places along a side at which the ball is pressed.
+_PLACES_PER_SIDE = 15
 
 
 @dataclass(frozen=True)

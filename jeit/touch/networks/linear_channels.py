@@ -65,9 +65,12 @@ def error_statistics(
 DEPTHS = (0.1, 0.8)
 # Maximum number of bodies that touch the skin at once.
 _MAX_BODIES = 3
-# Limit of detection of Park et al., newtons, for a ball of 15 mm diameter; the voltage change at this limit, in
-# standard deviations of the noise; number of places along a side at which the change is computed.
-_DETECTION_LIMIT, _DETECTION_DEVIATIONS, _PLACES_PER_SIDE = 0.7, 3.0, 15
+# Limit of detection of Park et al., newtons, for a ball of 15 mm diameter.
+_DETECTION_LIMIT = 0.7
+# Voltage change at the limit of detection, in standard deviations of the noise.
+_DETECTION_DEVIATIONS = 3.0
+# Number of places along a side at which the voltage change is computed.
+_PLACES_PER_SIDE = 15
 # Minimum distance of a touch's centre from the skin's edge, divided by the skin's shorter side.
 _EDGE_MARGIN = 0.04
 

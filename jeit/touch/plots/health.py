@@ -113,8 +113,10 @@ def _draw_cut(ax: Axes, event: HealthEvent) -> None:
     )
 
 
-# Maximum number of events with labels; minimum upper end of the y axis, as a multiple of the limit of damage.
-_MAX_LABELS, _MIN_AXIS_LIMIT = 12, 1.5
+# Maximum number of events with labels.
+_MAX_LABELS = 12
+# Minimum upper end of the y axis, as a multiple of the limit of damage.
+_MIN_AXIS_LIMIT = 1.5
 
 
 def plot_health_course(

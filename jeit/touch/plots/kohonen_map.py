@@ -22,8 +22,10 @@ from jeit.plot.axes import (
 )
 from jeit.touch.kohonen import MapTouch
 
-# Area of a neuron's marker, points², in a map of the reference size; number of neurons of a map of this size.
-_MARKER_AREA, _REFERENCE_NEURONS = 26.0, 1024
+# Area of a neuron's marker, points², in a map of the reference size.
+_MARKER_AREA = 26.0
+# Number of neurons of the map of the reference size.
+_REFERENCE_NEURONS = 1024
 
 
 def plot_map(

@@ -30,10 +30,14 @@ from jeit.touch.gestures.touch_watch import NamedTouch
 from jeit.touch.listening import SoundLabels
 from jeit.touch.listening.feature_images import WINDOW_INTERVAL
 
-# Minimum gap between frames at which a curve is interrupted, as a multiple of the median interval; maximum number of
-# points of a curve; minimum length of a touch's bar, as a share of the whole time; maximum number of touches with
-# numbers.
-_MIN_GAP_RATIO, _MAX_POINTS, _MIN_BAR_SHARE, _MAX_NUMBERED = 10.0, 3000, 0.003, 60
+# Minimum gap between frames at which a curve is interrupted, as a multiple of the median interval.
+_MIN_GAP_RATIO = 10.0
+# Maximum number of points of a curve.
+_MAX_POINTS = 3000
+# Minimum length of a touch's bar, as a share of the whole time.
+_MIN_BAR_SHARE = 0.003
+# Maximum number of touches with numbers.
+_MAX_NUMBERED = 60
 _UNLIKE_COLOUR = "#b9bdc4"
 
 

@@ -21,8 +21,10 @@ from jeit.arguments.extras import need_extra
 from jeit.touch.training.batches import ArrayRows, BatchOrder
 from jeit.touch.training.model_file import Checkpoint, Course, State
 
-# Number of training batches after which a checkpoint may be written; maximum number of held-out rows evaluated at once.
-_CHECKPOINT_BATCHES, _MAX_BATCH_SIZE = 32, 256
+# Number of training batches after which a checkpoint may be written.
+_CHECKPOINT_BATCHES = 32
+# Maximum number of held-out rows evaluated at once.
+_MAX_BATCH_SIZE = 256
 
 
 class TrainingObjective(NamedTuple):

@@ -21,9 +21,10 @@ from jaxtyping import Array, Float
 
 from jeit_solvers.engines import undifferentiated
 
-# Relative tolerance of the linear system, and maximum number of conjugate-gradient steps; with a good preconditioner
-# about a dozen steps are taken.
-_TOLERANCE, _MAX_STEPS = 1e-11, 500
+# Relative tolerance of the linear system.
+_TOLERANCE = 1e-11
+# Maximum number of conjugate-gradient steps; with a good preconditioner about a dozen are taken.
+_MAX_STEPS = 500
 # The Newton step to the minimum is the last if its length, measured as the square root of the decrease of the cost, is
 # below the first value, because the remaining error is of the order of the squared length. The second value is the
 # maximum number of Newton steps.

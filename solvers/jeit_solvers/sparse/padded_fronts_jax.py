@@ -23,9 +23,10 @@ from jeit_solvers.module import Module
 from jeit_solvers.sparse.index_store import IndexLayout
 from jeit_solvers.sparse.padded_fronts import FactorisationPlan, Stage
 
-# Minimum number of entries in the fronts of a stage for which threads are used; and number of entries in the fronts
-# that are updated together.
-_MIN_PARALLEL_ENTRIES, _UPDATED_ENTRIES = 200_000, 100_000
+# Minimum number of entries in the fronts of a stage for which threads are used.
+_MIN_PARALLEL_ENTRIES = 200_000
+# Number of entries in the fronts that are updated together.
+_UPDATED_ENTRIES = 100_000
 
 
 class Factor(Module):

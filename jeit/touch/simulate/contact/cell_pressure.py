@@ -15,9 +15,12 @@ from jeit.touch.simulate.contact.indenters import DiscIndenter
 from jeit.touch.simulate.contact.press import AbstractSupport, Press
 from jeit.touch.simulate.contact.samples import Samples
 
-# Fineness of the finer lattice of samples for contacts on few samples; number of samples below which this lattice is
-# used; width that it resolves, as a share of the radius of a cell.
-_FINE_LATTICE, _MIN_NUM_SAMPLES, _RESOLVED_FRACTION = 11, 6, 1 / 6
+# Fineness of the finer lattice of samples for contacts on few samples.
+_FINE_LATTICE = 11
+# Number of samples below which the finer lattice is used.
+_MIN_NUM_SAMPLES = 6
+# Width that the finer lattice resolves, as a share of the radius of a cell.
+_RESOLVED_FRACTION = 1 / 6
 # Number of presses computed at once, so that the arrays fit in the cache.
 _PRESSES_AT_ONCE = 16
 # Factor by which the reach of a contact grows if about half its area is off the skin; 2^(1/4) for a ball on a Winkler

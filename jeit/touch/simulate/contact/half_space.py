@@ -27,11 +27,14 @@ from jeit.touch.simulate.contact.press import (
 
 # Number of pixels along a side of the raster on which the contact area is located.
 _NUM_COARSE_PIXELS = 24
-# Minimum fraction of the load of a contact that must lie on the skin, so that the load determines the pressure;
-# fraction of the load carried by sample points above which this minimum is not checked.
-_MIN_LOAD_FRACTION, _CHECKED_LOAD_FRACTION = 0.2, 0.5
-# Share of the load that a step moves between pixels, below which the iteration stops; maximum number of steps.
-_TOLERANCE, _MAX_STEPS = 1e-8, 2000
+# Minimum fraction of the load of a contact that must lie on the skin, so that the load determines the pressure.
+_MIN_LOAD_FRACTION = 0.2
+# Fraction of the load carried by sample points above which `_MIN_LOAD_FRACTION` is not checked.
+_CHECKED_LOAD_FRACTION = 0.5
+# Share of the load that a step moves between pixels, below which the iteration stops.
+_TOLERANCE = 1e-8
+# Maximum number of steps of the iteration.
+_MAX_STEPS = 2000
 
 
 class HalfSpace(AbstractSupport):

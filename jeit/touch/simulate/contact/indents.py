@@ -124,9 +124,10 @@ class PressDraws(Module):
         return np.asarray(self.outline.signed_distance(places)) >= self.margin
 
 
-# Fineness of the lattice of samples in each cell, see `lattice`; minimum fraction of the conductivity of a sheet that
-# remains where it is indented through its whole thickness.
-_LATTICE_FINENESS, _MIN_CONDUCTIVITY_RATIO = 2, 1e-3
+# Fineness of the lattice of samples in each cell, see `lattice`.
+_LATTICE_FINENESS = 2
+# Minimum fraction of the conductivity of a sheet that remains where it is indented through its whole thickness.
+_MIN_CONDUCTIVITY_RATIO = 1e-3
 # Minimum divisor of relative changes of voltages, as a fraction of the maximum voltage.
 _MIN_RELATIVE_DIVISOR = 1e-3
 

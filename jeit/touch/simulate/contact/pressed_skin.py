@@ -115,9 +115,13 @@ def _creep_branches(material: Material) -> tuple[np.ndarray, np.ndarray]:
     return pairs[:, :1], pairs[:, 1:]
 
 
-# Number of touches processed at once; limits between groups of touches, in numbers of cells; ratio of the extent of a
-# touch to the square root of its area above which the touch is assumed to consist of separate contacts.
-_TOUCHES_AT_ONCE, _GROUP_NUM_CELLS, _MIN_SEPARATION = 1024, (128, 512, 2048), 3.0
+# Number of touches processed at once.
+_TOUCHES_AT_ONCE = 1024
+# Limits between groups of touches, in numbers of cells.
+_GROUP_NUM_CELLS = (128, 512, 2048)
+# Ratio of the extent of a touch to the square root of its area above which the touch is assumed to consist of
+# separate contacts.
+_MIN_SEPARATION = 3.0
 # Changes below this share of the maximum change of a touch are neglected.
 _MIN_RELATIVE_CHANGE = 1e-6
 

@@ -19,12 +19,16 @@ from jeit_solvers.module import Module
 
 FaultKind = Literal["dead", "loose", "torn"]
 FAULTS: tuple[FaultKind, ...] = ("dead", "loose", "torn")
-# Factor by which the contact impedance of a dead electrode is multiplied; limit of the current source's voltage,
-# relative to its maximum for the skin at rest.
-_DEAD_CONTACT_FACTOR, _MAX_VOLTAGE_RATIO = 1e7, 5.0
-# Minimum and maximum factor by which the impedance of a loose contact is multiplied; time constant of the fluctuations
-# of this factor's logarithm, in seconds; number of levels of the factor for which voltages are solved.
-_LOOSE_CONTACT_FACTORS, _FLUCTUATION_TIME, _NUM_LEVELS = (10.0, 1000.0), 0.5, 7
+# Factor by which the contact impedance of a dead electrode is multiplied.
+_DEAD_CONTACT_FACTOR = 1e7
+# Limit of the current source's voltage, relative to its maximum for the skin at rest.
+_MAX_VOLTAGE_RATIO = 5.0
+# Minimum and maximum factor by which the impedance of a loose contact is multiplied.
+_LOOSE_CONTACT_FACTORS = (10.0, 1000.0)
+# Time constant of the fluctuations of the logarithm of a loose contact's factor, in seconds.
+_FLUCTUATION_TIME = 0.5
+# Number of levels of a loose contact's factor for which voltages are solved.
+_NUM_LEVELS = 7
 # Voltage picked up by a disconnected wire, relative to the root mean square of all voltages.
 _STRAY_FRACTION = 0.02
 

@@ -95,16 +95,26 @@ GESTURES = tuple(MANNERS)
 # Time recorded before a touch and minimum time after it, in seconds; the number of frames is a multiple of
 # `_FRAME_MULTIPLE`.
 _TIME_BEFORE, _TIME_AFTER, _FRAME_MULTIPLE = 0.1, 0.5, 16
-# Maximum mean pressure of a hand, Pa; minimum distance of the hand's path from the edge of the skin, m; maximum path of
-# a hand that does not move along the skin but rolls, m; share of a long touch in which the load rises, and in which it
-# falls; relative amplitude of fluctuations of the load.
-_MAX_PRESSURE, _EDGE_MARGIN, _MAX_ROLL, _RAMP_FRACTION, _FLUCTUATION_AMPLITUDE = 120e3, 15e-3, 2e-3, 0.15, 0.08
-# Number of fingertips that scratch; distance between them, divided by their radius; relative reduction of the load at
-# the turning points of a scratch.
-_NUM_FINGERTIPS, _FINGERTIP_SPACING, _LOAD_REDUCTION = 3, 2.6, 0.4
-# Number of random places tried for a path on the skin; factor by which the path is shortened if it fits at none of
-# them.
-_MAX_TRIES, _SHORTENING_FACTOR = 20, 0.8
+# Maximum mean pressure of a hand, Pa.
+_MAX_PRESSURE = 120e3
+# Minimum distance of the hand's path from the edge of the skin, m.
+_EDGE_MARGIN = 15e-3
+# Maximum path of a hand that does not move along the skin but rolls, m.
+_MAX_ROLL = 2e-3
+# Share of a long touch in which the load rises, and in which it falls.
+_RAMP_FRACTION = 0.15
+# Relative amplitude of fluctuations of the load.
+_FLUCTUATION_AMPLITUDE = 0.08
+# Number of fingertips that scratch.
+_NUM_FINGERTIPS = 3
+# Distance between the fingertips that scratch, divided by their radius.
+_FINGERTIP_SPACING = 2.6
+# Relative reduction of the load at the turning points of a scratch.
+_LOAD_REDUCTION = 0.4
+# Number of random places tried for a path on the skin.
+_MAX_TRIES = 20
+# Factor by which a path is shortened if it fits at none of the tried places.
+_SHORTENING_FACTOR = 0.8
 
 
 def gesture_motion(

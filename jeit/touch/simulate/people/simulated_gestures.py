@@ -16,10 +16,14 @@ from jeit.touch.simulate.contact.press import MovingPress
 from jeit.touch.simulate.contact.pressed_skin import PressedSkin
 from jeit.touch.simulate.people.person import GESTURES, Person
 
-# Maximum time since the reference frame, during which the skin drifts, in seconds; number of frames of which the
-# reference is the mean; number of recordings of the untouched skin, each with its own drift; number of frames of each
-# such recording.
-_MAX_DRIFT_TIME, _NUM_REFERENCE_FRAMES, _NUM_UNTOUCHED_RECORDINGS, _NUM_UNTOUCHED_FRAMES = 60.0, 60, 40, 16
+# Maximum time since the reference frame, during which the skin drifts, in seconds.
+_MAX_DRIFT_TIME = 60.0
+# Number of frames of which the reference is the mean.
+_NUM_REFERENCE_FRAMES = 60
+# Number of recordings of the untouched skin, each with its own drift.
+_NUM_UNTOUCHED_RECORDINGS = 40
+# Number of frames of each recording of the untouched skin.
+_NUM_UNTOUCHED_FRAMES = 16
 # Number of recordings simulated at once.
 _RECORDINGS_AT_ONCE = 120
 
