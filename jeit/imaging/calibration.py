@@ -46,7 +46,7 @@ def keep_last_result(function: Callable[_Arguments, _Result]) -> Callable[_Argum
         nonlocal last
         leaves, structure = jax.tree.flatten((args, kwargs))
         kept = last
-        if kept is None or kept[1] != structure or not all(map(_is_same, kept[0], leaves)):
+        if kept is None or kept[1] != structure or not all(map(_are_equal_arguments, kept[0], leaves)):
             copies = [leaf.copy() if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
             last = kept = copies, structure, function(*args, **kwargs)
         return kept[2]
@@ -54,7 +54,7 @@ def keep_last_result(function: Callable[_Arguments, _Result]) -> Callable[_Argum
     return call
 
 
-def _is_same(first, second) -> bool:
+def _are_equal_arguments(first, second) -> bool:
     """Whether two leaves of arguments are the same object, or arrays or numbers of equal types and values."""
     if first is second:
         return True

@@ -5,10 +5,10 @@ the residual r of the data and its precision G. The covariance of the coefficien
 
     Σ = (Q + JᵀGJ)⁻¹ = Q⁻¹ - Q⁻¹Jᵀ(JQ⁻¹Jᵀ + C)⁻¹JQ⁻¹
 
-is computed in data space, with the Jacobian J at ĉ, the data covariance C = G⁻¹ and the prior precision Q. For smooth
-priors Q = I, and Σ is exact if voltages are linear in c. Tarantola, Inverse Problem Theory (SIAM 2005), ch. 3; Kaipio
-and Somersalo, Statistical and Computational Inverse Problems (Springer 2005), ch. 3; MacKay, Neural Comput. 4 (1992)
-415-447.
+is computed in data space, with the Jacobian J at ĉ, the data covariance C = G⁻¹ and the prior precision Q. The
+coefficients of smooth (Gaussian) priors are scaled so that Q = I; Σ is then exact if voltages are linear in c.
+Tarantola, Inverse Problem Theory (SIAM 2005), ch. 3; Kaipio and Somersalo, Statistical and Computational Inverse
+Problems (Springer 2005), ch. 3; MacKay, Neural Comput. 4 (1992) 415-447.
 
 For total variation, Q is the quadratic form of lagged diffusivity, which touches the energy at ĉ from above (Vogel and
 Oman, SIAM J. Sci. Comput. 17 (1996) 227-238). A jump of height d between cells has a stiffness proportional to 1 / √(d²

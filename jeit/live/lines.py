@@ -25,8 +25,9 @@ _FRAME_WORD = re.compile(rb"magnitudes\s{0,40}:", re.IGNORECASE)
 _COMMENT_PREFIXES = ("#", "%", "//")
 # Maximum number of characters that are stored of a line that is not a frame.
 _MAX_TEXT_LENGTH = 400
-# Maximum relative difference from the reference for which a number is considered complete, and for which a frame is
-# used to determine the factors from numbers to volts.
+# Maximum relative difference between the first number of a line and the reference; a larger difference shows that the
+# beginning of the line was lost. Maximum relative difference of a frame that is used to determine the factors from
+# numbers to volts.
 _MAX_DIFFERENCE = 0.5
 # Maximum number of frames from which the factors are determined.
 _MAX_FACTOR_FRAMES = 20

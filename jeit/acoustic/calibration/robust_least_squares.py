@@ -223,7 +223,7 @@ class TapFit(Module):
         floor = np.asarray(self.noise.floor)
         return DecayProblem(self.level, self.offset, weight, floor, self.kind, self.spread, self.place_error)
 
-    def expected(self) -> Float[np.ndarray, "M T"]:
+    def predicted_level(self) -> Float[np.ndarray, "M T"]:
         """Levels (M, T) predicted by the fitted decay models."""
         return self.problem().expected(self.values, self.strength)[0]
 
@@ -355,7 +355,7 @@ def _update_spread(fit: TapFit) -> Float[np.ndarray, " P"]:
 
 def _update_noise_and_weights(fit: TapFit) -> TapFit:
     """Re-estimate the microphones' noise, the outlying taps and the weights from the residuals of the fit."""
-    expected = fit.expected()
+    expected = fit.predicted_level()
     received = np.maximum(np.exp(expected) - fit.noise.floor[:, None], 0.0)
     # The residuals are smaller than the errors of the data, since strengths and parameters were fitted to the data;
     # `inflation` corrects for the difference.
@@ -397,7 +397,7 @@ def _residual_for_equal_errors(fit: TapFit, received: np.ndarray) -> Float[np.nd
     equal_fit = replace(fit, noise=replace(fit.noise, relative=np.full(len(relative), np.median(relative))))
     equal_fit = replace(equal_fit, weight=1 / _level_variance(equal_fit, received))
     strength = fit_strengths(equal_fit.problem(with_outliers=True), fit.values, fit.strength)
-    return np.where(fit.usable, fit.level - replace(equal_fit, strength=strength).expected(), 0.0)
+    return np.where(fit.usable, fit.level - replace(equal_fit, strength=strength).predicted_level(), 0.0)
 
 
 def _level_variance(fit: TapFit, received: np.ndarray) -> np.ndarray:

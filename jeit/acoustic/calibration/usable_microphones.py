@@ -89,7 +89,7 @@ def exclude_unusable(
 def _reasons_and_explained(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[np.ndarray, " M"]]:
     """Return the reason why each microphone is unusable ("" if usable), and the fraction of the variance of its levels
     that its decay model explains. For excluded microphones this fraction is taken from `explained`."""
-    expected, level, use = fit.expected(), fit.level, fit.use
+    expected, level, use = fit.predicted_level(), fit.level, fit.use
     decreases = _response_decrease(fit)
     min_readings = len(fit.kind.parameters) + 2
     deviation, relative = fit.noise.deviation, fit.noise.relative

@@ -116,7 +116,7 @@ def estimate_gain_changes(
     if deviation == 0:
         return (no_changes,)
     for factor in _DEVIATION_FACTORS:
-        changes, explained_share = _estimate_for_deviation(
+        changes, explained_share = _estimate_gain_changes(
             microphone_array, power, use, factor * deviation * centring_matrix, locate_frames
         )
         if explained_share >= (_MIN_EXPLAINED_FIRST if factor == 1 else _MIN_EXPLAINED_LATER):
@@ -124,7 +124,7 @@ def estimate_gain_changes(
     return no_changes, no_changes._replace(covariance=deviation**2 * centring_matrix)
 
 
-def _estimate_for_deviation(
+def _estimate_gain_changes(
     microphone_array: MicrophoneArray, power, use, scale, locate_frames
 ) -> tuple[GainChanges, float]:
     """Estimate the changes of the gains for one prior standard deviation, and the fraction of the frames that one

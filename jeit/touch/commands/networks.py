@@ -101,7 +101,7 @@ def image_by_network(
         step("image")
         counter = FrameCounter(step, None if numbers is None else len(numbers))
 
-        def show(frame_depth: "FrameDepth") -> None:
+        def print_refused(frame_depth: "FrameDepth") -> None:
             counter.one_more()
             if frame_depth.depth is None and not quiet:
                 console.print(f"  frame {frame_depth.number}: refused. {frame_depth.reason}", soft_wrap=True)
@@ -111,7 +111,9 @@ def image_by_network(
             frame_depths = (item._replace(number=int(numbers[item.number])) for item in frame_depths)
         drawing = stopping.drawing_reporter(PICTURES, step)
         with stopping.exit_after_signal(counter, "frames.csv", "depth.npz"):
-            summary = write_depths(frame_depths, network, output, name=str(data), progress=show, drawing=drawing)
+            summary = write_depths(
+                frame_depths, network, output, name=str(data), progress=print_refused, drawing=drawing
+            )
     if quiet:
         return
     deepest, latency = summary.deepest, 1e3 * np.median(summary.latency)

@@ -143,7 +143,8 @@ class _TouchSuperposition:
     def group_neurons(self, shares: Float[np.ndarray, " k"], min_distance: float) -> list[Bool[np.ndarray, " k"]]:
         """Group the neurons that have a share in the frame into clusters of nearby places.
 
-        Returns, for each of the clusters that change the frame most, whether each neuron is near the cluster.
+        Returns a mask of neurons for each cluster that explains much of the frame's change, with the neurons whose
+        places are near those of the cluster.
         """
         from scipy.cluster.hierarchy import fcluster, linkage
 
