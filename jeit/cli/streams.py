@@ -202,7 +202,7 @@ class Stopping:
 
     def _stop(self, signal_number: int, _) -> None:
         at_once = self.signal is not None or self._waiting or not self._streaming
-        self.signal, self._waiting = signal_number, False
+        self.signal = signal_number
         if at_once:
             raise KeyboardInterrupt
 

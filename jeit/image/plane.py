@@ -106,11 +106,9 @@ class TriangleSurface:
     @property
     def enclosed(self) -> float:
         """Volume in m³ that the surface encloses; the surface must be closed."""
-        a, b, c = (
-            np.swapaxes(self.points[self.triangles] - self.points.mean(axis=0), 0, 1)
-            if len(self.points)
-            else np.zeros((3, 0, 3))
-        )
+        if not len(self.points):
+            return 0.0
+        a, b, c = np.swapaxes(self.points[self.triangles] - self.points.mean(axis=0), 0, 1)
         return float(np.sum(a * np.cross(b, c)) / 6)
 
 

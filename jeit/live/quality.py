@@ -51,7 +51,7 @@ def change_during(frames: Float[np.ndarray, "N M"]) -> float | None:
     fewer than eight frames, for a change that noise explains, and for a change no larger than the noise of a single
     frame. The noise is estimated from successive frames."""
     frames = np.asarray(frames, float)[:, np.isfinite(frames).all(axis=0)]
-    if len(frames) < _NUM_PARTS * _MIN_PART_FRAMES or not frames.size:
+    if len(frames) < _NUM_PARTS * _MIN_PART_FRAMES:
         return None
     part_deviations = np.array([part.mean(axis=0) for part in np.array_split(frames, _NUM_PARTS)]) - frames.mean(axis=0)
     noise = (np.diff(frames, axis=0) ** 2).mean(axis=0).sum() / 2

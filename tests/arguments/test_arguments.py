@@ -13,11 +13,13 @@ from jeit.arguments import (
     check_kind,
     check_metres,
     check_name,
+    counted,
     describe,
     did_you_mean,
     interval_text,
     is_number,
     real_array,
+    signed_percent,
 )
 from jeit.mesh import Disk
 
@@ -157,5 +159,16 @@ def test_check_metres_rejects_values_that_are_no_lengths(value):
 def test_open_intervals_name_the_known_end():
     """A decrease beyond its limit: "at most -90" might mean a smaller one."""
     texts = {(1.0, 2.0): "1 to 2", (1.0, None): "at least 1", (None, 2.0): "at most 2", (None, -90.0): "beyond -90"}
+    texts |= {(None, 0.0): "at most 0"}
     assert {ends: interval_text(ends, lambda value: f"{value:g}") for ends in texts} == texts
     assert interval_text((None, None), str) == "not determined"
+
+
+def test_changes_in_per_cent_have_a_sign_and_two_digits():
+    said = {0.0: "+0 %", 0.01234: "+1.2 %", -0.904: "-90 %", 1.5: "+150 %", -0.9949: "-99 %", 7.94: "+790 %"}
+    assert {change: signed_percent(change) for change in said} == said
+
+
+def test_numbers_have_their_noun_in_the_plural():
+    said = {(1, "frame"): "1 frame", (0, "frame"): "0 frames", (1000, "touch"): "1,000 touches", (2, "box"): "2 boxes"}
+    assert {given: counted(*given) for given in said} == said

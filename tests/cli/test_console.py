@@ -1,5 +1,6 @@
 """Numbers and tables as the commands print them."""
 
+import contextlib
 import io
 from types import SimpleNamespace
 from typing import Any
@@ -10,7 +11,7 @@ from rich.console import Console
 from jeit.arguments import percent
 from jeit.cli import console as console_room
 from jeit.cli.commands.reconstruct import bodies_text
-from jeit.cli.console import Steps, inclusion_table, quantity_table
+from jeit.cli.console import Steps, in_one_unit, inclusion_table, quantity_table, with_unit
 from jeit.image import Inclusion, SolidForm
 
 SAID = {
@@ -94,6 +95,46 @@ def test_extent_of_bodies_is_an_outline_in_a_sheet_and_a_surface_in_a_solid(dime
         f"2 {edge} fitted; 1 ghost left out; of 1 the data give a limit of the change only; the background "
         "has drifted by 1 %"
     )
+
+
+def test_durations_are_rounded_to_the_accuracy_of_an_estimate():
+    said = {0.2: "0 s", 9.4: "9 s", 10.6: "10 s", 13.0: "15 s", 97.0: "95 s", 130.0: "2 min", 5300.0: "88 min"}
+    said |= {5500.0: "1.5 h", 86400.0: "24.0 h"}
+    assert {seconds: console_room._rounded_duration(seconds) for seconds in said} == said
+
+
+def test_steps_are_printed_with_their_duration_once_they_end(monkeypatch):
+    """The last one too, but not one that fails; nothing is printed on request."""
+    now, printed = [100.0], {}
+    monkeypatch.setattr(console_room.time, "perf_counter", lambda: now[0])
+    for quiet in (False, True):
+        file = io.StringIO()
+        with contextlib.suppress(KeyError), Steps(Console(file=file), quiet=quiet) as step:
+            assert step.under_way == ""
+            for name, seconds in (("read", 0.04), ("image", 12.34), ("write", 1.0)):
+                step(name)
+                step.report("half")
+                assert step.under_way == name
+                now[0] += seconds
+            raise KeyError
+        printed[quiet] = [line.split() for line in file.getvalue().splitlines()]
+    assert printed == {False: [["read", "0.0", "s"], ["image", "12.3", "s"]], True: []}
+    with Steps(Console(file=(file := io.StringIO())), quiet=False) as step:
+        step("read")
+    assert file.getvalue().split() == ["read", "0.0", "s"]
+
+
+def test_values_have_the_prefix_that_suits_them():
+    said = {None: "not known", 0.0: "0 S", 1.234: "1.23 S", -0.0567: "-56.7 mS", 9.996e-4: "1 mS", 9.99e-7: "999 nS"}
+    said |= {2e-10: "2e-10 S", 1234.0: "1.23e+03 S"}
+    assert {value: with_unit(value, "S") for value in said} == said
+    for values, unit, texts in (
+        ([2e-6, -3.456e-3], "mS", ["0.002", "-3.46"]),
+        ([9.996e-4, 2e-5], "mS", ["1", "0.02"]),
+        ([0.0], "S", ["0"]),
+        ([], "S", []),
+    ):
+        assert in_one_unit(values, "S") == (unit, texts)
 
 
 def test_the_time_left_is_estimated_where_parts_are_known(monkeypatch):

@@ -1,12 +1,14 @@
-"""Frames from standard input: old frames are skipped, times come from the clock or a given rate; files have a rate."""
+"""Frames from standard input: old frames are skipped, times come from the clock or a given rate; files have a rate.
+Their number is reported as they come."""
 
 import signal
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from jeit.cli import streams
-from jeit.cli.streams import LiveFrames, Stopping
+from jeit.cli.streams import FrameCounter, LiveFrames, Stopping
 
 
 @pytest.fixture
@@ -109,3 +111,17 @@ def test_ctrl_c_ends_the_stream(clock):
             if len(seen) == 4:
                 signal.raise_signal(signal.SIGINT)
     assert len(seen) == 4
+
+
+@pytest.mark.parametrize(("number", "total"), [(None, ""), (1200, " of 1,200")])
+def test_the_number_of_frames_is_reported_at_once_and_then_a_few_times_a_second(clock, number, total):
+    reported = []
+    counter = FrameCounter(SimpleNamespace(report=reported.append), number)
+    for _ in range(1100):
+        counter.one_more()
+        clock.now += 0.001
+    assert counter.number == 1100
+    first, *others, last = [text.removesuffix(total) for text in reported]
+    assert first == "frame 1"
+    assert len(others) in (2, 3, 4)
+    assert last.startswith("frame 1,0")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jeit.cli import main
-from jeit.cli.console import Steps
+from jeit.cli.console import Steps, with_unit
 from jeit.data import load_description
 
 DESCRIBED = """
@@ -50,15 +50,19 @@ def test_results_are_written(recording, tmp_path, capsys):
     assert found["frequency"] == pytest.approx(1.3, abs=0.01)
     parts = found["regions"].values()
     assert min(abs((one["phase_degrees"] - np.degrees(0.4) + 90) % 180 - 90) for one in parts) < 5
-    kept = np.load(tmp_path / "series.npz")
-    assert kept["changes"].shape == (30, kept["cells"].shape[0])
-    assert kept["amplitude"].shape == kept["phase"].shape == (1, kept["cells"].shape[0])
+    with np.load(tmp_path / "series.npz") as kept:
+        assert kept["changes"].shape == (30, kept["cells"].shape[0])
+        assert kept["amplitude"].shape == kept["phase"].shape == (1, kept["cells"].shape[0])
     table = (tmp_path / "regions.csv").read_text().splitlines()
     assert table[0] == 'time_s,"half:1,0","box:-0.09,-0.09,0,0.09"'
     assert len(table) == 31
     assert (tmp_path / "series.png").stat().st_size > 20_000
     assert (tmp_path / "a.gif").stat().st_size > 10_000
-    assert "1.3 Hz (resolution 0.34 Hz)" in capsys.readouterr().out
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "30 frames, 5 a second, 0 refused 1.3 Hz (resolution 0.34 Hz): " in printed
+    for name, one in found["regions"].items():
+        sizes = f"{with_unit(one['amplitude'], 'S')} ± {with_unit(one['noise'], 'S')}"
+        assert f"{name}: amplitude {sizes}, phase {one['phase_degrees']:.0f}°" in printed
 
 
 @pytest.mark.slow

@@ -46,3 +46,21 @@ def test_other_variables_are_not_unpacked(tmp_path):
     assert set(matlab.load(tmp_path / "a.mat", "a")) == {"", "a"}
     with pytest.raises(ValueError, match=r"not a readable \.mat file"):
         matlab.load(tmp_path / "a.mat", "b")
+
+
+@pytest.mark.parametrize("compressed", [True, False])
+def test_a_file_that_is_cut_short_is_refused_wherever_it_ends(tmp_path, compressed):
+    """Within the header or the numbers of its last variable; before that, the file is whole and has one less."""
+    path = tmp_path / "a.mat"
+    sizes = []
+    for held in ({"a": np.ones((2, 2))}, {"a": np.ones((2, 2)), "b": np.arange(9.0)}):
+        scipy.io.savemat(path, held, do_compression=compressed)
+        sizes.append(path.stat().st_size)
+    whole = path.read_bytes()
+    for size in range(sizes[0] + 8, sizes[1]):
+        path.write_bytes(whole[:size])
+        for read in (matlab.variable_names, matlab.shapes, lambda file: matlab.load(file, "a")):
+            with pytest.raises(ValueError, match=r"^a\.mat is not a readable \.mat file; .* \(it is cut short\)\.$"):
+                read(path)
+    path.write_bytes(whole[: sizes[0]])
+    assert matlab.variable_names(path) == {"a"}

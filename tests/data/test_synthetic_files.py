@@ -43,6 +43,8 @@ def test_kit4_layout(tmp_path):
     assert float(measurement.voltages[0, 16 * 5 + 3]) == voltages[3, 5]
     np.testing.assert_allclose(measurement.protocol.channel_drive[16 * 5 + 3], 1e-3 * current[:, 5])
     np.testing.assert_allclose(measurement.protocol.channel_measurement[16 * 5 + 3], pattern[:, 3])
+    # Clockwise from 12 o'clock: electrode 5 is at 3 o'clock.
+    np.testing.assert_allclose(np.asarray(measurement.electrodes.position)[[0, 4]], [[0, 0.14], [0.14, 0]], atol=1e-12)
 
 
 def test_ktc_layout_and_missing_electrodes(tmp_path):
@@ -58,6 +60,11 @@ def test_ktc_layout_and_missing_electrodes(tmp_path):
     np.testing.assert_array_equal(np.flatnonzero(~mask), np.arange(31 * 7, 31 * 8))
     assert np.isnan(np.asarray(measurement.voltages)[0, ~mask]).all()
     assert any("31 of 2356 voltages masked" in note and "NaN" in note for note in measurement.notes)
+    # Counter-clockwise from 12 o'clock: electrode 9 is at 9 o'clock. Electrodes cover half of the circumference.
+    np.testing.assert_allclose(
+        np.asarray(measurement.electrodes.position)[[0, 8]], [[0, 0.115], [-0.115, 0]], atol=1e-12
+    )
+    np.testing.assert_allclose(32 * np.asarray(measurement.electrodes.width), np.pi * 0.115)
 
 
 @pytest.mark.parametrize("polarity", [1, -1])

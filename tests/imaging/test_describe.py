@@ -4,6 +4,8 @@ import functools
 import io
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +14,8 @@ import scipy.io
 from jeit import data
 from jeit.cli import main
 from jeit.data.description import parse_description
-from jeit.imaging.describe import find_description
+from jeit.imaging.describe import Candidate, Findings, find_description
+from jeit.imaging.wiring import Wiring
 from jeit.layout import ring
 from jeit.mesh import centroids
 
@@ -113,8 +116,38 @@ def test_an_insufficient_explanation_is_reported(tmp_path):
     empty, rod = saved(tmp_path, random)
     found = find_description(rod, DISK, RING, reference=empty)
     assert "not good enough to go on" in found.fault
+    assert not found.known
     with pytest.raises(ValueError, match=r"1 line of 1\. Are there columns of other things"):
         find_description(saved(tmp_path, random[:, :1])[0], DISK, RING)
+
+
+def test_the_best_explanation_is_refused_by_what_it_leaves_unexplained():
+    """A misfit of 30 % is good enough for voltages that differ from channel to channel, which another order of the
+    channels would explain far worse, and for any voltages if the kind of protocol is known. 60 % is never enough."""
+    protocol = {"kind": "adjacent", "number": 8}
+    alike, different = (
+        SimpleNamespace(voltages=voltages[None], mask=np.ones((1, 40), bool))
+        for voltages in (np.linspace(1.0, 1.1, 40), np.geomspace(0.01, 1, 40))
+    )
+
+    def fault(measurement, misfit, known=False, **others):
+        wiring = Wiring(tuple(range(8)), described=misfit)
+        given: dict[str, Any] = {"frames": 1, "spread": 0.01, "reciprocity": None, **others}
+        best = Candidate(protocol, measurement=measurement, wiring=wiring, **given)
+        return Findings((best,), (), "", known).fault
+
+    assert not fault(different, 0.3)
+    assert not fault(alike, 0.2)
+    assert not fault(alike, 0.3, known=True)
+    assert "adjacent, 8 electrodes, misses 30 % of the empty body: that" in fault(alike, 0.3)
+    # The reciprocity error counts by 1/√2: with 0.3, a misfit of 0.1 is 0.23 together, and 0.2 is 0.29.
+    assert not fault(alike, 0.1, reciprocity=0.3)
+    assert "misses 20 % of the empty body and breaks reciprocity by 30 %" in fault(alike, 0.2, reciprocity=0.3)
+    for measurement in (alike, different):
+        assert "misses 60 %" in fault(measurement, 0.6, known=True)
+        assert "frames of the empty body differ by 25 %" in fault(measurement, 0.01, known=True, spread=0.25)
+    columns = "its two columns are real and imaginary parts"
+    assert [columns in fault(alike, 0.01, spread=0.25, frames=number) for number in (1, 2, 3)] == [False, True, False]
 
 
 @pytest.mark.slow
@@ -191,6 +224,7 @@ def test_known_settings_restrict_the_search(tmp_path):
     voltages, _ = simulated(KINDS[0])
     empty, rod = saved(tmp_path, voltages, " ")
     found = find_description(rod, DISK, RING, reference=empty, known={"kind": "adjacent", "number": 8})
+    assert found.known
     assert {one.protocol["kind"] for one in found.candidates} == {"adjacent"}
     assert {replace(one.measurement).num_frames for one in found.candidates} == {1}
 

@@ -1,17 +1,17 @@
 """Breathing lungs in a chest, and a sphere that oscillates ten times a second: frequency, amplitude and phase in
-images.
-"""
+images; and images of the change between two frequencies of the current, against differences that NumPy computes."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_chosen_frame import EMPTY, FULL, SETTINGS, tank
 
 from jeit import data, protocol
 from jeit.electrodes import BoundaryElectrodes, FaceDiscs
 from jeit.forward import ForwardModel
 from jeit.image import ball_region, half_region, oscillation
-from jeit.imaging import ImagingSettings, image_sequence
+from jeit.imaging import ImagingSettings, frequency_weight, image_difference, image_frequencies, image_sequence
 from jeit.layout import ring
 from jeit.mesh import Disk, Solid, centroids, measures
 
@@ -92,6 +92,30 @@ def test_frames_with_missing_channels_are_refused_and_channels_missing_in_most_a
     assert np.flatnonzero(found.refused).tolist() == [5]
     assert np.isnan(found.series.changes[5]).all()
     assert not np.asarray(found.reconstruction.matrix)[:, 40].any()
+
+
+def test_the_change_between_two_frequencies_is_relative_to_that_of_the_whole_body():
+    """Unless the weight is left out: then it is the plain difference. The first frequency is the mean of its frames."""
+    first, second = tank(0.9 * EMPTY, 1.1 * EMPTY), tank(EMPTY, 1.25 * FULL)
+    weighted, plain = (image_frequencies(second, first, SETTINGS, frame=1, weighted=one) for one in (True, False))
+    weight = np.linalg.lstsq(EMPTY[:, None], 1.25 * FULL)[0].item()
+    assert weighted.weight == pytest.approx(weight, rel=1e-12)
+    assert frequency_weight(second.frame(1), first.mean_frame()) == weighted.weight
+    assert plain.weight == 1
+    for found, scale in ((weighted, weight), (plain, 1.0)):
+        expected = image_difference(tank(1.25 * FULL), tank(scale * EMPTY), SETTINGS)
+        np.testing.assert_allclose(found.image.change, expected.change, rtol=1e-6, atol=1e-9)
+    assert [found.image.reference.name for found in (weighted, plain)] == [f"{weight:.3g} × tank", "tank"]
+
+
+def test_frequencies_are_weighted_by_the_channels_that_both_use():
+    used = np.arange(EMPTY.size) % 7 > 0
+    first, second = (replace(one, mask=mask[None]) for one, mask in ((tank(EMPTY), used), (tank(FULL), used[::-1])))
+    both = used & used[::-1]
+    weight = np.linalg.lstsq(EMPTY[both, None], FULL[both])[0].item()
+    assert frequency_weight(second, first) == pytest.approx(weight, rel=1e-12)
+    with pytest.raises(ValueError, match="nothing in common"):
+        frequency_weight(tank(-FULL), tank(EMPTY))
 
 
 def test_invalid_series(chest):

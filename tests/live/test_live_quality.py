@@ -91,6 +91,19 @@ def test_a_rate_that_doubles_is_reported_once():
     assert [one for one in reported if one] == ["The frame rate has changed from 60 to 121 frames a second."]
 
 
+def test_a_steady_change_during_eight_frames_is_detected():
+    """Eight frames are the fewest: four pairs, of which the first and the last differ by three steps from the mean."""
+    usual, step = 1 + np.arange(CHANNELS) / CHANNELS, np.where(np.arange(CHANNELS) < 5, 0.01, 0.0)
+    frames = usual + (np.arange(8) - 3.5)[:, None] * step
+    assert change_during(frames) == pytest.approx(3 * np.linalg.norm(step) / np.linalg.norm(usual), rel=1e-12)
+    lost = np.where(np.arange(CHANNELS) == 2, np.nan, frames)  # one channel is left out
+    known = np.arange(CHANNELS) != 2
+    change = 3 * np.linalg.norm(step[known]) / np.linalg.norm(usual[known])
+    assert change_during(lost) == pytest.approx(change, rel=1e-12)
+    assert change_during(frames[:7]) is None
+    assert change_during(np.full((8, CHANNELS), np.nan)) is None
+
+
 @pytest.mark.parametrize("number", [8, 30, 300])
 def test_noise_is_not_reported_as_change(number):
     """None of a hundred references. A motion of ten times the noise is detected, and its size is that of its

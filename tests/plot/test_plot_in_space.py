@@ -308,6 +308,10 @@ def test_the_overview_cuts_through_the_strongest_change(tank, image, patches):
     titles = {one.get_title() for one in figure.axes} - {""}
     strongest = np.asarray(centroids(tank))[np.abs(image).argmax()]
     assert titles == {Plane.at(axis, float(one)).name for axis, one in zip("xyz", strongest, strict=True)}
+    # The view, three slices, the caption and the colour bar fill the grid, and none lies on another.
+    places = [ax.get_subplotspec() for ax in figure.axes]
+    cells = [(row, column) for place in places for row in place.rowspan for column in place.colspan]
+    assert sorted(cells) == [(row, column) for row in range(2) for column in range(4)]
     inclusions = [Inclusion(-1, (-0.03, 0.06, 0.06), 1e-4, -1e-3, centroid_radius=2.34e-3)]
     figure = plot_solid(tank, image, patches, inclusions=inclusions)
     assert {one.get_title() for one in figure.axes} - {""} == {"x = −30 mm", "y = 60 mm", "z = 60 mm"}

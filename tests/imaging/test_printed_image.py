@@ -1,0 +1,106 @@
+"""What is stated about an image: the rows that `jeit reconstruct` prints, the durations of the steps, and the labels of
+the pixels. Rows are compared with the properties of the image, durations with a clock that the test sets."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_chosen_frame import EMPTY, FULL, MODEL, SETTINGS, tank
+
+from jeit.cli.commands.reconstruct import show
+from jeit.cli.console import plain_console
+from jeit.image import Inclusion, Raster
+from jeit.imaging import calibration, image_difference
+from jeit.imaging.difference import _region_labels
+from jeit.imaging.wiring import Wiring
+from jeit.mesh import centroids
+from jeit_solvers import Status
+
+
+@pytest.fixture(scope="module")
+def imaged():
+    return image_difference(tank(FULL), tank(EMPTY), SETTINGS)
+
+
+@pytest.fixture
+def printed(imaged, capsys):
+    """Print the image with some of its properties replaced; return the text, and the names of the rows."""
+
+    def call(**changed):
+        show(plain_console(), replace(imaged, **changed))
+        lines = capsys.readouterr().out.splitlines()
+        table = lines[2 : lines.index("", 2)]
+        return " ".join(" ".join(lines).split()), [name for line in table if (name := line[:15].strip())]
+
+    return call
+
+
+USUAL = ["background", "difference", "noise in it", "method", "mesh"]
+
+
+def test_a_sound_image_has_no_rows_of_faults(printed):
+    text, rows = printed()
+    assert rows == USUAL
+    assert "conductive" in text
+    assert "peaks of the image, which blurs" in text
+
+
+def test_faults_have_rows_of_their_own(imaged, printed):
+    turned = Wiring((0, 1, 6, 3, 4, 5, 2, 7), described=0.4)
+    text, rows = printed(wiring=turned, unlike_electrodes={2: 2.54})
+    assert rows == [*USUAL, "note", "wiring"]
+    assert "electrodes 3 and 7 look exchanged" in text
+    assert "at 3 (2.5 times): what reads them counts less" in text
+    text, rows = printed(quality=replace(imaged.quality, rounding=0.012, difference_noise=None))
+    assert rows == [*USUAL[:3], "rounding", *USUAL[3:]]
+    assert "noise in it not known" in text
+    assert "1.2 % of the difference: voltages have few digits" in text
+
+
+def test_a_calibration_that_failed_is_explained(imaged, printed):
+    fit = imaged.calibration
+    known = {"model": fit.model, "conductivity": fit.conductivity, "misfit": fit.misfit}
+    failed = SimpleNamespace(**known, note="contacts are those described", status=Status.STALLED, reason="No step fits")
+    text, rows = printed(calibration=failed)
+    assert rows == [USUAL[0], "calibration", "note", *USUAL[1:]]
+    assert "stalled. No step fits" in text
+    assert "contacts are those described" in text
+
+
+def test_a_linear_image_of_negative_conductivity_is_doubted(imaged, printed):
+    background = float(imaged.calibration.conductivity)
+    change = np.asarray(imaged.change).copy()
+    change[0] = -1.3 * background
+    text, rows = printed(change=change, inclusions=())
+    assert rows == [*USUAL, "linear image"]
+    assert "falls to -130 % of the background" in text
+    assert "no inclusion found" in text
+    assert "peaks of the image" not in text
+    change[0] = -0.9 * background
+    assert printed(change=change)[1] == USUAL
+
+
+def test_a_step_takes_the_time_from_its_beginning_to_its_end(monkeypatch):
+    now, begun = [100.0], []
+    monkeypatch.setattr(calibration.time, "perf_counter", lambda: now[0])
+    clock = calibration.Clock(begun.append)
+    for step, seconds in (("mesh", 2.5), ("image", 0.25)):
+        with clock(step):
+            assert begun[-1] == step
+            now[0] += seconds
+    assert clock.seconds == {"mesh": 2.5, "image": 0.25}
+
+
+def test_every_pixel_of_a_region_is_labelled_by_its_sign():
+    """A region of all cells contains all pixels inside of the outline; a later region replaces its label."""
+    grid, cells = Raster.create(MODEL.mesh, shape=(32, 32)), np.asarray(centroids(MODEL.mesh))
+    whole, left = np.ones(len(cells), bool), cells[:, 0] < 0
+    conductive, resistive = (Inclusion(sign, (0.0, 0.0), 1e-4, sign * 1e-3) for sign in (1, -1))
+    labels = _region_labels([(conductive, whole), (resistive, left)], grid)
+    x, y = np.moveaxis(grid.pixel_centres(), -1, 0)
+    inside, size = np.hypot(x, y) < 0.0495, 0.004
+    np.testing.assert_array_equal(labels[inside & (x > size)], 2)
+    np.testing.assert_array_equal(labels[inside & (x < -size)], 1)
+    np.testing.assert_array_equal(labels[np.hypot(x, y) > 0.0501], 0)
+    assert set(labels[inside].tolist()) == {1, 2}
