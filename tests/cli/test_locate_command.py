@@ -120,7 +120,7 @@ def test_the_printed_table_gives_the_parameters_of_each_microphone_with_their_un
         displacement=np.array([[0.003, 0.004], [0.0, 0.0]]),
         explained=np.array([0.875, 0.0]),
     )
-    columns = [(column.header, *column.cells) for column in _parameter_table(fit).columns]  # pyright: ignore
+    columns = [(column.header, *column.cells) for column in _parameter_table(fit).columns]
     assert columns == [
         *(("", "0"), ("a / 1", "0.5"), ("± %", "1.0"), ("length / mm", "30"), ("± %", "–")),
         *zip(ending, ("5.0", "2.0", "87.5"), strict=True),
