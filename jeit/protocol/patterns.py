@@ -178,11 +178,8 @@ def skip(
     function_name = "adjacent" if skipped == 0 else "skip"
     count = check_count(num_electrodes, function_name, 4)
     measurement_skipped = skipped if measurement_skipped is None else measurement_skipped
-    for value, name in ((skipped, "skipped"), (measurement_skipped, "measurement_skipped")):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value <= count - 2:
-            raise ValueError(
-                f"skip: {name} must be an integer from 0 to {count - 2} for {count} electrodes; got {value!r}."
-            )
+    _check_skipped(skipped, "skipped", count, "skip")
+    _check_skipped(measurement_skipped, "measurement_skipped", count, "skip")
     kind = "adjacent" if skipped == 0 else f"skip-{skipped}"
     if measurement_skipped != skipped:
         kind += f", skip-{measurement_skipped} measurement"
@@ -194,6 +191,15 @@ def skip(
         reciprocal=reciprocal,
         order=order,
     )
+
+
+def _check_skipped(value, name: str, count: int, function_name: str) -> None:
+    """Raise `ValueError` unless the argument `name` is a number of electrodes that a pair of a ring of `count`
+    electrodes can skip."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value <= count - 2:
+        raise ValueError(
+            f"{function_name}: {name} must be an integer from 0 to {count - 2} for {count} electrodes; got {value!r}."
+        )
 
 
 def opposite(
@@ -315,8 +321,7 @@ def reference_electrode(
     count = check_count(num_boundary, "reference_electrode", 4)
     reference = count if reference is None else reference
     electrode_indices(reference, count + 1)
-    if not 0 <= skipped <= count - 2:
-        raise ValueError(f"reference_electrode: skipped must be from 0 to {count - 2}; got {skipped!r}.")
+    _check_skipped(skipped, "skipped", count, "reference_electrode")
     boundary = np.array([k for k in range(count + 1) if k != reference])
     drive_kind = "adjacent" if skipped == 0 else f"skip-{skipped}"
     drive, measurement = (

@@ -318,18 +318,15 @@ class Protocol(Module):
             np.asarray(self.drive_index)[used_channels],
             np.asarray(self.measurement_index)[used_channels],
         )
-        if not (np.count_nonzero(rows, axis=1) > 2).any():
-            return 0
-        num_repeated, repeats_of_rows = 0, {}
-        for drive_number in np.unique(drive):
+        # Differences of two electrodes are independent, so only drives with other measurements need be examined.
+        has_many_electrodes = np.count_nonzero(rows, axis=1) > 2
+        num_repeated, ranks = 0, {}
+        for drive_number in np.unique(drive[has_many_electrodes[measurement]]):
             drive_rows = np.sort(measurement[drive == drive_number])
             key = drive_rows.tobytes()
-            if key not in repeats_of_rows:
-                has_combinations = (np.count_nonzero(rows[drive_rows], axis=1) > 2).any()
-                repeats_of_rows[key] = (
-                    len(drive_rows) - int(np.linalg.matrix_rank(rows[drive_rows], tol=1e-9)) if has_combinations else 0
-                )
-            num_repeated += repeats_of_rows[key]
+            if key not in ranks:
+                ranks[key] = int(np.linalg.matrix_rank(rows[drive_rows], tol=1e-9))
+            num_repeated += len(drive_rows) - ranks[key]
         return num_repeated
 
     def reciprocal_pairs(self) -> tuple[Int[np.ndarray, "P 2"], Float[np.ndarray, " P"]]:

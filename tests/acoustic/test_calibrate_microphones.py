@@ -206,6 +206,18 @@ def test_additive_noise_is_estimated(exact):
     assert fit.outlier.sum() <= 1
 
 
+def test_taps_that_few_microphones_receive_are_no_outliers(exact):
+    """The mean square of five residuals often exceeds two, although the noise of all taps is the same."""
+    power = exact[2] * np.exp(0.05 * np.random.default_rng(3).normal(size=exact[2].shape))
+    nearest = np.argsort(np.argsort(SQUARED, axis=1), axis=1) < 5
+    fit = calibrated(np.where(nearest, power, np.nan))
+    assert not fit.outlier.any()
+    np.testing.assert_array_equal(fit.usable, nearest)
+    # A quarter of the readings determine strengths and parameters, by which the residuals are smaller than the noise.
+    relative = np.asarray(fit.calibration.microphone_array.noise.relative)
+    assert np.sqrt(np.mean(relative**2)) == pytest.approx(0.05, rel=0.1)
+
+
 def with_one(exact, k, response):
     """The exact data with another response of microphone k."""
     _, loudness, power = exact

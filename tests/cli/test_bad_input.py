@@ -70,10 +70,13 @@ GEOMETRY = {
 }
 
 ELECTRODES = {
-    "off the boundary": (lambda mesh: arcs(radius=0.05).check(mesh), "from the boundary of the mesh"),
+    "off the boundary": (
+        lambda mesh: arcs(radius=0.05).check(mesh),
+        r"electrode 1 lies 0\.04\d+ m from the boundary of the mesh",
+    ),
     "in millimetres": (lambda mesh: arcs(radius=100.0).check(mesh), "metres"),
-    "overlapping": (lambda mesh: arcs(width=0.09).check(mesh), "overlap"),
-    "wider than the edge": (lambda mesh: arcs(number=1 + 1, width=2.0).check(mesh), "wide"),
+    "overlapping": (lambda mesh: arcs(width=0.09).check(mesh), "Electrodes 1 and 2 overlap"),
+    "wider than the edge": (lambda mesh: arcs(number=1 + 1, width=2.0).check(mesh), "electrode 1 is 2 m wide"),
     "zero width": (lambda mesh: arcs(width=0.0), "width must be positive"),
     "negative contact impedance": (lambda mesh: arcs(contact_impedance=-1), "contact_impedance must be positive"),
     "NaN position": (lambda mesh: el.PointElectrodes([[np.nan, 0.0]]), "NaN"),

@@ -8,6 +8,7 @@ import contextlib
 import csv
 import io
 import json
+import re
 import signal
 
 import numpy as np
@@ -144,14 +145,29 @@ def test_gestures_in_a_file_are_classified(files, model, run):
     assert (folder / "out" / "timeline.png").read_bytes().startswith(b"\x89PNG")
 
 
+def printed_touches(output):
+    """Lines of the output that describe a touch, by its place."""
+    return [line for line in output.splitlines() if line.endswith(") mm")]
+
+
 def test_a_table_with_a_given_rate_gives_the_same_labels(files, model, run, tmp_path):
-    folder, _ = files
-    status, _, error = run(
-        *("touch", "watch", folder / "stream.csv", "--skin", folder / "skin.toml", "--gestures", model),
-        *("--rate", RATE, "--reference", folder / "rest.csv", "--output", tmp_path, "--quiet"),
+    """A touch that lasts to the end of the file is listed, too."""
+    folder, stream = files
+    np.savetxt(folder / "cut.csv", stream.voltages[: round((stream.onset[2] + 0.4) * RATE)], delimiter=",")
+    status, output, error = run(
+        *("touch", "watch", folder / "cut.csv", "--skin", folder / "skin.toml", "--gestures", model),
+        *("--rate", RATE, "--reference", folder / "rest.csv", "--output", tmp_path),
     )
     assert (status, error) == (0, "")
-    assert [one["gesture"] for one in events(tmp_path)] == list(GESTURES)
+    assert [one["gesture"] for one in events(tmp_path)][:2] == list(GESTURES)[:2]
+    printed = printed_touches(output)
+    assert ["cut off" in line for line in printed] == [False, False, True]
+    for line, one in zip(printed, events(tmp_path), strict=True):
+        onset, offset, x, y = (float(one[name]) for name in ("onset_s", "offset_s", "x_m", "y_m"))
+        numbers = re.match(r"([\d.]+) s +([\d.]+) s .*\(([-+]\d+), ([-+]\d+)\) mm", line.strip())
+        given = [float(number) for number in numbers.groups()]
+        np.testing.assert_allclose(given[:2], [onset, offset - onset], atol=0.006)
+        np.testing.assert_allclose(given[2:], [1e3 * x, 1e3 * y], atol=0.51)
 
 
 @pytest.mark.slow
@@ -170,10 +186,12 @@ def test_gestures_on_standard_input_are_classified(files, model, run, tmp_path, 
 
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
 def test_results_are_written_after_a_signal(files, model, run, tmp_path, monkeypatch, number):
+    """Touches are printed as they end, so not the last, which the signal cut off."""
     folder, stream = files
+    num_frames = round((stream.onset[2] + 0.4) * RATE)
 
     def lines():
-        yield from (" ".join(map(repr, map(float, row))) for row in stream.voltages[:420])
+        yield from (" ".join(map(repr, map(float, row))) for row in stream.voltages[:num_frames])
         signal.raise_signal(number)
 
     monkeypatch.setattr("sys.stdin", lines())
@@ -182,14 +200,15 @@ def test_results_are_written_after_a_signal(files, model, run, tmp_path, monkeyp
         *("--rate", RATE),
     )
     assert (status, error) == (143 if number == signal.SIGTERM else 0, "")
-    assert "420 frames" in output
+    assert f"{num_frames} frames" in output
+    assert ["cut off" in line for line in printed_touches(output)] == [False, False]
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "events.csv",
         "paths.csv",
         "report.json",
         "timeline.png",
     ]
-    assert json.loads((tmp_path / "report.json").read_text("utf-8"))["touches"] == len(events(tmp_path)) >= 2
+    assert json.loads((tmp_path / "report.json").read_text("utf-8"))["touches"] == len(events(tmp_path)) == 3
 
 
 @pytest.mark.parametrize(

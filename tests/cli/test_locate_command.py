@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +22,8 @@ from jeit.acoustic import (
     write_recording,
 )
 from jeit.acoustic.calibration.calibration import calibrated_intensities
+from jeit.acoustic.commands.calibrate_microphones import _parameter_table
+from jeit.acoustic.decay import Exponential
 from jeit.acoustic.reports import write_calibration, write_track
 from jeit.cli import main
 from jeit.layout import grid
@@ -93,6 +96,35 @@ def off(folder, tmp_path_factory):
     path = tmp_path_factory.mktemp("off") / "off.npz"
     np.savez(path, **taps, intensity=uneven)
     return path
+
+
+def test_the_printed_table_gives_the_parameters_of_each_microphone_with_their_units(folder):
+    printed = (folder / "cal.txt").read_text("utf-8")
+    title, *lines = printed[printed.index("  a / ") :].splitlines()[:10]
+    ending = ["moved / mm", "error %", "explained %"]
+    assert re.split(" {2,}", title.strip()) == ["a / m²", "± %", "b / mm²", "± %", *ending]
+    table = np.array([line.split() for line in lines], float)
+    calibration = Calibration.load(folder / "cal.json")
+    decay = calibration.microphone_array.decay
+    np.testing.assert_allclose(table[:, [1, 3]], np.stack([decay.a, 1e6 * decay.b], axis=1), rtol=6e-3)
+    np.testing.assert_allclose(table[:, [2, 4]], 100 * calibration.standard_errors.T, atol=0.06)
+    # A calibration with an exponential, an unknown standard error, and a microphone that is not usable.
+    array = SimpleNamespace(
+        decay=Exponential(np.array([0.5, 2.0]), np.array([0.03, 0.04])),
+        noise=SimpleNamespace(relative=np.array([0.02, 0.3])),
+    )
+    fit = SimpleNamespace(
+        calibration=SimpleNamespace(
+            microphone_array=array, reasons=("", "dead"), standard_errors=np.array([[0.01, 0.1], [np.nan, 0.1]])
+        ),
+        displacement=np.array([[0.003, 0.004], [0.0, 0.0]]),
+        explained=np.array([0.875, 0.0]),
+    )
+    columns = [(column.header, *column.cells) for column in _parameter_table(fit).columns]
+    assert columns == [
+        *(("", "0"), ("a / 1", "0.5"), ("± %", "1.0"), ("length / mm", "30"), ("± %", "–")),
+        *zip(ending, ("5.0", "2.0", "87.5"), strict=True),
+    ]
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ from jeit.electrodes import FaceDiscs, SurfaceDiscs
 from jeit.forward import ForwardModel
 from jeit.inverse import one_step
 from jeit.layout import Layout, SurfaceLayout, grid, spread
-from jeit.mesh import Mesh, Rectangle, bend, forearm, layer, shell, tube
+from jeit.mesh import Mesh, Rectangle, bend, box, forearm, layer, shell, tube
 from jeit.mesh.geodesic import Geodesics, Triangles
 from jeit.touch.contacts import CellFinder, find_contacts
 
@@ -50,6 +50,20 @@ def test_places_are_spread_by_distance_along_the_surface():
     np.testing.assert_array_equal(places, spread(mesh, 20, margin=0.01))
     with pytest.raises(ValueError, match="leaves no room"):
         spread(mesh, 20, margin=0.15)
+
+
+def test_many_places_are_spread_over_both_faces_of_a_thin_body():
+    """Faces 6 mm apart, with places about 23 mm apart on each."""
+    body = box(0.2, 0.15, 0.006, cell_size=0.012)
+    surface = Triangles(np.asarray(body.points), np.asarray(body.facets))
+    places = spread(surface, 130)
+    pitch = np.sqrt(2 / np.sqrt(3) * surface.areas.sum() / 130)
+    for height in (0.0, 0.006):
+        face = places[np.abs(places[:, 2] - height) < 1e-6]
+        assert 50 <= len(face) <= 72
+        apart = np.linalg.norm(face[:, None] - face, axis=-1)
+        np.fill_diagonal(apart, np.inf)
+        assert apart.min() > 0.6 * pitch
 
 
 def test_94_nearest_pairs_are_nearest_along_the_surface():
@@ -291,6 +305,18 @@ def test_a_touch_across_the_seam_is_one_touch():
 def test_refuses_bad_electrodes(match, centres, diameter):
     with pytest.raises(ValueError, match=match):
         SurfaceLayout(centres, diameter, tube(0.03, 0.1, num_points=1500))
+
+
+@pytest.mark.parametrize(("scale", "message"), [(100.0, "would be 10 m across"), (8e-3, "would be 0.8 mm across")])
+def test_the_size_of_a_surface_is_that_of_its_longest_side(scale, message):
+    """Wherever the surface is; the sides are 100, 60 and 60 mm long."""
+    surface, far = tube(0.03, 0.1, num_points=200), np.array([200.0, -30.0, 7.0])
+    centres = np.array([[0.03, 0, 0.05]])
+    moved = eqx.tree_at(lambda one: one.points, surface, surface.points + far)
+    assert SurfaceLayout(centres + far, 6e-3, moved).num_electrodes == 1
+    scaled = eqx.tree_at(lambda one: one.points, surface, scale * surface.points)
+    with pytest.raises(ValueError, match=message):
+        SurfaceLayout(scale * centres, 6e-3 * scale, scaled)
 
 
 def test_refuses_bad_skins():

@@ -38,10 +38,13 @@ class Page(HTMLParser):
     def __init__(self, text):
         super().__init__()
         self.tags, self.links, self.text, self.cells, self.heads = [], [], "", [], []
+        self.classes = {"th": [], "td": []}
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
+        if tag in self.classes:
+            self.classes[tag].append(dict(attrs).get("class"))
         self.links += [value for name, value in attrs if name in ("src", "href", "srcset", "data")]
 
     def handle_data(self, data):
@@ -75,6 +78,9 @@ def test_the_table_contains_the_results(folder):
     for value in [*1e3 * data.minimum.values, *1e3 * data["mean"].values, *data.uniformity.values]:
         assert f"{value:.4g}" in page.cells
     assert {"minimum / mV", "mean / mV", "uniformity"} <= set(page.heads)
+    # Titles are aligned as the columns below them: text at the left, numbers at the right.
+    assert page.classes["td"] == 2 * page.classes["th"]
+    assert {title for title, kind in zip(page.heads, page.classes["th"], strict=True) if kind} == {"layout", "protocol"}
     assert study.fingerprint in page.text
     assert re.search(r"Computed with jeit [\d.]+, jax [\d.]+", page.text)
     assert "2 of 2 points finished" in page.text

@@ -56,6 +56,17 @@ def test_arc_over_part_of_an_edge_by_hand():
     assert np.count_nonzero(np.abs(matrix) > ROUNDING) == 4
 
 
+def test_arcs_may_touch_but_not_overlap():
+    """Side by side on an edge, and round a corner."""
+    middles = [[0.5, 0.0], [1.5, 0.0], [4.0, 0.5]]
+    BoundaryElectrodes(middles, [1.0, 1.0, 3.0], 1.0).check(strip())
+    BoundaryElectrodes(middles, [1.0, 1.0, 4.0], 1.0).check(strip())
+    with pytest.raises(ValueError, match="Electrodes 1 and 2 overlap"):
+        BoundaryElectrodes(middles, [1.0, 1.0 + 1e-6, 1.0], 1.0).check(strip())
+    with pytest.raises(ValueError, match="Electrodes 2 and 3 overlap"):
+        BoundaryElectrodes(middles, [1.0, 1.0, 5.0 + 1e-6], 1.0).check(strip())
+
+
 def test_arc_round_a_corner_and_across_the_start_of_the_boundary():
     mesh = strip()
     for corner in ([0.0, 0.0], [4.0, 0.0], [4.0, 1.0], [0.0, 1.0]):

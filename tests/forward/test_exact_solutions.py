@@ -129,6 +129,17 @@ def test_discs_converge_scale_and_approach_points():
     assert measurement @ tiny @ drive == pytest.approx(expected, rel=1e-6)
 
 
+def test_discs_that_hardly_resist_at_any_angle():
+    """Two equipotential discs of radius r at a distance d in an infinite sheet: R = arcosh(d / 2r) / (πσ)."""
+    drive = np.array([1.0, -1.0])
+    for angle in (0.0, 0.7, np.pi / 2, 2.5):
+        positions = 0.15 * np.array([1.0, -1.0])[:, None] * [np.cos(angle), np.sin(angle)]
+        discs = np.full(2, 0.1), np.full(2, 1e-16)
+        found = disc_transfer_impedance(ConductingDisk(1e6, 2.0), positions, *discs)
+        # Current passes through the rims of the discs, within a transfer length of 1e-8 m.
+        assert drive @ found @ drive == pytest.approx(np.arccosh(1.5) / (2.0 * np.pi), rel=1e-6)
+
+
 def test_centre_to_rim_resistance_is_the_sum_of_its_layers():
     # Sheet between radii b and a: log(a/b)/(2πσ).
     disk = ConductingDisk(0.1, 2.0)

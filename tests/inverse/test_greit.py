@@ -234,7 +234,8 @@ def test_thin_bodies_are_refused():
     strip = Rectangle(1.0, 0.01)
     ends = PointElectrodes(perimeter(strip, 4, start=0.01))
     thin = ForwardModel(strip.mesh(num_points=300), ends, adjacent(4))
-    with pytest.raises(ValueError, match="fits into this body"):
+    # A fifth of the radius of a disc with the area of the strip.
+    with pytest.raises(ValueError, match=r"no disc of 11\.3 mm radius fits into this body"):
         greit(thin, 1.0, target_radius=0.2)
 
 

@@ -8,6 +8,8 @@ import pytest
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse.shapes import Star, StarPrior, reconstruct_shapes
+from jeit.inverse.shapes.problem import Fit
+from jeit.inverse.shapes.search import _remove_unsupported
 from jeit.inverse.shapes.star import Stars
 from jeit.layout import ring
 from jeit.mesh import Disk, centroids
@@ -104,6 +106,54 @@ def test_bodies_are_detected_and_ghosts_rejected(found):
     assert max(one.rise for one in found.doubtful) < 2 < 100 < min(one.rise for one in found.bodies)
     np.testing.assert_allclose(found.drift, 0.05, atol=0.01)
     assert float(found.misfit) < 1
+
+
+class Named:
+    """Bodies that have only a name."""
+
+    def __init__(self, names):
+        self.names = self.sign = names
+
+    def without(self, k, coefficients):
+        return Named(self.names[:k] + self.names[k + 1 :]), coefficients
+
+    def body(self, k, coefficients, rise):
+        return self.names[k], rise
+
+
+class Listed:
+    """A problem whose cost is listed for every set of bodies, and whose log evidence falls by `weight` with each."""
+
+    def __init__(self, costs, weight):
+        self.costs, self.weight = costs, weight
+
+    def fit(self, bodies, coefficients, *steps):
+        return Fit(bodies, coefficients, self.costs[bodies.names], ())
+
+    def surprise(self, fit):
+        return fit.cost + self.weight * len(fit.bodies.names)
+
+
+@pytest.mark.parametrize(
+    ("least_rise", "weight", "left", "ghosts"),
+    [
+        (1.2, 0.0, "ab", [("c", 1.1)]),
+        (1.4, 0.0, "a", [("c", 1.1), ("b", 1.25)]),
+        (1.0, 1.9, "abc", []),  # 4 more in the cost, of which 1.9 are lost with the parameters: more than 2 are left
+        (1.0, 2.1, "ab", [("c", 1.1)]),
+    ],
+)
+def test_ghosts_are_removed_weakest_first(least_rise, weight, left, ghosts):
+    """By the factor by which the cost rises without a body, and by the evidence for the body."""
+    costs = {"abc": 40.0, "ab": 44.0, "ac": 60.0, "bc": 900.0, "a": 55.0, "b": 950.0, "": 2000.0}
+    problem = Listed(costs, weight)
+    result = _remove_unsupported(problem, problem.fit(Named("abc"), np.zeros(3)), (), least_rise)
+    assert result.fit.bodies.names == left
+    assert [name for name, _ in result.doubtful] == [name for name, _ in ghosts]
+    np.testing.assert_allclose([rise for _, rise in result.doubtful], [rise for _, rise in ghosts])
+    # Body a is beyond doubt, so it is left out only once.
+    rises = {"abc": [900 / 40, 60 / 40, 44 / 40], "ab": [900 / 44, 55 / 44], "a": [900 / 55]}
+    np.testing.assert_allclose(result.rises, rises[left])
 
 
 @pytest.mark.slow

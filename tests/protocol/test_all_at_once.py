@@ -88,6 +88,21 @@ def test_a_given_number_selects_the_first_currents(bodies):
     assert some.num_measurements == 3 * NUMBER
 
 
+def test_optimal_currents_are_as_many_as_the_bodies_differ_by_and_begin_with_a_positive_maximum(bodies):
+    first = bodies[0]
+    step = np.random.default_rng(3).normal(size=(NUMBER, 2))
+    step -= step.mean(axis=0)
+    for options in ({}, {"power": 1e-6}):
+        drive = np.asarray(protocol.optimal(first, first + step @ step.T, **options).drive)
+        assert len(drive) == 2
+        np.testing.assert_array_equal(drive.max(axis=1), np.abs(drive).max(axis=1))
+    # A measured impedance is only nearly symmetric.
+    noisy = first + 0.01 * np.triu(first, 1)
+    np.testing.assert_allclose(
+        protocol.optimal(noisy).drive, protocol.optimal((noisy + noisy.T) / 2).drive, atol=1e-12 * 1e-3
+    )
+
+
 @pytest.mark.parametrize("measurement", ["adjacent", "mean", "mean-removed", "against"])
 def test_measurements_of_potentials(measurement):
     potentials = np.random.default_rng(1).normal(size=7)
@@ -117,10 +132,12 @@ def test_measurements_of_potentials(measurement):
             r"transfer has shape \(1, 12, 12\), of 1 frame; .* transfer\[0\]",
         ),
         (lambda one, two: protocol.optimal(one, np.stack([two, two])), r"other .* of 2 frames; .* other\[0\]"),
+        (lambda one, two: protocol.optimal(one[:1, :1]), r"\(1, 1\)"),
         (lambda one, two: protocol.optimal(one * np.nan), "NaN"),
         (lambda one, two: protocol.optimal(np.triu(one)), "not symmetric"),
         (lambda one, two: protocol.optimal(one, power=1e-3), "power needs other"),
         (lambda one, two: protocol.optimal(-one, two, power=1e-3), "dissipate no power"),
+        (lambda one, two: protocol.optimal(0 * one, two, power=1e-3), "dissipate no power"),
         (lambda one, two: protocol.optimal(one, two, power=-1.0), "positive number of watts"),
         (lambda one, two: protocol.optimal(one, two, power=1e9), "above what"),
         (lambda one, two: protocol.optimal(one, two, number=0), "at least 1"),

@@ -57,6 +57,26 @@ def test_channels_are_unique(case):
     assert len(np.unique(channels, axis=0)) == chosen.num_measurements
 
 
+@pytest.mark.parametrize(
+    ("chosen", "name"),
+    [
+        (protocol.adjacent(16), "adjacent, 16 electrodes"),
+        (protocol.skip(16, 3), "skip-3, 16 electrodes"),
+        (protocol.skip(16, 0, measurement_skipped=2), "adjacent, skip-2 measurement, 16 electrodes"),
+        (protocol.reference_electrode(16), "adjacent drive against reference electrode, 16 + 1 electrodes"),
+        (protocol.reference_electrode(16, skipped=1), "skip-1 drive against reference electrode, 16 + 1 electrodes"),
+        (protocol.haar(8, measurement="mean"), "haar, mean measurement, 8 electrodes"),
+    ],
+)
+def test_names_state_the_pairs(chosen, name):
+    assert chosen.name == name
+
+
+def test_the_first_of_two_reciprocal_channels_is_measured():
+    half = protocol.adjacent(16, reciprocal="half", order="fixed")
+    assert np.all(np.asarray(half.drive_index) < half.measurement_index)
+
+
 def test_rotating_order_starts_after_the_driven_pair():
     # The order of the 6 cm tank's files: row 13 i + t measures the pair that starts at electrode i + 2 + t.
     rows = np.asarray(protocol.adjacent(16).channel_measurement).argmax(axis=1)
@@ -120,7 +140,7 @@ def test_skip_any(count, skipped, driven):
 BAD = {
     "too few electrodes": (lambda: protocol.adjacent(3), "at least 4"),
     "not an integer": (lambda: protocol.adjacent(16.0), "integer"),
-    "odd opposite": (lambda: protocol.opposite(15), "opposite pairs"),
+    "odd opposite": (lambda: protocol.opposite(15), r"opposite pairs.*skip\(\.\.\., 6\)"),
     "milliamperes": (lambda: protocol.adjacent(16, current=1.4), "1.4 mA"),
     "milliamperes in matrices": (lambda: protocol.from_matrices([[1.41, -1.41]], [[1, -1]]), "amperes"),
     "no current": (lambda: protocol.adjacent(16, current=0.0), "positive"),
@@ -133,6 +153,14 @@ BAD = {
     "common that is not": (lambda: protocol.all_against_one(8, common=8), "0 to 7"),
     "nothing left": (lambda: protocol.all_against_one(8, driven_electrodes=False), "driven_electrodes=True"),
     "reference that is not": (lambda: protocol.reference_electrode(16, reference=17), "0 to 16"),
+    "skip all around": (
+        lambda: protocol.reference_electrode(8, skipped=7),
+        "reference_electrode: skipped .* 0 to 6 .* 7",
+    ),
+    "skip half": (
+        lambda: protocol.reference_electrode(8, skipped=0.5),
+        "reference_electrode: skipped .* integer .* 0.5",
+    ),
     "rows do not sum to zero": (lambda: protocol.from_matrices([[1e-3, 0]], [[1, -1]]), "sums to 0.001"),
     "absolute potential": (lambda: protocol.from_matrices([[1e-3, -1e-3]], [[1, 0]]), "differences"),
     "zero row": (lambda: protocol.from_matrices([[1e-3, -1e-3], [0, 0]], [[1, -1]]), "all zero"),

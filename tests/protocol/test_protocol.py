@@ -1,4 +1,4 @@
-"""Properties of a protocol: reciprocity, masks, subsets, and JAX transformations."""
+"""Properties of a protocol: reciprocity, redundant channels, masks, subsets, and JAX transformations."""
 
 import jax
 import jax.numpy as jnp
@@ -47,17 +47,48 @@ def test_reciprocity_with_unequal_currents_and_reversed_pairs():
 def test_transfer_between_drives_is_symmetric_where_known():
     # Skip-1 drives are sums of two neighbours, so that adjacent measurements span all of them.
     chosen = protocol.skip(8, 1, measurement_skipped=0, driven_electrodes=True)
-    transfer, known, gain = transfer_between_drives(
-        np.asarray(chosen.drive),
-        np.asarray(chosen.measurement),
-        np.asarray(chosen.drive_index),
-        np.asarray(chosen.measurement_index),
-        voltages(chosen)[None],
-        np.ones(chosen.num_measurements, bool),
-    )
+    random = np.random.default_rng(2)
+    measured, deviation = voltages(chosen), random.uniform(0.5, 2, chosen.num_measurements)
+    patterns = [np.asarray(one) for one in (chosen.drive, chosen.measurement)]
+    indices = [np.asarray(one) for one in (chosen.drive_index, chosen.measurement_index)]
+    mask = np.ones(chosen.num_measurements, bool)
+    transfer, known, noise = transfer_between_drives(*patterns, *indices, measured[None], mask, deviation)
     assert known.all()
-    assert np.all(gain > 0)
     np.testing.assert_allclose(transfer[0], transfer[0].T, rtol=1e-9, atol=1e-12 * np.abs(transfer).max())
+    # By least squares with these deviations for the potentials against the last electrode.
+    weights = 1 / deviation[indices[0] == 3] ** 2
+    rows = patterns[1][indices[1][indices[0] == 3]]
+    reduced = rows[:, :-1]
+    covariance = np.linalg.inv(reduced.T @ (weights[:, None] * reduced))
+    drive = patterns[0][:, :-1]
+    np.testing.assert_allclose(noise[:, 3] ** 2, np.einsum("si,ij,sj->s", drive, covariance, drive), rtol=1e-9)
+    # Without two channels of a drive, only the combinations that the others span are known. The rest is as before.
+    lost = np.flatnonzero(indices[0] == 3)[[1, 4]]
+    mask[lost] = False
+    spoilt = np.where(mask, measured, 1e6)
+    transfer_without, known_without, _ = transfer_between_drives(*patterns, *indices, spoilt[None], mask, deviation)
+    across = drives_across(patterns[1][indices[1][lost]], patterns[0])
+    np.testing.assert_array_equal(known_without[:, 3], ~across)
+    assert known_without[:, np.arange(8) != 3].all()
+    np.testing.assert_array_equal(transfer_without[..., np.arange(8) != 3], transfer[..., np.arange(8) != 3])
+
+
+def drives_across(lost_pairs, drives):
+    """Whether each pair of `drives` joins the two parts into which a ring falls without its edges `lost_pairs`."""
+    number = drives.shape[1]
+    cuts = [row.argmax() for row in lost_pairs]  # the edge from electrode k to k + 1
+    part = np.isin(np.arange(number), np.arange(min(cuts) + 1, max(cuts) + 1))
+    return np.abs(drives @ part) > 0
+
+
+def test_protocols_are_the_same_if_all_their_channels_are():
+    chosen = protocol.skip(8, 1)
+    assert chosen.same_patterns(chosen.subset(np.arange(chosen.num_measurements)))
+    for change in ({"current": 2e-3}, {"order": "fixed"}):
+        assert not chosen.same_patterns(protocol.skip(8, 1, **change)), change
+    assert not protocol.haar(8, measurement="mean").same_patterns(protocol.haar(8, measurement="mean-removed"))
+    assert not protocol.haar(8).same_patterns(protocol.haar(8).subset(np.arange(55)))
+    assert not protocol.two_terminal(4, [(0, 1)]).same_patterns(protocol.two_terminal(5, [(0, 1)]))
 
 
 def test_channels_touching_an_electrode():
@@ -68,6 +99,25 @@ def test_channels_touching_an_electrode():
     np.testing.assert_array_equal(chosen.mask_without(3), ~touching)
     uses = (np.asarray(chosen.channel_drive) != 0) | (np.asarray(chosen.channel_measurement) != 0)
     np.testing.assert_array_equal(chosen.channels_touching([3, 7]), uses[:, 3] | uses[:, 7])
+
+
+def test_redundant_channels_are_those_beyond_the_rank_of_their_drive():
+    """Counted drive by drive; differences of two electrodes are measured one by one."""
+    ring = protocol.adjacent(6, driven_electrodes=True)
+    assert np.linalg.matrix_rank(ring.measurement) == 5
+    assert ring.repeated_facts() == 0
+    # L voltages against the mean of the others, of which L - 1 are independent.
+    for number in (3, 8):
+        for kind in ("mean", "mean-removed"):
+            chosen = protocol.haar(number, measurement=kind)
+            assert chosen.repeated_facts() == number - 1, (number, kind)
+            all_but_one = np.arange(1, chosen.num_measurements)
+            assert chosen.repeated_facts(all_but_one) == number - 2, (number, kind)
+            assert chosen.repeated_facts(all_but_one[::-1]) == number - 2, (number, kind)
+    # The first drive is measured between neighbours only, the second also against the mean.
+    rows = np.concatenate([ring.measurement, protocol.measurement_patterns(6, "mean")])
+    select = np.array([[True] * 6 + [False] * 6, [True] * 12])
+    assert protocol.from_matrices(np.asarray(ring.drive)[:2], rows, select).repeated_facts() == 12 - 5
 
 
 def test_subset_gives_the_same_voltages():
@@ -86,6 +136,7 @@ def test_subset_gives_the_same_voltages():
         (np.ones(5, bool), "one True or False per channel"),
         (np.zeros(40, bool), "no channel is left"),
         ([40], "from 0 to 39"),
+        ([-1], "from 0 to 39"),
         ([0.5], "integers"),
     ],
 )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jeit_solvers import kmeans
-from jeit_solvers.clustering import _lloyd
+from jeit_solvers.clustering import _kmeans_plus_plus, _lloyd
 
 
 def blobs(seed=0, count=30, number=400, d=24):
@@ -73,6 +73,26 @@ def together():
 
     both = jax.jit(jax.vmap(jax.grad(inertia, has_aux=True)))
     return jax.tree.map(np.asarray, both(SETS, jnp.stack([jax.random.key(seed) for seed in KEYS])))
+
+
+def plus_plus(points, draws):
+    """Textbook greedy k-means++: of a few points drawn in proportion to the squared distance from the nearest centre,
+    the one that leaves the least sum of them."""
+    centres = [points[int(draws[0, 0] * len(points))]]
+    for numbers in draws[1:]:
+        square = squared_distances(points, np.array(centres)).min(axis=1)
+        drawn = points[np.searchsorted(np.cumsum(square), numbers * square.sum(), side="right")]
+        left = [np.minimum(square, np.sum((points - one) ** 2, axis=1)).sum() for one in drawn]
+        centres.append(drawn[int(np.argmin(left))])
+    return np.array(centres)
+
+
+def test_starts_equal_greedy_kmeans_plus_plus():
+    random, start = np.random.default_rng(0), jax.jit(_kmeans_plus_plus)
+    for points in (blobs()[0], skin()):
+        points, draws = points - points.mean(axis=0), random.random((30, 5))
+        found = np.asarray(start(points, np.sum(points**2, axis=1), draws))
+        np.testing.assert_array_equal(found, plus_plus(points, draws))
 
 
 @pytest.mark.parametrize("steps", [1, 2, 5, 9])

@@ -380,7 +380,7 @@ def _update_noise_and_weights(fit: TapFit) -> TapFit:
     )
     usable = fit.usable
     tap_mean_square = np.minimum(squared_residual, 100.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
-    median_mean_square = max(float(np.median(tap_mean_square[usable.any(axis=0)])), 1e-6)
+    median_mean_square = float(np.median(tap_mean_square[usable.any(axis=0)]))
     fit = replace(fit, outlier=tap_mean_square > _OUTLIER_RATIO * max(median_mean_square, 0.2))
     variance = _level_variance(fit, received)
     return replace(fit, weight=(_T_FREEDOM + 1) / (_T_FREEDOM + residual**2 / variance) / variance)

@@ -248,7 +248,6 @@ def _escape_for_matplotlib(text: str) -> str:
 
 
 _PACKAGES = ("jeit", "jax", "numpy", "zarr", "xarray", "matplotlib")
-_TEXT_COLUMNS = ("layout", "protocol")
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 70em; margin: 2em auto; padding: 0 1em; color: #222 }
 table { border-collapse: collapse; font-size: 13px } th, td { padding: .2em .7em; text-align: right }
@@ -345,24 +344,18 @@ def _figure_html(figure: Any, caption: str) -> str:
 
 def _points_table(study: Study, data) -> str:
     """HTML table with a row for every point of a study: the swept parameters, then the scores."""
-    swept_names = list(study.points[0].coordinates)
-    values_and_units = {name: values_and_unit(data, name) for name in stored_score_names(data)}
-    column_titles = [
-        "point",
-        *swept_names,
-        *(name if unit == "1" else f"{name} / {unit}" for name, (_, unit) in values_and_units.items()),
-    ]
-    row_texts = [
-        "".join(
-            f'<th class="{"text" if title in _TEXT_COLUMNS else "number"}">{escape(title)}</th>'
-            for title in column_titles
-        )
-    ]
-    columns = [data[name].values.tolist() for name in swept_names] + [
-        values.tolist() for values, _ in values_and_units.values()
-    ]
-    for point_index, row in enumerate(zip(*columns, strict=True)):
-        row_texts.append("".join(_cell_text(value) for value in (point_index, *row)))
+    columns: dict[str, list] = {"point": list(range(len(study.points)))}
+    columns |= {name: data[name].values.tolist() for name in study.points[0].coordinates}
+    for name in stored_score_names(data):
+        values, unit = values_and_unit(data, name)
+        columns[name if unit == "1" else f"{name} / {unit}"] = values.tolist()
+    # Titles are aligned as the texts or numbers below them.
+    titles = (
+        f'<th class="text">{escape(title)}</th>' if isinstance(values[0], str) else f"<th>{escape(title)}</th>"
+        for title, values in columns.items()
+    )
+    rows = zip(*columns.values(), strict=True)
+    row_texts = ["".join(titles), *("".join(map(_cell_text, row)) for row in rows)]
     return '<div class="wide"><table>' + "\n".join(f"<tr>{row_text}</tr>" for row_text in row_texts) + "</table></div>"
 
 

@@ -275,23 +275,17 @@ def skins_of(layouts: Sequence[Layout | SurfaceLayout], protocols: Sequence[Prot
 
 def _can_share_mesh(skin: Skin, layout: Layout | SurfaceLayout) -> bool:
     """Whether the mesh of a skin can also be used for `layout`."""
-    if isinstance(layout, SurfaceLayout):
-        skin_layout = skin.layout
-        if (
-            not isinstance(skin_layout, SurfaceLayout)
-            or skin_layout.outward != layout.outward
-            or not _have_equal_num_electrodes(skin, layout)
-        ):
-            return False
-        return bool(eqx.tree_equal(skin_layout.surface, layout.surface))
-    if isinstance(skin.layout, SurfaceLayout):
+    skin_layout = skin.layout
+    if skin_layout.num_electrodes != layout.num_electrodes:
         return False
-    have_same_outline = eqx.tree_equal(skin.outline, plain_outline(layout.known_outline))
-    return bool(have_same_outline) and _have_equal_num_electrodes(skin, layout)
-
-
-def _have_equal_num_electrodes(skin: Skin, layout: Layout | SurfaceLayout) -> bool:
-    return layout.num_electrodes == skin.layout.num_electrodes
+    if isinstance(layout, SurfaceLayout):
+        return (
+            isinstance(skin_layout, SurfaceLayout)
+            and skin_layout.outward == layout.outward
+            and bool(eqx.tree_equal(skin_layout.surface, layout.surface))
+        )
+    # The outline of a curved skin is another kind of object, which equals no outline of a flat skin.
+    return bool(eqx.tree_equal(skin.outline, plain_outline(layout.known_outline)))
 
 
 def check_skin(name: str, skin) -> None:
