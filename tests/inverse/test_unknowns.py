@@ -9,7 +9,14 @@ import pytest
 from jeit.electrodes import BoundaryElectrodes, PointElectrodes, SheetDiscs
 from jeit.forward import ForwardModel
 from jeit.inverse import Gaussian, Parametrisation, TotalVariation, posterior, reconstruct
-from jeit.inverse.nonlinear import Background, ContactImpedance, ElectrodePosition, GaussNewton, Scale
+from jeit.inverse.nonlinear import (
+    Background,
+    ContactImpedance,
+    ElectrodePosition,
+    GaussNewton,
+    LevenbergMarquardt,
+    Scale,
+)
 from jeit.inverse.nonlinear.problem import independent_data
 from jeit.inverse.nonlinear.reconstruct import pose
 from jeit.layout import grid, ring
@@ -55,7 +62,6 @@ def test_estimated_positions_improve_an_image(model):
     truth = model_of(4000, shift)
     voltages, noise = noisy(truth.voltages(jnp.where(inclusion(truth.mesh), 3.0, 1.0)))
     options = {"prior": TotalVariation(), "noise": noise, "hyperparameter": 100.0}
-    options["solver"] = GaussNewton(max_steps=60)
     wrong = reconstruct(model, voltages, 1.0, **options)
     moving = Parametrisation(unknowns=[ElectrodePosition(model, 2e-3)])
     right = reconstruct(model, voltages, 1.0, parametrisation=moving, **options)
@@ -70,6 +76,24 @@ def test_estimated_positions_improve_an_image(model):
     assert alike[1] > 0.92
     moved = np.asarray(right.model.electrodes.position - model.electrodes.position)
     np.testing.assert_allclose(np.linalg.norm(moved, axis=1), np.abs(right.unknowns["ElectrodePosition"]), rtol=1e-9)
+
+
+def test_the_default_solver_damps_its_steps_if_there_are_unknowns(monkeypatch):
+    """Gauss-Newton steps lead too far where electrodes move."""
+    model = model_of(80)
+    chosen = []
+
+    def minimise(solver, inversion, start, box):
+        chosen.append(solver)
+        raise InterruptedError
+
+    for kind in (GaussNewton, LevenbergMarquardt):
+        monkeypatch.setattr(kind, "minimise", minimise)
+    for unknowns in ([], [ElectrodePosition(model, 1e-3)], [Scale()]):
+        with pytest.raises(InterruptedError):
+            parametrisation = Parametrisation(unknowns=unknowns)
+            reconstruct(model, np.ones(208), 1.0, noise=1e-3, hyperparameter=1.0, parametrisation=parametrisation)
+    assert chosen == [GaussNewton(), LevenbergMarquardt(max_steps=100), LevenbergMarquardt(max_steps=100)]
 
 
 @pytest.mark.slow
