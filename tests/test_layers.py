@@ -2,6 +2,7 @@
 others."""
 
 import ast
+import functools
 from collections import Counter
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -45,10 +46,17 @@ def modules(top: Path) -> dict[str, Path]:
     return named
 
 
+@functools.cache
+def parsed(path: Path) -> ast.Module:
+    """Syntax tree of a file, for all tests; test files that change have paths of their own."""
+    return ast.parse(path.read_text("utf-8"))
+
+
+@functools.cache
 def imported(path: Path) -> set[str]:
     """Dotted names that a file imports anywhere: modules, and names taken from them."""
     names = set()
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -63,13 +71,13 @@ def offered(page: Path) -> set[str]:
     if not stub.exists():
         return on_import(page)
     package = ".".join(page.parent.relative_to(next(top for top in SOURCES if page.is_relative_to(top))).parts)
-    statements = [node for node in ast.parse(stub.read_text("utf-8")).body if isinstance(node, ast.ImportFrom)]
+    statements = [node for node in parsed(stub).body if isinstance(node, ast.ImportFrom)]
     return {f"{package}.{one.module}.{alias.name}" for one in statements if one.module for alias in one.names}
 
 
 def on_import(path: Path) -> set[str]:
     """Dotted names that are imported when the file is imported, or for type checkers; not those within functions."""
-    names, left = set(), list(ast.parse(path.read_text("utf-8")).body)
+    names, left = set(), list(parsed(path).body)
     while left:
         node = left.pop()
         if isinstance(node, ast.ImportFrom):
@@ -169,7 +177,7 @@ def test_no_module_assigns_a_constant_twice(top):
     """The second value would be read by functions written for the first."""
     twice = []
     for name, path in modules(ROOT / top).items():
-        statements = [one for one in ast.parse(path.read_text("utf-8")).body if isinstance(one, ast.Assign)]
+        statements = [one for one in parsed(path).body if isinstance(one, ast.Assign)]
         targets = [target for one in statements for target in one.targets]
         names = [one for target in targets for one in ast.walk(target) if isinstance(one, ast.Name)]
         given = [one.id for one in names if isinstance(one.ctx, ast.Store)]

@@ -15,10 +15,13 @@ from jeit_solvers.engines import host, namespace
 
 # Sizes of the smallest blocks of recursive inversion, without and with LAPACK.
 _BLOCK, _LAPACK_BLOCK = 8, 128
+# Number of smallest blocks that a compiled loop over rows may span. It runs as fast as recursion down to one block, and
+# compiles in half the time.
+_BLOCKS_OF_A_LOOP = 3
 # Maximum size of compiled matrices that are inverted by recursion.
 _MAX_RECURSIVE_SIZE = 128
 # Number of matrices in a batch above which unrolled code is used.
-_MIN_UNROLLED_BATCH = 16
+_MIN_UNROLLED_BATCH = 64
 
 
 def inverse_cholesky(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
@@ -144,20 +147,17 @@ def _inverse_square_root(pivot: Inexact[Array, "batch 1"]) -> Inexact[Array, "ba
 def _inverse_cholesky_recursive(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
     """Inverse Cholesky factors, as defined in `inverse_cholesky`, computed by recursion on two by two blocks. Nearly
     all operations are matrix products, which are three to four times faster than LAPACK's inverse of a triangular
-    matrix. The smallest blocks are inverted by unrolled code in large batches, and by a loop over short vectors in
-    small batches; blocks are larger for fewer matrices."""
+    matrix. The smallest blocks are inverted by unrolled code in large batches. In small batches a loop over short
+    vectors inverts larger blocks, the larger the fewer the matrices."""
     batch, size, _ = matrices.shape
     is_numpy = isinstance(matrices, np.ndarray)
     uses_lapack = is_numpy and not np.iscomplexobj(matrices)
     block = _LAPACK_BLOCK if uses_lapack else _BLOCK if batch > 4 else 2 * _BLOCK
-    if size <= block:
+    is_loop = not is_numpy and batch <= _MIN_UNROLLED_BATCH
+    if size <= (_BLOCKS_OF_A_LOOP * block if is_loop else block):
         if uses_lapack:
             return _inverse_cholesky_lapack(matrices)
-        return (
-            _inverse_cholesky_unrolled(matrices)
-            if batch > _MIN_UNROLLED_BATCH or is_numpy
-            else _inverse_cholesky_by_rows(matrices)
-        )
+        return _inverse_cholesky_by_rows(matrices) if is_loop else _inverse_cholesky_unrolled(matrices)
     first_size = block * -(-size // (2 * block))
     first_inverse = _inverse_cholesky_recursive(matrices[:, :first_size, :first_size])
     lower = matrices[:, first_size:, :first_size] @ _transposed(first_inverse)

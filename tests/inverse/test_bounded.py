@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.electrodes import BoundaryElectrodes
+from jeit.electrodes import PointElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse import Gaussian, Noser, Parametrisation, TotalVariation, reconstruct
 from jeit.inverse.nonlinear import (
@@ -25,8 +25,9 @@ from jeit.protocol import adjacent
 
 @pytest.fixture(scope="module")
 def model():
-    """Six electrodes and 25 nodes, because bounded solvers take seconds to compile."""
-    return ForwardModel(Disk(0.1).mesh(num_points=25), BoundaryElectrodes(ring(0.1, 6), 0.012, 1e-3), adjacent(6))
+    """Six points and 25 nodes, because bounded solvers take seconds to compile; twice as long for electrodes with a
+    width."""
+    return ForwardModel(Disk(0.1).mesh(num_points=25), PointElectrodes(ring(0.09, 6)), adjacent(6))
 
 
 def disturbed(model, inside):
