@@ -10,6 +10,7 @@ from jeit.design import Bell, touch_grid
 from jeit.design.skin.touched_cells import touched_cells
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.design.study import open_results, read_study, run_study, study_progress
+from jeit.design.study import run as study_run
 from jeit.electrodes import SheetDiscs
 from jeit.forward import ForwardModel
 from jeit.mesh import Rectangle, rectangle
@@ -126,3 +127,16 @@ def test_a_missing_package_names_the_extra(study, store_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "zarr", None)
     with pytest.raises(ImportError, match=r"pip install 'jeit\[cluster\]'"):
         run_study(study, store_path)
+
+
+def test_the_remaining_time_is_that_of_the_points_finished_in_this_run(monkeypatch):
+    """Points of earlier runs count as finished, but not for the time of a point."""
+    now = iter([100.0, 106.0, 110.0])
+    monkeypatch.setattr(study_run.time, "monotonic", lambda: next(now))
+    reports = []
+    reporter = study_run.ProgressReporter([(0, 1), (2, 3, 4), (5, 6, 7, 8, 9)], {0}, reports.append)
+    reporter.report_finished_chunk(1)
+    reporter.report_points(2)
+    assert reports[0] == (2, 10, 1, 3, None)
+    assert reports[1] == (5, 10, 2, 3, pytest.approx(5 * 6 / 3))
+    assert reports[2] == (7, 10, 2, 3, pytest.approx(3 * 10 / 5))

@@ -90,8 +90,8 @@ def test_the_default_solver_damps_its_steps_if_there_are_unknowns(monkeypatch):
     for kind in (GaussNewton, LevenbergMarquardt):
         monkeypatch.setattr(kind, "minimise", minimise)
     for unknowns in ([], [ElectrodePosition(model, 1e-3)], [Scale()]):
+        parametrisation = Parametrisation(unknowns=unknowns)
         with pytest.raises(InterruptedError):
-            parametrisation = Parametrisation(unknowns=unknowns)
             reconstruct(model, np.ones(208), 1.0, noise=1e-3, hyperparameter=1.0, parametrisation=parametrisation)
     assert chosen == [GaussNewton(), LevenbergMarquardt(max_steps=100), LevenbergMarquardt(max_steps=100)]
 

@@ -18,7 +18,7 @@ from jeit.layout import ring
 from jeit.live import ConductivityView, LiveFrame
 from jeit.live.views.conductivity import PixelGrid, channel_names, electrode_curves, scene_of
 from jeit.live.views.contacts import ContactsView
-from jeit.mesh import Disk, centroids, cylinder, sphere
+from jeit.mesh import Disk, centroids, cylinder, rectangle, sphere
 from jeit.protocol import adjacent, reference_electrode
 from jeit.touch import CellFinder, ImageNoise, find_contacts, track_contacts
 
@@ -98,6 +98,15 @@ def test_pixels_equal_those_of_the_stream(model, calibration, still, frames, mem
         assert [(marker.x, marker.y) for marker in picture.markers] == (
             [] if one.status == "unchanged" else [tuple(centroid)]
         )
+
+
+def test_pixels_are_squares_in_the_box_of_the_body():
+    """As many along the longer side as requested, and at least one along the shorter."""
+    for width, height, shape in ((0.2, 0.1, (8, 16)), (0.1, 0.2, (16, 8)), (0.2, 0.004, (1, 16))):
+        grid = PixelGrid(rectangle(width, height, num_points=120), 16)
+        assert grid.inside.shape == shape
+        np.testing.assert_allclose(grid.extent, (-width / 2, width / 2, -height / 2, height / 2), atol=1e-12)
+        assert grid.inside.all()
 
 
 def test_the_first_row_is_the_uppermost(model, calibration, imager):

@@ -1,6 +1,7 @@
 """Recordings are complete to the last whole frame, however they end, and the readers of other commands accept them."""
 
 import csv
+import dataclasses
 import errno
 import os
 import signal
@@ -18,6 +19,7 @@ from jeit.data import load_description, read, read_frame_recording
 from jeit.live import recording
 from jeit.live.pictures import LiveFrame
 from jeit.live.recording import Recorder
+from jeit.mesh import Disk
 
 HERE = Path(__file__).resolve().parent
 
@@ -70,6 +72,18 @@ def test_a_recording_is_read_with_its_times_description_and_reference(tmp_path):
         rows = list(csv.reader(file))
     assert rows[1] == ["0.500000", "half a line 0.1, 0."]
     assert rows[2][1].split() == ["0.0"] * (CHANNELS + 1)
+
+
+def test_a_reference_is_recorded_without_a_body_that_no_description_expresses(tmp_path):
+    reference = dataclasses.replace(measured(), domain=Disk(0.1).mesh(num_points=30))
+    recorder = Recorder(tmp_path, reference=reference)
+    folder = recorder.start()
+    recorder.add(frame(0, noisy(1)[0]))
+    recorder.stop()
+    again = read(folder / "reference.npz")
+    np.testing.assert_array_equal(again.voltages, reference.voltages)
+    assert again.protocol.same_patterns(reference.protocol)
+    assert again.domain is None
 
 
 def test_the_readers_of_skins_accept_it_too(tmp_path):

@@ -43,6 +43,17 @@ def test_channel_counts_of_the_literature(case):
     assert chosen.num_measurements == count
 
 
+def test_all_against_one_drives_against_one_and_measures_against_it_or_between_neighbours():
+    def pairs(patterns):
+        return {tuple(sorted(np.flatnonzero(row))) for row in np.asarray(patterns)}
+
+    against_two = {tuple(sorted((2, k))) for k in range(6) if k != 2}
+    neighbours = {tuple(sorted((k, (k + 1) % 6))) for k in range(6)}
+    for measurement, expected in (("common", against_two), ("adjacent", neighbours)):
+        chosen = protocol.all_against_one(6, common=2, measurement=measurement)
+        assert (pairs(chosen.drive), pairs(chosen.measurement)) == (against_two, expected)
+
+
 def test_currents_and_weights_sum_to_zero(case):
     chosen, _ = case
     # Rounding of a sum of 16 terms of size one.
