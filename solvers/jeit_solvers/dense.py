@@ -17,11 +17,11 @@ from jeit_solvers.engines import host, namespace
 _BLOCK, _LAPACK_BLOCK = 8, 128
 # Number of smallest blocks that a compiled loop over rows may span. It runs as fast as recursion down to one block, and
 # compiles in half the time.
-_BLOCKS_OF_A_LOOP = 3
+_BLOCKS_OF_A_LOOP = 4
 # Maximum size of compiled matrices that are inverted by recursion.
 _MAX_RECURSIVE_SIZE = 128
 # Number of matrices in a batch above which unrolled code is used.
-_MIN_UNROLLED_BATCH = 64
+_MIN_UNROLLED_BATCH = 32
 
 
 def inverse_cholesky(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:

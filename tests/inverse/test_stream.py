@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jeit.electrodes import BoundaryElectrodes
+from jeit.electrodes import PointElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse import Gaussian, Imager, Parametrisation, TotalVariation, reconstruct, stream
 from jeit.inverse.nonlinear import GaussNewton, LevenbergMarquardt, OneStep, Scale
@@ -37,14 +37,14 @@ def moving(model):
 @pytest.fixture(scope="module")
 def model():
     """A model with sixteen electrodes, for linear images."""
-    electrodes = BoundaryElectrodes(ring(RADIUS, 16), 0.012, 1e-3)
+    electrodes = PointElectrodes(ring(0.9 * RADIUS, 16))
     return ForwardModel(Disk(RADIUS).mesh(num_points=120), electrodes, adjacent(16))
 
 
 @pytest.fixture(scope="module")
 def small():
     """A model with six electrodes and 25 nodes for iterative images, which take two seconds to compile even so."""
-    electrodes = BoundaryElectrodes(ring(RADIUS, 6), 0.012, 1e-3)
+    electrodes = PointElectrodes(ring(0.9 * RADIUS, 6))
     return ForwardModel(Disk(RADIUS).mesh(num_points=25), electrodes, adjacent(6))
 
 
@@ -155,7 +155,7 @@ def test_frames_of_noise_alone_are_reported_as_unchanged(model, linear):
 @pytest.mark.slow
 def test_streams_with_total_variation():
     """A constant frame converges to `reconstruct`; with five electrodes, to limit compilation."""
-    electrodes = BoundaryElectrodes(ring(RADIUS, 5), 0.012, 1e-3)
+    electrodes = PointElectrodes(ring(0.9 * RADIUS, 5))
     tiny = ForwardModel(Disk(RADIUS).mesh(num_points=16), electrodes, adjacent(5))
     frame = np.asarray(tiny.voltages(np.where(np.asarray(centroids(tiny.mesh))[:, 0] > 0.03, 0.5, 1.0)))
     options = {**settings(tiny), "prior": TotalVariation(), "hyperparameter": 30.0}

@@ -25,6 +25,7 @@ from jeit_solvers import (
     solve,
 )
 from jeit_solvers.engines import on_device, on_host
+from jeit_solvers.sparse import padded_fronts
 
 # Residuals relative to |A| |x|; a backward stable solver reaches a small multiple of the unit roundoff.
 TOLERANCE = {"float32": 3e-6, "float64": 5e-15, "complex128": 5e-15}
@@ -100,6 +101,16 @@ def test_numpy_solves_every_problem_to_roundoff(case):
 @pytest.mark.parametrize(("case", "dtype"), COMPILED, ids=name_of)
 def test_compiled_code_solves_problems_to_roundoff(case, dtype):
     assert_solves_to_roundoff(case, dtype, on_device)
+
+
+def test_a_small_matrix_is_a_single_front(monkeypatch):
+    case = sparse_problems.diagonal
+    pattern, _, coordinates = case()
+    monkeypatch.setattr(padded_fronts, "_MAX_SINGLE_FRONT", pattern.size)
+    assert len(analyse(pattern, coordinates).stages) == 1
+    assert_solves_to_roundoff(case, "float64", on_host)
+    monkeypatch.setattr(padded_fronts, "_MAX_SINGLE_FRONT", pattern.size - 1)
+    assert len(analyse(pattern, coordinates).stages) > 1
 
 
 def test_entries_of_the_inverse_at_pairs_of_nodes_of_an_element():

@@ -26,6 +26,9 @@ from jeit_solvers.sparse.pattern import SparsityPattern
 # Size of the fronts at the leaves of the elimination tree: large enough for efficient matrix products, and small enough
 # to be treated as dense.
 _LEAF_SIZE = 24
+# Maximum size of a matrix that is a single front, as programs of two stages take twice as long to compile, and run no
+# faster.
+_MAX_SINGLE_FRONT = 64
 # Number of floating-point operations that take as long as the overhead of launching a stage.
 _OPERATIONS_WORTH_A_STAGE = 1e6
 
@@ -47,7 +50,7 @@ class EliminationTree:
         size = pattern.size
         rows, columns = np.asarray(pattern.rows, dtype=np.int64), np.asarray(pattern.columns, dtype=np.int64)
         self.size = size
-        depth = max(0, int(np.ceil(np.log2(size / _LEAF_SIZE))))
+        depth = 0 if size <= _MAX_SINGLE_FRONT else int(np.ceil(np.log2(size / _LEAF_SIZE)))
         owner = nested_dissection(graph_of(rows, columns, size), depth, coordinates)
         self._make_fronts(owner, depth)
         order = np.argsort(self.front, kind="stable")
