@@ -26,8 +26,8 @@ from jeit_solvers.sparse.pattern import SparsityPattern
 # Size of the fronts at the leaves of the elimination tree: large enough for efficient matrix products, and small enough
 # to be treated as dense.
 _LEAF_SIZE = 24
-# Maximum size of a matrix that is a single front, as programs of two stages take twice as long to compile, and run no
-# faster.
+# Maximum size of a matrix that is a single front: programs of two stages take 1.5 times as long to compile. They run as
+# fast for one matrix, and faster only for batches.
 _MAX_SINGLE_FRONT = 64
 # Number of floating-point operations that take as long as the overhead of launching a stage.
 _OPERATIONS_WORTH_A_STAGE = 1e6
