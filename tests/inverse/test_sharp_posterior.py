@@ -157,7 +157,7 @@ def test_steps_equal_those_of_the_whole_matrix(damping, image):
     inversion, point = on_host((image.inversion, image.coefficients))
     point = point + 0.05 * np.random.default_rng(0).normal(size=point.shape)
     residual, jacobian = inversion.linearise(point)
-    form, gradient = precision(inversion, point)[0], np.asarray(jax.grad(inversion.penalty.cost)(jnp.asarray(point)))
+    form, gradient = precision(inversion, point)[0], np.asarray(jax.jit(jax.grad(inversion.penalty.cost))(point))
     matrix = jacobian.T @ inversion.data.precision @ jacobian + (1 + damping) * form
     expected = -np.linalg.solve(matrix, jacobian.T @ inversion.data.precision @ residual + gradient)
     direction, _, curvature = inversion.quadratic_model(point)[1](damping)

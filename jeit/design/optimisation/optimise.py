@@ -200,11 +200,13 @@ class _LayoutSearch(Module):
         )
         if not is_valid.any():
             nearest_start = int(violations.argmin())
-            violations_by_name = self.constraints.violations_by_name(
-                jnp.asarray(parameters.centres[nearest_start]), jnp.asarray(parameters.radii[nearest_start])
+            violations_by_name = _violations_by_name(
+                self.constraints,
+                jnp.asarray(parameters.centres[nearest_start]),
+                jnp.asarray(parameters.radii[nearest_start]),
             )
             worst_name = max(
-                violations_by_name, key=lambda name: float(jnp.max(violations_by_name[name], initial=-jnp.inf))
+                violations_by_name, key=lambda name: float(np.max(violations_by_name[name], initial=-np.inf))
             )
             min_violation = 1e3 * violations.min()
             reason = (
@@ -258,9 +260,13 @@ def _penalty(variables: Variables, constraints: Constraints, variable_values, ma
     return jnp.sum((jnp.maximum(violations, 0) / variables.pitch) ** 2)
 
 
+_violations_by_name = eqx.filter_jit(Constraints.violations_by_name)
+
+
 def _largest_violation(constraints: Constraints, centres, radii) -> float:
     """Largest violation of a constraint, metres; zero or negative if all constraints are satisfied."""
-    return float(jnp.max(constraints.violations(jnp.asarray(centres), jnp.asarray(radii))))
+    violations = _violations_by_name(constraints, centres, radii)
+    return max(float(np.max(values, initial=-np.inf)) for values in violations.values())
 
 
 def _make_feasible(variables: Variables, constraints: Constraints, start_variables):

@@ -19,6 +19,7 @@ from jeit.design.skin.skin import Skin, check_skin
 from jeit.design.skin.touches import AbstractIndentation
 from jeit.electrodes import SheetDiscs
 from jeit.mesh import Domain
+from jeit_solvers.engines import as_array
 from jeit_solvers.module import Module
 
 Symmetry = Literal["mirror-x", "mirror-y", "rotate-2", "rotate-4"]
@@ -138,7 +139,7 @@ class Variables(Module):
         if thickness_range is not None:
             start.append(thickness_range.variables(np.asarray(initial.thickness)[None]))
         radii, impedance = (
-            jnp.tile(jnp.asarray(values)[is_generator], len(images))[order]
+            as_array(np.tile(np.asarray(values)[is_generator], len(images))[order])
             for values in (radii, initial.contact_impedance)
         )
         symmetric_parameters = LayoutParameters(initial.centres, radii, impedance, initial.thickness)
@@ -149,7 +150,7 @@ class Variables(Module):
     def represents(self, parameters: LayoutParameters) -> bool:
         """Whether the variables `start` reproduce the given `parameters`: True if the parameters have the symmetry and
         lie in the ranges."""
-        represented = self.parameters(jnp.asarray(self.start))
+        represented = _compiled_parameters(self, jnp.asarray(self.start))
         are_equal = (
             np.allclose(represented_values, given_values, rtol=1e-6, atol=0)
             for represented_values, given_values in zip(represented[1:], parameters[1:], strict=True)
@@ -194,6 +195,9 @@ class Variables(Module):
     def _values_of_images(self, values: Float[Array, " G"]) -> Float[Array, " L"]:
         """Repeat the values (G,) of the generators for their images: values (L,) of all electrodes."""
         return jnp.tile(values, len(self.images))[self.order]
+
+
+_compiled_parameters = eqx.filter_jit(Variables.parameters)
 
 
 def _is_in_first_sector(offsets: np.ndarray, symmetry: str | None) -> np.ndarray:

@@ -31,7 +31,7 @@ from jeit.forward.system import cell_conductivity, check_conductivity, stiffness
 from jeit.forward.transfer import fields_and_inverse
 from jeit.protocol import Protocol
 from jeit_solvers import NearInverse, Strips, over_cores
-from jeit_solvers.engines import has_values, on_device
+from jeit_solvers.engines import evaluate_in_numpy, has_values, on_device
 from jeit_solvers.module import Module
 
 # Tolerance of the error bound, relative to the voltage changes, and maximum number of conjugate-gradient steps.
@@ -284,7 +284,11 @@ class RestingSkin(Module):
         if 8 * float(strips.num_strips * strips.selected_per_strip) ** 2 > max_bytes:
             return None
         solved = evaluate(model, solved_system_of, conductivity)
-        voltages = channel_voltages(model.protocol, solved.impedance())
+        voltages = on_device(
+            evaluate_in_numpy(
+                lambda solved, protocol: channel_voltages(protocol, solved.impedance()), solved, model.protocol
+            )
+        )
         skin_fields_and_inverse = fields_and_inverse(solved, strips, max(strips.num_strips - 1, 1))
         return cls(model, voltages, cell_stiffness(model, conductivity), strips, *skin_fields_and_inverse)
 

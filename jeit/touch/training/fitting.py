@@ -228,7 +228,7 @@ class _CompiledTraining:
             return objective.held_out(combine(arrays), jax.tree.map(lambda array: array[rows], data))
 
         self._train_batch, self._held_out_loss = jax.jit(train_batch), jax.jit(held_out_loss)
-        self.optimiser = adam.init(eqx.filter(eqx.partition(network, trained)[0], eqx.is_inexact_array))
+        self.optimiser = jax.jit(adam.init)(eqx.filter(eqx.partition(network, trained)[0], eqx.is_inexact_array))
 
     def combine(self, arrays) -> Any:
         """Combine the given arrays with the fixed parts of the network."""

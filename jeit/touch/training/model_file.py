@@ -16,6 +16,7 @@ import numpy as np
 
 from jeit.arguments import describe
 from jeit.files import error_text, written_whole
+from jeit_solvers.engines import as_array
 
 # First bytes of a model file; maximum size of its header, and of all its arrays together, bytes.
 _MAGIC, _MAX_HEADER_SIZE, _MAX_ARRAY_SIZE = b"jeit model\n", 2**20, 2**31
@@ -157,7 +158,7 @@ def _read_array(file: BinaryIO, leaf: Any) -> Any:
     values = np.frombuffer(data, dtype).reshape(shape, order="F" if columns_first else "C")
     if np.isnan(values).any():
         raise ValueError("some of its numbers are NaN")
-    return jax.numpy.asarray(values)
+    return as_array(values)
 
 
 def _are_equal(first: Any, second: Any) -> bool:

@@ -21,7 +21,7 @@ CUT = Cut([(-0.005, 0.014), (0.02, 0.024)])
 MATERIAL = material("velostat")
 SHEET = MATERIAL.conductivity * MATERIAL.thickness
 DAMAGED, PRESSED = 12.0, (10.0, 13.0)
-SECONDS = np.arange(0, 30, 0.2)
+SECONDS = np.arange(0, 26, 0.25)
 
 
 def disk_model(num_points: int, refine=None) -> ForwardModel:
@@ -31,7 +31,7 @@ def disk_model(num_points: int, refine=None) -> ForwardModel:
 
 @pytest.fixture(scope="module")
 def skin() -> PressedSkin:
-    return PressedSkin(jax.random.key(0), disk_model(1200, CUT.refine(1.5e-3)), MATERIAL)
+    return PressedSkin(jax.random.key(0), disk_model(800, CUT.refine(1.5e-3)), MATERIAL)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def press(places, starts, load=2.0, last=1.0) -> MovingPress:
 def health(skin) -> SkinHealth:
     places = 0.03 * np.array([(np.cos(a), np.sin(a)) for a in np.arange(6)])
     frames = record_damage(jax.random.key(1), skin, press(places, 2.0 + 4.5 * np.arange(6)), SECONDS, [])
-    return SkinHealth.fit(frames, SECONDS, patience=9.0, model=disk_model(700), conductivity=SHEET)
+    return SkinHealth.fit(frames, SECONDS, patience=9.0, model=disk_model(500), conductivity=SHEET)
 
 
 @pytest.fixture(scope="module")
