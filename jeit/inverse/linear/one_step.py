@@ -21,7 +21,17 @@ from jeit.inverse.linearisation import Linearisation
 from jeit.inverse.prior.priors import AbstractPrior
 from jeit.inverse.spectrum import Spectrum
 from jeit.mesh import Mesh
-from jeit_solvers.engines import as_array, has_values, is_forked, on_device, on_host, product_for_jax
+from jeit_solvers.engines import (
+    add_into,
+    as_array,
+    has_values,
+    is_forked,
+    on_device,
+    on_host,
+    product_for_jax,
+    sum_into,
+    values_at_once,
+)
 
 # Approximate number of cells used to find the channels with proportional columns in the reconstruction matrix.
 _NUM_SAMPLED_CELLS = 4000
@@ -154,10 +164,7 @@ class LinearReconstruction:
     @property
     def matrix(self) -> Inexact[Array, "m M"]:
         """Full reconstruction matrix (m, M), zero in the columns of masked channels."""
-        weights = self.weights if self.mixing is None else self.mixing @ self.weights
-        full = jnp.zeros((self.num_measurements, weights.shape[1]), weights.dtype)
-        full = full.at[self.second].add(self.ratio[:, None] * weights)
-        return full.at[self.first].add(weights).T
+        return _full_matrix(self)
 
     def image(self, difference: Inexact[Array | np.ndarray, "*frames M"]) -> Inexact[Array, "*frames m"]:
         """Change of conductivity in every cell, (m,) or (F, m), for one difference of frames (M,) or several (F, M), in
@@ -187,6 +194,13 @@ class LinearReconstruction:
         """Arrays used by `image`, converted to NumPy only once, because a conversion takes as long as the product."""
         arrays = (self.first, self.second, self.ratio, self.mixing, self.weights)
         return on_host(arrays) if has_values(arrays) else arrays
+
+
+@values_at_once
+def _full_matrix(linear: LinearReconstruction) -> Inexact[Array, "m M"]:
+    weights = linear.weights if linear.mixing is None else linear.mixing @ linear.weights
+    full = sum_into((linear.num_measurements, weights.shape[1]), linear.second, linear.ratio[:, None] * weights)
+    return add_into(full, linear.first, weights).T
 
 
 def _image_product(arrays, difference) -> Any:

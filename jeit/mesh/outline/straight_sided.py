@@ -301,7 +301,7 @@ def distance_from_loops(loops: Sequence[Loop], points: ArrayLike) -> Float[Array
     xp = numerics(loops, points)
     point_array, is_inside, nearest_points = _project_onto_loops(xp, loops, points)
     distances = xp.sqrt(((point_array - nearest_points) ** 2).sum(axis=1) + 1e-24)  # differentiable at zero, too
-    return jnp.asarray(xp.where(is_inside, distances, -distances))
+    return as_array(xp.where(is_inside, distances, -distances))
 
 
 def nearest_in_loops(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, "p 2"]:
@@ -309,7 +309,7 @@ def nearest_in_loops(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, "
     unchanged."""
     xp = numerics(loops, points)
     point_array, is_inside, nearest_points = _project_onto_loops(xp, loops, points)
-    return jnp.asarray(xp.where(is_inside[:, None], point_array, nearest_points))
+    return as_array(xp.where(is_inside[:, None], point_array, nearest_points))
 
 
 def _project_onto_loops(xp: Any, loops: Sequence[Loop], points: ArrayLike) -> tuple[Any, Any, Any]:

@@ -28,6 +28,7 @@ from jeit.touch.simulate.contact.indent_sets import image_places
 from jeit.touch.simulate.contact.indenters import AbstractIndenter
 from jeit.touch.simulate.contact.indents import relative_changes, relative_to
 from jeit.touch.simulate.contact.samples import lattice
+from jeit_solvers.engines import on_host
 
 # Fraction of a map's maximum depth below which a pixel is not part of a touch.
 _TOUCH_FRACTION = 0.5
@@ -212,5 +213,5 @@ def _contact_changes(skin: Skin, rest_voltages, conductivity) -> Float[np.ndarra
     derivatives = ContactSensitivity(model.mesh, model.electrodes)(
         fields, impedance, model.electrodes.contact_impedance
     )
-    changes = np.stack([select_channels(model.protocol, derivative) for derivative in derivatives])
+    changes = np.stack([select_channels(*on_host((model.protocol, derivative))) for derivative in derivatives])
     return relative_to(np.asarray(rest_voltages), np.asarray(rest_voltages) + changes)

@@ -13,6 +13,7 @@ from jeit.touch.listening.learners import LEARNERS, NetworkListener, TrainingSet
 from jeit.touch.listening.modality_network import NetworkAnswers, library_plan, paper_plan
 
 KEY = jax.random.key(1)
+METHODS = ModalityNetwork.log_odds_in_training, ModalityNetwork.log_odds
 
 
 def test_outputs_in_numpy_equal_those_of_the_network():
@@ -20,13 +21,13 @@ def test_outputs_in_numpy_equal_those_of_the_network():
     random = np.random.default_rng(0)
     network = ModalityNetwork.draw(KEY, 89, 41, 5)
     images = (3 + 2 * random.standard_normal((4, 89, 41))).astype(np.float32)
-    answers, moved = network.log_odds_in_training(images)
-    np.testing.assert_array_equal(answers, network.log_odds_in_training(images)[0])
-    learn = jax.jit(lambda one: one.log_odds_in_training(images)[1])
+    learn, answer = (jax.jit(lambda one, method=method: method(one, images)) for method in METHODS)
+    answers, moved = learn(network)
+    np.testing.assert_array_equal(answers, learn(network)[0])
     for _ in range(200):
-        moved = learn(moved)
-    np.testing.assert_allclose(moved.log_odds(images), answers, rtol=1e-3, atol=1e-3)
-    np.testing.assert_allclose(NetworkAnswers(moved).log_odds(images), moved.log_odds(images), rtol=1e-3, atol=1e-4)
+        moved = learn(moved)[1]
+    np.testing.assert_allclose(answer(moved), answers, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(NetworkAnswers(moved).log_odds(images), answer(moved), rtol=1e-3, atol=1e-4)
     assert network.dense.shape[0] == 13 * 5 * 64
     assert NetworkAnswers(network).log_odds(images[:0]).shape == (0, 5)
 

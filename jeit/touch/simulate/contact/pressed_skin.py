@@ -39,7 +39,7 @@ from jeit.touch.simulate.contact.cell_pressure import pressed_cells
 from jeit.touch.simulate.contact.materials import Material
 from jeit.touch.simulate.contact.press import MovingPress, Press, motions_of, touches_of
 from jeit.touch.simulate.contact.samples import Samples
-from jeit_solvers.engines import as_array
+from jeit_solvers.engines import as_array, on_host
 from jeit_solvers.module import Module
 
 
@@ -382,7 +382,7 @@ class PressedSkin(Module):
             return np.zeros((electrodes.num_electrodes, protocol.num_measurements))
         fields, impedance = (np.asarray(array) for array in self.model.fields(self.conductivity))
         derivative = ContactSensitivity(self.model.mesh, electrodes)(fields, impedance, electrodes.contact_impedance)
-        return np.stack([select_channels(protocol, matrix) for matrix in derivative])
+        return np.stack([select_channels(*on_host((protocol, matrix))) for matrix in derivative])
 
 
 def _collect_changes(places, cells, changes, num_cells: int) -> TouchedCells:

@@ -10,11 +10,13 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
+from scipy.special import ndtr
 
 from jeit.arguments import check_key, check_kind, check_name, describe, is_number, real_array
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model, select_channels
 from jeit.touch.simulate.contact import MovingPress, PressedSkin
+from jeit_solvers.engines import on_host
 from jeit_solvers.module import Module
 
 FaultKind = Literal["dead", "loose", "torn"]
@@ -121,7 +123,7 @@ class ElectrodeFault(Module):
             for impedance in (initial_impedance, faulty_impedance)
         ]
         relative_currents = np.minimum(1.0, _MAX_VOLTAGE_RATIO * voltage_ranges[0].max() / voltage_ranges[1])
-        voltages = np.asarray(select_channels(model.protocol, faulty_impedance))
+        voltages = np.asarray(select_channels(*on_host((model.protocol, faulty_impedance))))
         return voltages * relative_currents[np.asarray(model.protocol.drive_index)]
 
     def _loose_contact_voltages(self, key: Array, model: ForwardModel, conductivity, seconds: np.ndarray) -> np.ndarray:
@@ -142,7 +144,7 @@ class ElectrodeFault(Module):
             fluctuation[frame] = fluctuation_value
         # The normal distribution function, applied to the fluctuation, makes the factor's logarithm uniformly
         # distributed.
-        level_positions = np.asarray(jax.scipy.stats.norm.cdf(fluctuation)) * (_NUM_LEVELS - 1)
+        level_positions = ndtr(fluctuation) * (_NUM_LEVELS - 1)
         lower_levels = np.minimum(level_positions.astype(int), _NUM_LEVELS - 2)
         upper_weights = (level_positions - lower_levels)[:, None]
         table = np.array(level_voltages)
