@@ -15,8 +15,8 @@ from jeit_solvers.engines import host, namespace
 
 # Sizes of the smallest blocks of recursive inversion, without and with LAPACK.
 _BLOCK, _LAPACK_BLOCK = 8, 128
-# Number of smallest blocks that a compiled loop over rows may span. It runs as fast as recursion down to one block, and
-# compiles in half the time.
+# Number of smallest blocks that a compiled loop over rows may span. It runs about as fast as recursion down to one
+# block, and compiles in half the time.
 _BLOCKS_OF_A_LOOP = 4
 # Maximum size of compiled matrices that are inverted by recursion.
 _MAX_RECURSIVE_SIZE = 128

@@ -241,7 +241,7 @@ def _check_protocol(model: ForwardModel, used) -> None:
 
 def _default_solver(parametrisation: Parametrisation) -> AbstractSolver:
     """Return the default solver. With further unknowns, such as the positions of electrodes, voltages are so nonlinear
-    that the line search of Gauss-Newton often leads nowhere; Levenberg-Marquardt converges in 25 to 70 steps."""
+    that the line search of Gauss-Newton often leads nowhere; Levenberg-Marquardt mostly converges in 10 to 70 steps."""
     if parametrisation.bounds is not None:
         return LBFGSB()
     return LevenbergMarquardt(max_steps=100) if parametrisation.unknowns else GaussNewton()
