@@ -32,6 +32,24 @@ def test_the_nearest_point_in_a_box(solver):
     assert not bool(run(0.5 * UPPER, max_steps=1).converged)
 
 
+@pytest.mark.parametrize("solver", [lbfgsb, projected_gradient])
+def test_the_objective_is_evaluated_between_the_bounds_only(solver):
+    """The accelerated gradient method would pass this minimum near a bound with its momentum."""
+    aim, curvature = np.array([0.01, 0.6]), np.array([[1.0, 0.9], [0.9, 1.0]])
+
+    def defined_for_positive(x):
+        distance = jnp.exp(jnp.log(x)) - aim
+        return distance @ curvature @ distance
+
+    @jax.jit
+    def run(start):
+        return solver(defined_for_positive, start, 1e-3, 1.0, max_steps=1000, tolerance=1e-6)
+
+    found = run(np.ones(2))
+    np.testing.assert_allclose(found.x, aim, atol=1e-4)
+    assert bool(found.converged)
+
+
 def test_scipy_solver_keeps_the_shape_and_reports_its_status():
     seen = []
     of_rows = jax.jit(jax.value_and_grad(lambda x: squares(x[0]) + squares(x[1])))

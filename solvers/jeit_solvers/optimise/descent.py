@@ -184,11 +184,23 @@ def projected_gradient(
     ```
     """
     jaxopt = _jaxopt()
-    solver = jaxopt.ProjectedGradient(
-        objective, jaxopt.projection.projection_box, maxiter=max_steps, tol=tolerance, acceleration=True
-    )
-    solution = solver.run(start, hyperparams_proj=(lower, upper))
-    return BoundedMinimum(solution.params, solution.state.iter_num, solution.state.error <= tolerance)
+    solver = jaxopt.ProjectedGradient(objective, jaxopt.projection.projection_box, acceleration=True)
+
+    def is_unfinished(carry):
+        _, state = carry
+        return (state.iter_num < max_steps) & (state.error > tolerance)
+
+    def step(carry):
+        point, state = carry
+        extrapolated = state.velocity
+        point, state = solver.update(point, state, hyperparams_proj=(lower, upper))
+        # jaxopt extrapolates beyond the bounds, where the objective may not be defined, and takes two equal points in
+        # succession for a minimum, although the gradient was computed elsewhere.
+        error = jnp.linalg.norm(point - extrapolated) / state.stepsize
+        return point, state._replace(velocity=jnp.clip(state.velocity, lower, upper), error=error)
+
+    solution, state = jax.lax.while_loop(is_unfinished, step, (start, solver.init_state(start)))
+    return BoundedMinimum(solution, state.iter_num, state.error <= tolerance)
 
 
 def scipy_lbfgsb(
