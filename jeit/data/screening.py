@@ -19,6 +19,8 @@ from jeit.protocol import Protocol
 _MAX_EXTRA_COLUMNS = 4
 # Maximum plausible voltage on an electrode, in volts.
 _MAX_VOLTAGE = 1000.0
+# Minimum number of equal extreme values that count as saturated.
+_MIN_SATURATED = 4
 
 
 def screen(
@@ -157,17 +159,30 @@ def _find_saturated(values: np.ndarray, usable: np.ndarray, saturation: float | 
     result = np.zeros(values.shape, dtype=bool)
     components = [np.real(values), np.imag(values)] if np.iscomplexobj(values) else [values]
     for component in components:
-        for frame, (row, row_usable) in enumerate(zip(component, usable, strict=True)):
-            if row_usable.sum() < 8:
-                continue
+        used = np.where(usable, component, np.nan)
+        repeated = _is_minimum_repeated(used) | _is_minimum_repeated(-used)
+        for frame in np.flatnonzero(repeated & (usable.sum(axis=1) >= 8)):
+            row, row_usable = component[frame], usable[frame]
             levels, level_index, counts = np.unique(row[row_usable], return_inverse=True, return_counts=True)
             for extreme in (0, len(levels) - 1):
                 # A coarse converter or a simulated symmetric body also produces exactly equal extremes, but then values
                 # between them repeat as often; in saturated data only the extreme value repeats.
                 other_counts = np.delete(counts, [0, len(levels) - 1]) if len(levels) > 2 else np.zeros(1)
-                if levels[extreme] != 0 and counts[extreme] >= 4 and counts[extreme] >= 4 * other_counts.max(initial=0):
+                if (
+                    levels[extreme] != 0
+                    and counts[extreme] >= _MIN_SATURATED
+                    and counts[extreme] >= 4 * other_counts.max(initial=0)
+                ):
                     result[frame, np.flatnonzero(row_usable)[level_index == extreme]] = True
     return result
+
+
+def _is_minimum_repeated(rows: np.ndarray) -> Bool[np.ndarray, " F"]:
+    """Whether at least `_MIN_SATURATED` values of a row equal its minimum. NaN is left out."""
+    if rows.shape[1] < _MIN_SATURATED:
+        return np.zeros(len(rows), bool)
+    smallest = np.partition(rows, _MIN_SATURATED - 1, axis=1)[:, :_MIN_SATURATED]
+    return smallest.min(axis=1) == smallest.max(axis=1)
 
 
 def _current_flow(

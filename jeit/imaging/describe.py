@@ -45,6 +45,8 @@ _MIN_CHANNELS = 2
 # Maximum number of candidate protocols whose misfit is computed. A candidate is ruled out if its unexplained share is
 # at least `_RIVAL_RATIO` times that of the best candidate plus `_RIVAL_MARGIN`.
 _MAX_COMPARED, _RIVAL_RATIO, _RIVAL_MARGIN = 12, 1.3, 0.01
+# Maximum number of frames of a file with which protocols are compared; of more frames, some at regular intervals.
+_MAX_FRAMES = 32
 # Minimum reciprocity error for which gains are estimated.
 _MIN_GAIN_ERROR = 0.03
 # Maximum ratio of the reciprocity error after the correction by estimated gains to the error before.
@@ -70,6 +72,11 @@ class Candidate:
     measurement: Measurement
     wiring: Wiring | None = None
     gains: np.ndarray | None = None
+
+    @property
+    def is_cut_off(self) -> bool:
+        """Whether the last frame of the file, or of its reference, is incomplete."""
+        return any("is cut off after" in note for note in self.measurement.notes)
 
     @property
     def misfit(self) -> float:
@@ -201,6 +208,8 @@ def find_description(
     compared.sort(key=lambda item: (round(item.unexplained, 3), len(item.protocol)))
     winner = compared[0]
     rivals = [item for item in compared[1:] if item.unexplained < _RIVAL_RATIO * winner.unexplained + _RIVAL_MARGIN]
+    if not winner.is_cut_off:
+        rivals = [item for item in rivals if not item.is_cut_off]
     winner = _with_gains(winner, models)
     compared[0] = winner
     contact = {"contact_impedance": _contact_impedance(winner, models[winner.protocol["number"]])}
@@ -276,9 +285,13 @@ class _Numbers:
         text = read_text(path)
         length, lines = int(text.lengths[0]), len(text.lengths)
         total, shape = len(text.values), f"{counted(lines, 'line')} of {length}"
-        divisors = {total // k for k in range(1, 1 + total // max(length, 1)) if length < total // k}
+        # A frame that is wrapped over several lines ends with a line.
+        wrapped = {total // k for k in range(1, 1 + total // max(length, 1)) if length < total // k}
+        wrapped.intersection_update(np.cumsum(text.lengths).tolist())
         table = text.values.reshape(lines, length) if total == lines * length else np.zeros((0, 0))
-        sizes = tuple({length, length - 1, lines, *divisors})
+        sizes = tuple({length, length - 1, lines, *wrapped})
+        if text.part_size:  # a separator begins a frame or a part of one
+            sizes = tuple(size for size in sizes if size % text.part_size == 0)
         if lines == length == len(table) and _spread(table.T) < _spread(table):  # columns resemble each other more
             data = {"frames_in": "columns"}
             return cls(path, lambda counts: frames_in_table(table.T, counts, _UNKNOWN_LAYOUT), shape, sizes, data)
@@ -356,11 +369,12 @@ def _fitting(
                 continue
             found_protocols.add(protocol_key)
             description = _describe_body(geometry, electrodes, table, current)
-            measurements = [_measurement_of(values, description, protocol) for values in (numbers, base_numbers)]
-            if measurements[0] is not None and measurements[1] is not None:
-                empty_frame = measurements[1].mean_frame()
-                spread = _spread(np.asarray(measurements[1].filled()))
-                yield Candidate(table, measurements[0].num_frames, spread, reciprocity_error(empty_frame), empty_frame)
+            num_frames, measurement = _measurement_of(numbers, description, protocol)
+            base = measurement if base_numbers is numbers else _measurement_of(base_numbers, description, protocol)[1]
+            if measurement is not None and base is not None:
+                empty_frame = base.mean_frame()
+                spread = _spread(np.asarray(base.filled()))
+                yield Candidate(table, num_frames, spread, reciprocity_error(empty_frame), empty_frame)
 
 
 def _channel_counts(known: dict) -> list[int]:
@@ -385,15 +399,19 @@ def _protocol(table: dict, path: Path) -> Protocol | None:
         return None
 
 
-def _measurement_of(numbers: _Numbers, description: Description, protocol: Protocol) -> Measurement | None:
-    """The numbers of a file as a measurement with `protocol`; None if the numbers do not fit it."""
+def _measurement_of(numbers: _Numbers, description: Description, protocol: Protocol) -> tuple[int, Measurement | None]:
+    """Number of frames of a file with `protocol`, and at most `_MAX_FRAMES` of them as a measurement; None if the
+    numbers do not fit the protocol."""
     try:
         frames = numbers.frames([protocol.num_measurements])
         if frames.table.shape[1] != protocol.num_measurements:
-            return None
-        return measurement_in(numbers.path, description, frames, [(protocol, "")])
+            return 0, None
+        num_frames = len(frames.table)
+        chosen = np.unique(np.linspace(0, num_frames - 1, _MAX_FRAMES).round().astype(int))
+        some_frames = frames._replace(table=frames.table[chosen], times=None)
+        return num_frames, measurement_in(numbers.path, description, some_frames, [(protocol, "")])
     except ValueError:
-        return None
+        return 0, None
 
 
 def _with_misfit(candidate: Candidate, models: dict[int, ForwardModel]) -> Candidate:

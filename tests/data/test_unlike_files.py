@@ -323,7 +323,7 @@ def test_a_first_line_of_column_numbers_is_no_frame(index, first, frames, tmp_pa
     (tmp_path / "a.csv").write_text("\n".join(lines))
     found = read(tmp_path / "a.csv")
     np.testing.assert_allclose(found.voltages, values)
-    assert any("the first 1 line is a heading" in note for note in found.notes)
+    assert any("the first line is a heading" in note for note in found.notes)
 
 
 def test_json_is_named(frames, tmp_path):
@@ -342,7 +342,7 @@ def test_titles_between_frames(frames, tmp_path):
     (tmp_path / "a.csv").write_text("\n".join(blocks))
     found = read(tmp_path / "a.csv")
     np.testing.assert_allclose(found.voltages, values, rtol=1e-8)
-    assert any("2 more such lines stand between" in note for note in found.notes)
+    assert any("between the numbers, 2 lines such as 'Frame 1' are left out" in note for note in found.notes)
     (tmp_path / "a.csv").write_text("\n".join(blocks).replace("Frame 2", "broken"))
     with pytest.raises(ValueError, match="'broken' is no number"):
         read(tmp_path / "a.csv")

@@ -81,8 +81,12 @@ def describe(
         check_name("--protocol", known_values["kind"], ("adjacent", "skip", "opposite", "two_terminal"))
     if order is not None:
         check_name("--order", order, ("rotating", "fixed"))
+    examples = {"--shape disk:0.1": shape, "--width 0.01": width}
+    missing = [example for example, value in examples.items() if value is None]
+    if missing and not sys.stdin.isatty():
+        raise ValueError(f"{' '.join(missing)}: the file does not state the sizes; give them, in metres.")
     geometry, electrode_table = _body_tables(
-        _value_or_prompt("--shape", shape, "The body in metres, such as disk:0.1", "disk:0.1"), width, height
+        _value_or_prompt(shape, "The body in metres, such as disk:0.1"), width, height
     )
     make_folder(output, _WRITTEN_FILES)
     target = output / _DESCRIPTION_FILE
@@ -157,14 +161,9 @@ def _naming_sizes() -> Iterator[None]:
         raise ValueError(re.sub(r"^(--\w+): \1: ", r"\1: ", message)) from error
 
 
-def _value_or_prompt(option: str, value: Any, question: str, example: str) -> Any:
-    """Return the `value` of an option; if the value is missing, ask the user on the terminal. Raises `ValueError` if
-    the value is missing and there is no terminal."""
-    if value is not None:
-        return value
-    if not sys.stdin.isatty():
-        raise ValueError(f"{option}: no file says it; give {option} {example}, in metres.")
-    return typer.prompt(question)
+def _value_or_prompt(value: Any, question: str) -> Any:
+    """Return the `value` of an option; if the value is missing, ask the user on the terminal."""
+    return typer.prompt(question) if value is None else value
 
 
 def _body_tables(shape: str, width: float | None, height: float | None) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -180,7 +179,7 @@ def _body_tables(shape: str, width: float | None, height: float | None) -> tuple
         options = ", ".join(f"{shape_name}:{','.join(sizes).upper()}" for shape_name, (sizes, _) in _SHAPES.items())
         raise ValueError(f"--shape: give one of {options}, in metres; it is {shape[:40]!r}.")
     geometry = {"shape": name, **dict(zip(size_names, numbers, strict=True))}
-    electrode_width = float(_value_or_prompt("--width", width, "Width of an electrode in metres, such as 0.01", "0.01"))
+    electrode_width = float(_value_or_prompt(width, "Width of an electrode in metres, such as 0.01"))
     electrode_table: dict[str, Any] = {"layout": layout, "width": electrode_width}
     if name in ("cylinder", "box"):
         electrode_height = geometry["height"] if height is None else height

@@ -22,14 +22,16 @@ from jaxtyping import Float, Inexact
 
 from jeit.arguments import counted
 from jeit.data.description import TableLayout
+from jeit.data.formats.separated import Separators, line_pattern, separator_patterns
 from jeit.files import check_memory
 
 # Bytes of memory per byte of text: a number may take only two characters, and is stored twice, in eight bytes each.
 _MEMORY_FACTOR = 8
 # Number of lines from which separators are detected, and maximum number of lines of a heading.
 _NUM_SAMPLE_LINES, _MAX_HEADING_LINES = 40, 100
-# A word before the numbers of a line; the end of a number that is cut off.
+# A word before the numbers of a line; a word that is a line; the end of a number that is cut off.
 _LABEL = re.compile(r"\s{0,40}([A-Za-z_][\w ()/\[\].-]{0,60})[:=]\s{0,40}(?=[-+.\d])")
+_LONE_LABEL = re.compile(r"\s*[A-Za-z_][\w ]{0,60}:\s*")
 _CUT_NUMBER = re.compile(r"[-+]?(\d*[.,]?\d*([eE][-+]?)?|na?)")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 _COMPLEX = re.compile(r"\(?[-+]?[\d.]+(?:[eE][-+]?\d+)?[-+]{1,2}[\d.]+(?:[eE][-+]?\d+)?[ijIJ]\)?")
@@ -46,12 +48,14 @@ _MIN_MILLISECOND_STEP = 5
 
 class Text(NamedTuple):
     """The numbers of a text file. **Fields**: `values`: all numbers; `lengths`: number of values in each line;
-    `heading`: cells of the last line of the heading; `notes`: detected properties."""
+    `heading`: cells of the last line of the heading; `notes`: detected properties; `part_size`: number of values
+    between two separator lines, 0 without separators."""
 
     values: Inexact[np.ndarray, " n"]
     lengths: np.ndarray
     heading: tuple[str, ...]
     notes: tuple[str, ...]
+    part_size: int = 0
 
 
 class _NumberFormat(NamedTuple):
@@ -121,7 +125,8 @@ def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = 
     """Read the numbers of a text file. The `delimiter` between numbers and `skip_rows`, the number of heading lines,
     are detected if they are None.
 
-    Raises `ValueError`, with the line, for a file that contains anything but numbers or that was cut off.
+    Between separator lines, a few parts of which some numbers are missing or unreadable are replaced by NaN. Raises
+    `ValueError`, with the line, for a file that contains anything else but numbers or that was cut off.
     """
     check_memory(path.name, _MEMORY_FACTOR * path.stat().st_size)
     num_skipped = skip_rows or 0
@@ -130,52 +135,55 @@ def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = 
         _NumberFormat(_delimiter_for_split(delimiter), False) if delimiter is not None else _detect_format(lines)
     )
     num_heading = 0 if skip_rows is not None else _heading_length(number_format, lines)
+    patterns = {line_pattern(heading_line) for heading_line in lines[:num_heading]}
+    patterns |= separator_patterns(lines, lambda line: any(map(_is_number, number_format.cells(line))))
     values, imaginary, lengths, label = array("d"), array("d"), array("q"), ""
-    lines_after_heading, line, cells, is_cut_off = (
-        islice(_content_lines(path, num_skipped), num_heading, None),
-        "\n",
-        [],
-        False,
-    )
-    heading_patterns, num_repeated = {_line_pattern(heading_line) for heading_line in lines[:num_heading]}, 0
-    for line_number, line in lines_after_heading:
-        if lengths and _line_pattern(line) in heading_patterns:
-            num_repeated += 1
+    separators, fault = Separators(), ""
+    line, cells, row = "\n", [], []
+    for line_number, line in islice(_content_lines(path, num_skipped), num_heading, None):
+        if fault and not separators.examples:  # it is not in the last line, which may be cut off
+            raise ValueError(fault)
+        if line_pattern(line) in patterns or _LONE_LABEL.fullmatch(line):
+            separators.add(len(lengths), line_number, line)
             continue
         cells = number_format.cells(line)
-        try:
-            row = [_number(cell) for cell in cells]
-        except ValueError:
-            is_truncated = lengths and all(map(_is_number, cells[:-1])) and _CUT_NUMBER.fullmatch(cells[-1])
-            if not is_truncated or next(lines_after_heading, None) is not None:
-                raise ValueError(
-                    f"{path.name}, line "
-                    f"{line_number}{_not_a_number_message(cells, number_format, is_first=not lengths)}"
-                ) from None
-            row, is_cut_off = [_number(cell) for cell in cells[:-1]], True
+        row = _numbers_until_a_fault(cells)
+        if len(row) < len(cells):
+            message = _not_a_number_message(cells, number_format, is_first=not lengths)
+            fault = fault or f"{path.name}, line {line_number}{message}"
+            separators.unreadable.append(len(lengths))
         if not lengths and (label_match := _LABEL.match(line)):
             label = label_match[1].strip()
         values.extend([number.real for number in row])
         if imaginary or any(isinstance(number, complex) for number in row):
             imaginary.extend([0.0] * (len(values) - len(row) - len(imaginary)) + [number.imag for number in row])
         lengths.append(len(row))
+    is_cut_off = separators.unreadable[-1:] == [len(lengths) - 1] and len(lengths) > 1
+    is_cut_off = is_cut_off and len(row) == len(cells) - 1 and _CUT_NUMBER.fullmatch(cells[-1]) is not None
+    if is_cut_off:
+        separators.unreadable.pop()
+    numbers = np.array(values) + 1j * np.array(imaginary) if imaginary else np.array(values)
+    parts = separators.complete(numbers, np.array(lengths))
+    if separators.unreadable and parts is None:
+        raise ValueError(fault)
     if not values:
         raise ValueError(f"{path.name} holds no numbers.")
     notes = [f"numbers are separated by {number_format}."] if delimiter is None and number_format != _CSV_FORMAT else []
-    notes += (
-        [f"the first {num_heading} line{'s are' if num_heading > 1 else ' is'} a heading, skipped."]
-        if num_heading
-        else []
-    )
-    notes += [f"{num_repeated} more such lines stand between the numbers, and are left out."] if num_repeated else []
+    if num_heading:
+        notes.append(f"the first {f'{num_heading} lines are' if num_heading > 1 else 'line is'} a heading, skipped.")
+    if separators.examples:
+        number_text = counted(len(separators.examples), "line")
+        notes.append(f"between the numbers, {number_text} such as {separators.examples[0]!r} are left out.")
+    notes += [] if parts is None else parts.notes
     notes += [f"{label!r} stands before each line, and is left out."] if label else []
     if is_cut_off:
         notes.append(f"the last number, {cells[-1][:20]!r}, is cut off, and left out.")
     elif not line.endswith("\n") and len(cells) > 1 and len(cells[-1]) < min(map(len, cells[:-1])):
         notes.append(f"no line end follows the last number, {cells[-1][:20]}: is it cut off?")
     heading_cells = tuple(number_format.cells(lines[num_heading - 1])) if num_heading else ()
-    numbers = np.array(values) + 1j * np.array(imaginary) if imaginary else np.array(values)
-    return Text(numbers, np.array(lengths), heading_cells, tuple(notes))
+    if parts is None:
+        return Text(numbers, np.array(lengths), heading_cells, tuple(notes))
+    return Text(parts.numbers, parts.lengths, heading_cells, tuple(notes), parts.size)
 
 
 def rectangle(text: Text, name: str) -> Inexact[np.ndarray, "R C"]:
@@ -187,11 +195,6 @@ def rectangle(text: Text, name: str) -> Inexact[np.ndarray, "R C"]:
             "file cut off?"
         )
     return text.values.reshape(-1, length)
-
-
-def _line_pattern(line: str) -> str:
-    """A line with # in place of each number, so that "Frame 1" and "Frame 2" have the same pattern."""
-    return re.sub(r"\d+", "#", line.strip())
 
 
 def _without_label(line: str) -> str:
@@ -282,6 +285,17 @@ def _number(cell: str) -> complex:
         if not _COMPLEX.fullmatch(cell):
             raise
         return complex(cell.strip("()").replace("+-", "-").replace("i", "j").replace("I", "j"))
+
+
+def _numbers_until_a_fault(cells: list[str]) -> list[float | complex]:
+    """The numbers in cells, up to the first cell that contains anything else."""
+    numbers: list[float | complex] = []
+    for cell in cells:
+        try:
+            numbers.append(_number(cell))
+        except ValueError:
+            break
+    return numbers
 
 
 def _is_number(cell: str) -> bool:

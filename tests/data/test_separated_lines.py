@@ -1,0 +1,114 @@
+"""Recordings with a separator line before each frame, some frames of which are damaged: against the numbers that were
+written."""
+
+import numpy as np
+import pytest
+
+from jeit.data import read
+from jeit.data.formats.text import read_text
+from jeit.imaging.describe import _Numbers
+
+DESCRIPTION = """
+[geometry]
+shape = "disk"
+radius = 0.1
+
+[electrodes]
+layout = "ring"
+number = 8
+width = 0.01
+contact_impedance = 0.01
+
+[protocol]
+kind = "adjacent"
+number = 8
+order = "rotating"
+current = 0.001
+"""
+NUM_FRAMES = 20
+
+
+@pytest.fixture(scope="module")
+def values():
+    """Voltages of 8 electrodes, 5 channels of each drive, with the two digits of a serial port."""
+    return np.round(np.random.default_rng(0).uniform(0.5, 4.0, (NUM_FRAMES, 8, 5)), 2)
+
+
+def recording(values, separator="s"):
+    """The lines of a recording, a list for each frame."""
+    return [[separator, *(" ".join(f"{value:.2f}" for value in row) + "  " for row in frame)] for frame in values]
+
+
+def written(frames, path):
+    path.write_text("\n".join(line for frame in frames for line in frame) + "\n")
+    path.with_suffix(".toml").write_text(DESCRIPTION)
+    return path
+
+
+def lose_a_line(frame):
+    del frame[4]
+
+
+def join_two_numbers(frame):
+    frame[3] = frame[3].replace(" ", "", 1)
+
+
+def add_a_number(frame):
+    frame[3] += "1.00"
+
+
+def insert_a_word(frame):
+    frame[3] = "overflow"
+
+
+def swap_digits_for_a_letter(frame):
+    frame[3] = frame[3].replace(".", "x", 1)
+
+
+@pytest.mark.parametrize(
+    "damage", [lose_a_line, join_two_numbers, add_a_number, insert_a_word, swap_digits_for_a_letter]
+)
+def test_damaged_frames_are_empty(damage, values, tmp_path):
+    frames = recording(values)
+    for damaged in (6, 13):
+        damage(frames[damaged])
+    measured = read(written(frames, tmp_path / "a.txt"))
+    whole = np.setdiff1d(np.arange(NUM_FRAMES), [6, 13])
+    np.testing.assert_array_equal(np.abs(measured.voltages)[whole], values.reshape(NUM_FRAMES, -1)[whole])
+    np.testing.assert_array_equal(measured.mask.any(axis=1), np.isin(np.arange(NUM_FRAMES), whole))
+    first_line = 1 + sum(map(len, frames[:6]))
+    assert any("2 of 20 parts" in note and f"from line {first_line} on" in note for note in measured.notes)
+
+
+def test_a_recording_that_begins_and_ends_within_a_frame(values, tmp_path):
+    frames = recording(values)
+    del frames[0][:5], frames[-1][-2:]
+    measured = read(written(frames, tmp_path / "a.txt"))
+    assert not measured.mask[0].any()
+    np.testing.assert_array_equal(np.abs(measured.voltages)[1:], values.reshape(NUM_FRAMES, -1)[1:-1])
+    assert any("the last line is cut off" in note for note in measured.notes)
+
+
+def test_words_beside_separators(values, tmp_path):
+    frames = recording(values)
+    frames[0][0], frames[1][:1] = "reference:", ["difference:", "s"]
+    measured = read(written(frames, tmp_path / "a.txt"))
+    np.testing.assert_array_equal(np.abs(measured.voltages), values.reshape(NUM_FRAMES, -1))
+
+
+def test_a_recording_with_too_many_damaged_frames_is_refused(values, tmp_path):
+    frames = recording(values)
+    for damaged in (4, 9, 11):
+        join_two_numbers(frames[damaged])
+        frames[damaged][3] = frames[damaged][3].replace(".", ".x", 1)
+    with pytest.raises(ValueError, match=r"line 40, column 1: '.*' is no number"):
+        read(written(frames, tmp_path / "a.txt"))
+
+
+def test_a_frame_is_a_number_of_whole_parts(values, tmp_path):
+    """What a description can be found for: one part, or several."""
+    path = written(recording(values), tmp_path / "a.txt")
+    assert read_text(path).part_size == 40
+    sizes = _Numbers.read(path, None).sizes
+    assert 40 in sizes
+    assert {size % 40 for size in sizes} == {0}
