@@ -17,7 +17,7 @@ from contextlib import suppress
 from typing import Any
 
 from jeit.arguments.extras import optional
-from jeit.live.lines import LineBuffer, LineReading
+from jeit.data.formats.lines import LineBuffer, LineReading
 from jeit.live.pictures import LiveFrame
 from jeit.live.sources import CONNECTED, ENDED, AbstractSource
 

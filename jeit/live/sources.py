@@ -251,8 +251,8 @@ def open_source(
         return open_simulated(text, rate)
     scheme = text.partition(":")[0]
     if text == "-" or scheme in ("serial", "tcp"):
+        from jeit.data.formats.lines import LineReading
         from jeit.live.line_source import LineSource, ReadAhead, connection_to
-        from jeit.live.lines import LineReading
 
         return ReadAhead(LineSource(text, connection_to(text), LineReading(description, reference), rate))
     path = Path(text)

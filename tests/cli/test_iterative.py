@@ -129,6 +129,17 @@ def test_a_stream_from_standard_input(tank, run, tmp_path, monkeypatch):
     assert [row["status"] for row in rows_of(tmp_path / "out")] == [
         "imaged", "refused", "imaged", "refused", "partial",
     ]  # fmt: skip
+    # Frames of several lines after a separator, in the unit that the description states.
+    cells = [repr(1e3 * value) for value in map(float, tank.touched)]
+    wrapped = "".join(f"{' '.join(cells[k : k + 5])}\n" for k in range(0, 40, 5))
+    monkeypatch.setattr("sys.stdin", io.StringIO(f"frame 1\n{wrapped}frame 2\n{wrapped}"))
+    reference = tank.write("millivolts", 1e3 * tank.rest, tank.description.replace('"V"', '"mV"'))
+    status, _, error = run(
+        "stream", "-", "--reference", reference, "--output", tmp_path / "wrapped", "--method", "one-step", "--quiet",
+        "--film", "none", *FEW,
+    )  # fmt: skip
+    assert (status, error) == (0, "")
+    assert [row["status"] for row in rows_of(tmp_path / "wrapped")] == ["refused", "imaged", "imaged"]
     # A stream of which all frames are refused fails with the reason, and its table holds the reasons.
     monkeypatch.setattr("sys.stdin", io.StringIO("1 2 3\nrubbish\n"))
     status, _, error = run(

@@ -7,7 +7,7 @@ import pytest
 from small_sensor import CHANNELS, description, measured, noisy
 
 from jeit.data import read
-from jeit.live.lines import LineBuffer, LineReading
+from jeit.data.formats.lines import LineBuffer, LineReading
 
 
 def pieces(content, longest):

@@ -11,9 +11,9 @@ import pytest
 from small_sensor import CHANNELS, measured, noisy
 
 from jeit.data import write_table
+from jeit.data.formats.lines import LineReading
 from jeit.live import line_source, preparation
 from jeit.live.line_source import LineSource, ReadAhead, SerialPort, Server, StandardInput, connection_to
-from jeit.live.lines import LineReading
 from jeit.live.preparation import first_frames
 from jeit.live.sources import AbstractSource, PlayedRecording, WatchedFolder, open_source
 

@@ -34,7 +34,7 @@ def stream(
         str,
         typer.Argument(
             help="Measured file with the frames, or - for standard input: a frame a line, its voltages parted by "
-            "spaces or commas (nan: no reading).",
+            "spaces or commas (nan: no reading), or several lines after a separator line.",
             show_default=False,
         ),
     ],
@@ -120,8 +120,9 @@ def stream(
     from jeit.arguments import counted
     from jeit.cli.console import Steps, plain_console, say_written, with_unit
     from jeit.cli.streams import FrameCounter, Stopping
+    from jeit.data.formats.lines import LineReading, read_lines
     from jeit.data.imageable import mask_spikes
-    from jeit.imaging.stream_preparation import StreamSettings, frames_of, parse_frames, prepare_imager
+    from jeit.imaging.stream_preparation import StreamSettings, frames_of, prepare_imager
     from jeit.inverse import stream as stream_images
     from jeit.inverse.nonlinear.solvers import SOLVERS, frame_solvers
     from jeit.report import write_stream
@@ -170,7 +171,7 @@ def stream(
                 reference_measurement = measured if base is None else base
             imager, calibration = prepare_imager(reference_measurement, settings, measurement=measured, progress=step)
         if data == "-":
-            frames, num_frames = parse_frames(sys.stdin), None
+            frames, num_frames = read_lines(sys.stdin, LineReading(description, reference_measurement)), None
         else:
             measured = measured if settings.as_is else mask_spikes(measured, reference_measurement)
             frames, num_frames = frames_of(measured), measured.num_frames

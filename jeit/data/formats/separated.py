@@ -1,5 +1,7 @@
-"""Text files with a separator line before each frame or each part of a frame, as recordings of a serial port have.
-Parts with missing, superfluous or unreadable numbers are replaced by NaN, so that the other frames keep their places.
+"""Text with a separator line before each frame or each part of a frame, as devices on a serial port send it.
+
+In files, parts with missing, superfluous or unreadable numbers are replaced by NaN, so that the other frames keep their
+places. Of a device, the lines of a frame are joined.
 """
 
 from __future__ import annotations
@@ -103,3 +105,45 @@ class Separators:
             f"else, the first from line {self.positions[damaged[0]]} on: they are left empty (NaN)."
         )
         return CompleteParts(np.concatenate(number_parts), np.concatenate(length_parts), size, (note,))
+
+
+class WrappedLines:
+    """Joins the lines of a frame that a device sends as several lines of numbers after a separator line.
+
+    `channels`: number of channels of a frame. Lines that are frames themselves, and text that is not a separator, are
+    returned as they are. The first separator cannot be recognised, and is returned as text.
+    """
+
+    def __init__(self, channels: int):
+        self.channels = channels
+        self._separator = self._last_text = ""
+        self._numbers: list[float] | None = None  # of the frame that arrives, None outside of frames
+        self._is_damaged = False  # the frame that arrives has been reported already
+
+    def __call__(self, line: list[float] | str) -> list[float] | str | None:
+        """Add a line, as its numbers or as text. Returns a frame, or text or numbers that are not a frame; None if the
+        line belongs to a frame that is not complete."""
+        if isinstance(line, str):
+            return self._add_text(line)
+        if self._is_damaged and len(line) < self.channels:
+            return None
+        is_first = self._numbers == []
+        if self._numbers is None or len(line) >= self.channels or (is_first and self.channels % len(line)):
+            self._numbers = None
+            return line
+        self._numbers += line
+        if len(self._numbers) < self.channels:
+            return None
+        numbers, self._numbers = self._numbers, None
+        if len(numbers) == self.channels:
+            self._separator = self._last_text
+        return numbers
+
+    def _add_text(self, text: str) -> list[float] | str | None:
+        incomplete, pattern = self._numbers, line_pattern(text)
+        self._is_damaged = bool(self._separator) and pattern != self._separator
+        if self._is_damaged:
+            self._numbers = None
+            return text
+        self._last_text, self._numbers = pattern, []
+        return text if not self._separator else incomplete or None

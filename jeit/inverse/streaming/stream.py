@@ -126,7 +126,9 @@ class FrameCheck:
         if values.dtype.kind in "US":
             return values, no_channels, FrameStatus.REFUSED, f"The frame is text, not {self.mask.size} real voltages."
         if values.shape != self.mask.shape or values.dtype.kind not in "iuf":
-            reason = f"The frame is {values.dtype} of shape {values.shape}, not {self.mask.size} real voltages."
+            is_row = values.ndim == 1 and values.dtype.kind in "iuf"
+            found = f"has {values.size} numbers" if is_row else f"is {values.dtype} of shape {values.shape}"
+            reason = f"The frame {found}, not {self.mask.size} real voltages."
             return values, no_channels, FrameStatus.REFUSED, reason
         change = (values - self.expected)[self.mask]
         if change @ change < self.max_ordinary_square:  # False for frames with NaN and for frames of zeros

@@ -183,6 +183,7 @@ def projected_gradient(
     found = projected_gradient(bowl, jnp.zeros(3), 0.0, 1.0, max_steps=100, tolerance=1e-8)
     ```
     """
+    lower, upper = jnp.asarray(lower), jnp.asarray(upper)
     jaxopt = _jaxopt()
     solver = jaxopt.ProjectedGradient(objective, jaxopt.projection.projection_box, acceleration=True)
 

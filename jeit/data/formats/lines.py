@@ -6,6 +6,7 @@ from __future__ import annotations
 import itertools
 import re
 import tempfile
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from jaxtyping import Float
 from jeit.data import Measurement, load_description, read
 from jeit.data.description import Description
 from jeit.data.formats.boards import OpenEit
+from jeit.data.formats.separated import WrappedLines
 from jeit.data.formats.table import description_like
 from jeit.data.formats.text import LineNumbers
 
@@ -102,6 +104,7 @@ class LineReading:
         self.has_times = layout is None or layout.time_column is not False
         self.note = ""
         self._parse_numbers = LineNumbers()
+        self._join_lines = None if self.channels is None else WrappedLines(self.channels)
         self._channel_factors, self._num_factor_frames = np.ones(self.channels or 1), 0
         self._known_factors: np.ndarray | None = None
 
@@ -116,14 +119,19 @@ class LineReading:
 
     @np.errstate(all="ignore")  # numbers that are not voltages may overflow
     def __call__(self, line: bytes) -> Float[np.ndarray, " M"] | str | None:
-        """Return the frame in a line; the text of the line, shortened, if it is not a frame; None for a comment."""
+        """Return the frame in a line, or in this and the lines before it; the text of the line, shortened, if it is not
+        a frame; None for a comment, and for a part of a frame."""
         text = line.decode("utf-8", "replace").replace("\x00", "\ufffd").strip()
         if text.startswith(_COMMENT_PREFIXES):
             self.note = text[:_MAX_TEXT_LENGTH]
             return None
         word = _FRAME_WORD.match(line.strip())
         numbers = next(OpenEit.frames_in(line), None) if word else self._parse_numbers(text)
-        if numbers is None or not len(numbers):
+        if not word and self._join_lines is not None:
+            numbers = self._join_lines(list(numbers) if numbers else text)
+            if numbers is None:
+                return None
+        if numbers is None or isinstance(numbers, str) or not len(numbers):
             return text if len(text) <= _MAX_TEXT_LENGTH else f"{text[: _MAX_TEXT_LENGTH - 1]}…"
         row = np.array(numbers, float)
         if self.channels is not None and len(row) == self.channels + 1 and self.has_times:
@@ -203,6 +211,14 @@ class LineReading:
             return np.zeros(0)
         usable = np.asarray(self.reference.mask).all(axis=0)
         return np.where(usable, np.real(np.asarray(self.reference.voltages)).mean(axis=0), np.nan)
+
+
+def read_lines(lines: Iterable[str], reading: LineReading) -> Iterator[Float[np.ndarray, " M"] | str]:
+    """Yield the frames of lines of text as they arrive, in volts, and the text of lines that are not frames."""
+    for line in lines:
+        found = reading(line.encode()) if line.strip() else None
+        if found is not None:
+            yield found
 
 
 def _load_description(description: str | Path | None, reference: Measurement | None) -> Description | None:
