@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 
+from jeit.design.skin import voltage_changes
 from jeit.touch.networks import NetworkPreset, learn, linear_channels
 from jeit.touch.simulate import DiscIndenter
 from jeit.touch.training import TrainingPlan
@@ -26,13 +27,15 @@ SHAPE = (24, 24)
 
 @contextmanager
 def small_maps():
-    """Maps with half the usual numbers of rows and columns, and bodies of one kind in few sizes, to limit
-    compilation."""
+    """Maps with half the usual numbers of rows and columns, bodies of one kind, and one program for touches of all
+    sizes, to limit compilation."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(learn, "SHAPE", SHAPE)
         patch.setattr(learn, "_PLACES_PER_SIDE", 5)
         patch.setattr(linear_channels, "_PLACES_PER_SIDE", 5)
         patch.setattr(linear_channels, "_MAX_BODIES", 1)
+        padded = voltage_changes._padded_size
+        patch.setattr(voltage_changes, "_padded_size", lambda count, ratio: np.maximum(padded(count, ratio), 64))
         patch.setattr(linear_channels, "touching_bodies", lambda: [DiscIndenter(0.02)])
         yield
 

@@ -81,11 +81,17 @@ def _first_sentence(text: str | None) -> str:
 
 
 @cache
+def tree(path: Path) -> ast.Module:
+    """The syntax tree of a module, which is parsed once."""
+    return ast.parse(path.read_text("utf-8"))
+
+
+@cache
 def _defined(path: Path) -> tuple[tuple[str, str], ...]:
     """Public names that a module defines at its top, each with its docstring, or what stands by a constant."""
     defined = []
     lines = path.read_text("utf-8").split("\n")
-    body = ast.parse("\n".join(lines)).body
+    body = tree(path).body
     for node, after in zip(body, [*body[1:], None], strict=True):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             found = [(node.name, ast.get_docstring(node) or "")]
@@ -107,11 +113,11 @@ def _imported(path: Path, top: str) -> Iterator[tuple[str, str]]:
     stub = path.with_suffix(".pyi")
     if stub.exists():
         package = ".".join((top, *path.parent.relative_to(TOPS[top]).parts))
-        for node in ast.parse(stub.read_text("utf-8")).body:
+        for node in tree(stub).body:
             if isinstance(node, ast.ImportFrom) and node.module:
                 yield from ((alias.name, f"{package}.{node.module}.{alias.name}") for alias in node.names)
         return
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+    for node in ast.walk(tree(path)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == top:
             for alias in node.names:
                 name = alias.asname or alias.name
@@ -158,7 +164,7 @@ def packages() -> tuple[Package, ...]:
             exports = {name: _home(source) for name, source in sorted(_imported(init, top), key=lambda one: one[0])}
             exports |= {name: _home(f"{path}.{name}") for name, _ in _defined(init)}
             if path == "jeit.cli" or not _COMMANDS.match(path):
-                docstring = ast.get_docstring(ast.parse(init.read_text("utf-8"))) or ""
+                docstring = ast.get_docstring(tree(init)) or ""
                 found.append(Package(path, docstring, exports, modules))
     return tuple(found)
 
@@ -210,7 +216,7 @@ def page(package: Package) -> str:
         if rest:
             lines += [] if marked else ["## Internal modules", "", _MARK.format(where="from here on")]
             marked = True
-            docstring = ast.get_docstring(ast.parse(_file(module).read_text("utf-8"))) or ""
+            docstring = ast.get_docstring(tree(_file(module))) or ""
             lines += [f"### {module} {{ #{module} }}", "", docstring, ""]
             for one in rest:
                 lines += [f"::: {one.home}", "    options:", "      heading_level: 4", ""]

@@ -4,6 +4,7 @@ import ast
 import importlib
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -38,14 +39,17 @@ def public(tree: ast.Module) -> Iterator[tuple[str, Function, str]]:
                     yield f"{node.name}.{inner.name}", inner, said
 
 
-def own(function: Function) -> Iterator[ast.AST]:
-    """What stands in the body of a function itself, not in functions within."""
-    left: list[ast.AST] = list(function.body)
+@cache
+def own(function: Function) -> list[ast.Raise | ast.Call]:
+    """What the body of a function itself raises and calls, not functions within."""
+    found, left = [], list[ast.AST](function.body)
     while left:
         node = left.pop()
-        yield node
-        if not isinstance(node, Function | ast.Lambda | ast.ClassDef):
+        if isinstance(node, ast.Raise | ast.Call):
+            found.append(node)
+        if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda, ast.ClassDef)):
             left += ast.iter_child_nodes(node)
+    return found
 
 
 def raised(function: Function) -> set[str]:
@@ -66,7 +70,7 @@ def called(function: Function) -> set[str]:
 def faults(path: Path) -> list[str]:
     """What the docstrings of a module lack; a function also raises what the private functions beside it do for it."""
     found = []
-    tree = ast.parse(path.read_text("utf-8"))
+    tree = reference.tree(path)
     private = {one.name: raised(one) for one in tree.body if isinstance(one, Function) and one.name.startswith("_")}
     for name, function, said_of_class in public(tree):
         overloads = any("overload" in ast.unparse(one) for one in function.decorator_list)

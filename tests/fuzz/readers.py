@@ -24,6 +24,7 @@ from microphone_arrays import array
 from small_networks import SKIN
 from studies import SMALL
 from test_calibration_file import calibration, curved
+from thread_limits import libraries_found_once
 
 from jeit import data
 from jeit.acoustic import Calibration, IntensitySettings, Taps, read_recording, read_taps
@@ -43,7 +44,7 @@ from jeit.report import read_image
 from jeit.report.saved_image import saved_extras
 from jeit.touch import LearntSkin, PlacedMap, Presses, SelfOrganisingMap, read_presses, read_skin, write_skin
 from jeit.touch.gestures import GestureModel
-from jeit.touch.kohonen import MapSchedule, read_map, write_map
+from jeit.touch.kohonen import read_map, write_map
 from jeit.touch.learnt.presses import read_frames
 from jeit.touch.listening import LabelledClips, Listener
 from jeit.touch.networks import ImageNetwork, read_network, write_network
@@ -74,7 +75,7 @@ _ARM = tube(0.02, 0.05, num_points=60)
 def _files(name: str) -> dict[str, bytes]:
     import tempfile
 
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, libraries_found_once():
         READERS[name].make(Path(folder))
         found = sorted(one for one in Path(folder).rglob("*") if one.is_file())
         return {str(one.relative_to(folder)): one.read_bytes() for one in found}
@@ -416,7 +417,7 @@ def _asked():
 @_reader("map", "a.npz", read_map)
 def _map(folder):
     frames, places = _recorded()["frames"], _recorded()["positions"]
-    learnt = SelfOrganisingMap.fit(frames, jax.random.key(0), shape=(4, 4), schedule=MapSchedule(100, 100))
+    learnt = SelfOrganisingMap(frames[:16].reshape(4, 4, -1), 1.0)
     write_map(PlacedMap.learn(learnt, frames, places), folder / "a.npz")
 
 
@@ -440,7 +441,8 @@ def _network(folder):
     skin = Skin.create(layout, num_layers=0, cell_size=9e-3)
     extent = tuple(map(float, skin.outline.extent))
     made_for = describe_skin(skin.model.protocol, layout.centres, extent)
-    network = Unrolled(made_for["channels"], (12, 12), 2, key=jax.random.key(0))
+    shapes = jax.eval_shape(lambda: Unrolled(made_for["channels"], (12, 12), 2, key=jax.random.key(0)))
+    network = jax.tree.map(lambda one: np.ones(one.shape, one.dtype), shapes)
     write_network(ImageNetwork(network, "unrolled", 5e-3, (12, 12), extent, 1e-4, made_for), folder / "a.jeit")
 
 

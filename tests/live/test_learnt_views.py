@@ -44,7 +44,7 @@ def pictures(view, frames, seconds=None):
 
 @pytest.fixture(scope="module")
 def skin():
-    return LearntSkin.fit(Presses.create(**record(120)), method="neighbours")
+    return LearntSkin.fit(Presses.create(**record(80)), method="neighbours")
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def test_places_and_forces_equal_the_predictions(skin, presses):
     still = presses["reference"][:1]
     found = skin.predict(presses["frames"], still[0])
     made = pictures(LearntSkinView(skin, still), presses["frames"])
-    draws = np.random.default_rng(0).normal(size=(100_000, 2))
+    draws = np.random.default_rng(0).normal(size=(20_000, 2))
     for number, picture in enumerate(made):
         assert (picture.status == "refused") == found.unlike[number]
         if not np.isfinite(found.position[number]).all():
@@ -114,8 +114,8 @@ def test_labels_and_keys_are_events_once_they_last():
 
 
 def test_a_skin_learnt_by_sessions_is_refused():
-    given = record(120)
-    learnt = LearntSkin.fit(Presses.create(**given, group=np.arange(120) // 40), method="neighbours", per_session=True)
+    given = record(60)
+    learnt = LearntSkin.fit(Presses.create(**given, group=np.arange(60) // 20), method="neighbours", per_session=True)
     with pytest.raises(ValueError, match="--per-session"):
         LearntSkinView(learnt, given["reference"])
 

@@ -199,7 +199,7 @@ def test_contacts_are_shown_on_request(served, run):
 
 def test_a_learnt_skin_is_recognised_by_its_file(tmp_path):
     with libraries_found_once():
-        given = record(120)
+        given = record(60)
         skin = LearntSkin.fit(Presses.create(**given), method="neighbours")
     write_skin(skin, tmp_path / "skin.skops")
     later = record(10, seed=4)

@@ -6,6 +6,7 @@ channels and 84 latent values, and convolutions of 16, 32 and 64 channels.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jeit_solvers.engines import has_values
 from jeit_solvers.module import Module
 
 
@@ -123,8 +125,15 @@ def channels_to_pixels(image: Float[Array, "b r c 4"]) -> Float[Array, "b s d"]:
 
 
 def _draw_weights(key: Array, shape: tuple[int, ...], inputs: int) -> Array:
-    """Draw random initial weights of a layer; each output depends on a number `inputs` of values (He et al. 2015)."""
-    return jax.random.normal(key, shape, jnp.float32) * np.float32(np.sqrt(2 / inputs))
+    """Draw random initial weights of a layer; each output depends on a number `inputs` of values (He et al. 2015).
+
+    The number of draws is rounded up to a power of two, so that JAX compiles fewer programs for layers of different
+    sizes; the first draws are the same for any number.
+    """
+    num_weights = math.prod(shape)
+    draws = jax.random.normal(key, (1 << max(num_weights - 1, 0).bit_length(),), jnp.float32)
+    draws = np.asarray(draws) if has_values(draws) else draws
+    return jnp.asarray(draws[:num_weights].reshape(shape) * np.float32(np.sqrt(2 / inputs)))
 
 
 # Autoencoder of voltages: size of the hidden layers, size of the latent vector, and dropout rate; autoencoder of depth

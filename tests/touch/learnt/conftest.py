@@ -20,7 +20,7 @@ def _libraries_found_once():
 @pytest.fixture(scope="session")
 def recorded():
     """Presses on the simulated skin."""
-    return record(200)
+    return record(140)
 
 
 class Mean:

@@ -55,7 +55,7 @@ def test_the_best_method_is_selected(skin):
     assert {name.partition(" on ")[0] for name in errors} >= set(REGRESSORS)
     assert place.method == min(errors, key=errors.get)
     assert errors[place.method] < 0.5 * errors["ridge on differences"]
-    assert place.held_out.shape == (200, 2)
+    assert place.held_out.shape == (140, 2)
 
 
 def test_deviations_are_calibrated(skin):
@@ -95,7 +95,7 @@ def few_channels(number, seed):
 
 @pytest.fixture(scope="module")
 def skin_of_few_channels():
-    changes, place = few_channels(300, 0)
+    changes, place = few_channels(240, 0)
     return LearntSkin.fit(Presses.create(changes, positions=place), method="gaussian-process")
 
 
@@ -246,12 +246,12 @@ def test_keys_pressed_together():
 
 
 @pytest.mark.usefixtures("few_trees")
-@pytest.mark.parametrize("group", [None, np.repeat(np.arange(4), 20)])
+@pytest.mark.parametrize("group", [None, np.repeat(np.arange(3), 16)])
 def test_keys_pressed_in_sequence(group):
     """Where each person pressed one key only, the held-out data have a key without training data."""
     rng = np.random.default_rng(0)
-    touched = np.repeat(np.eye(4, dtype=bool), 20, axis=0)
-    frames = touched @ rng.normal(size=(4, 12)) + 0.1 * rng.normal(size=(80, 12))
+    touched = np.repeat(np.eye(3, dtype=bool), 16, axis=0)
+    frames = touched @ rng.normal(size=(3, 12)) + 0.1 * rng.normal(size=(48, 12))
     skin = LearntSkin.fit(Presses.create(frames, touched=touched, group=group))
     wrong = np.mean(skin.standing["keys"].held_out != touched)
     assert wrong < 0.01 if group is None else wrong >= 0.2

@@ -11,7 +11,7 @@ from jeit.touch.learnt.numbers import DeviationModel
 @pytest.fixture(scope="module")
 def fine():
     """A skin whose places depend on all channels: its errors are small and grow with the noise."""
-    return LearntSkin.fit(Presses.create(**record(200)), method="gaussian-process")
+    return LearntSkin.fit(Presses.create(**record(120)), method="gaussian-process")
 
 
 def test_deviations_are_calibrated_for_errors_of_which_few_are_large():

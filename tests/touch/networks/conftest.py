@@ -11,6 +11,7 @@ from jeit.touch.networks import ImageNetwork, learn_images, write_network
 from jeit.touch.networks.linear_channels import LinearChannels
 from jeit.touch.networks.unrolled import Unrolled
 from jeit.touch.simulate.contact.indent_sets import image_places
+from jeit.touch.simulate.contact.indents import resting_skin
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -22,6 +23,12 @@ def _small_maps():
 @pytest.fixture(scope="session")
 def small_skin():
     return Skin.create(named_layout("grid-4x4", Rectangle(0.1, 0.1)), num_layers=0, cell_size=8e-3)
+
+
+@pytest.fixture(scope="session")
+def resting(small_skin):
+    """The small skin at rest, for changes by touches without a program for each set of touches."""
+    return resting_skin(small_skin, float(small_skin.thickness))
 
 
 @pytest.fixture(scope="session")

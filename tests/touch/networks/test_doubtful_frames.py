@@ -10,8 +10,8 @@ PLACE = (0.012, -0.02)
 
 
 @pytest.fixture(scope="module")
-def change(small_skin):
-    return relative_changes(small_skin, [[Indent(DiscIndenter(0.02), 5e-3, PLACE)]])
+def change(small_skin, resting):
+    return relative_changes(small_skin, [[Indent(DiscIndenter(0.02), 5e-3, PLACE)]], resting)
 
 
 def test_missing_channels_are_replaced_by_their_expectation():

@@ -35,9 +35,9 @@ def cloudpickle_copy(one):
     return cloudpickle.loads(cloudpickle.dumps(one))
 
 
-def voltages(skin, touches):
+def voltages(skin, touches, resting):
     rest = np.asarray(skin.model.voltages(skin.model_conductivity))
-    return rest * (1 + relative_changes(skin, touches)), rest
+    return rest * (1 + relative_changes(skin, touches, resting)), rest
 
 
 @pytest.mark.parametrize("change", [lambda one: pickle.loads(pickle.dumps(one)), cloudpickle_copy, copy.deepcopy])
@@ -76,10 +76,10 @@ def test_a_network_that_predicts_no_touch_explains_nothing(small_skin, learnt):
     assert (standing.explained, standing.deepest) == (0, 0)
 
 
-def test_frames(small_skin, learnt):
+def test_frames(small_skin, learnt, resting):
     _, found = learnt
     given, rest = voltages(
-        small_skin, [[Indent(DiscIndenter(0.02), 5e-3, (0.01, -0.02))], [Indent(DiscIndenter(0.02), 5e-3)]]
+        small_skin, [[Indent(DiscIndenter(0.02), 5e-3, (0.01, -0.02))], [Indent(DiscIndenter(0.02), 5e-3)]], resting
     )
     depth = found.network.depth(given, rest)
     assert depth.shape == (2, *SHAPE)
@@ -98,8 +98,8 @@ def test_frames(small_skin, learnt):
         (lambda frame, rest: (frame, np.stack([rest, rest])), "reference has shape"),
     ],
 )
-def test_frames_of_other_shapes(small_skin, learnt, change, message):
-    given, rest = voltages(small_skin, [[Indent(DiscIndenter(0.02), 5e-3)]])
+def test_frames_of_other_shapes(small_skin, learnt, resting, change, message):
+    given, rest = voltages(small_skin, [[Indent(DiscIndenter(0.02), 5e-3)]], resting)
     with pytest.raises(ValueError, match=message):
         learnt[1].network.depth(*change(given[0], rest))
 

@@ -8,6 +8,13 @@ import numpy as np
 from jeit.touch.networks.three_stages import Convolution, repeat_pixels
 
 
+def test_weights_are_the_first_of_more_draws():
+    """Of normal numbers whose variance is 2 over the number of values that each output depends on."""
+    key = jax.random.key(0)
+    drawn = np.asarray(jax.random.normal(key, (256,), np.float32))[:180].reshape(3, 3, 5, 4)
+    np.testing.assert_allclose(Convolution(5, 4, key=key).weight, drawn * np.sqrt(2 / 45), rtol=1e-6)
+
+
 def test_a_convolution_of_a_doubled_image():
     """With four ninths of the products the results are the same, including the edges, and so are the derivatives."""
     random = np.random.default_rng(0)

@@ -24,11 +24,11 @@ def missed(found, right):
 
 
 @pytest.mark.parametrize(("depth", "most"), [(0.5e-3, 0.04), (4e-3, 0.12), (7e-3, 0.25)])
-def test_changes_are_nearly_exact(small_skin, sensed, depth, most):
+def test_changes_are_nearly_exact(small_skin, resting, sensed, depth, most):
     """For a disc of 24 mm. Without the square root the error at 7 mm is a half."""
     touches = [[Indent(DiscIndenter(0.024), depth, place)] for place in [(0.0, 0.005), (0.02, -0.018), (-0.03, 0.01)]]
     maps = depth_maps(touches, image_places(small_skin, 48, 48)) / float(small_skin.thickness)
-    exact = relative_changes(small_skin, touches)
+    exact = relative_changes(small_skin, touches, resting)
     assert missed(channel_changes(sensed, maps), exact) < most
     if depth == 7e-3:
         assert missed(maps.reshape(3, -1) @ sensed.operator.T, exact) > 0.4

@@ -17,12 +17,13 @@ PLACES = ((0.01, -0.02), (-0.025, 0.01))
 
 
 @pytest.fixture(scope="module")
-def recorded(small_skin, tmp_path_factory):
+def recorded(small_skin, resting, tmp_path_factory):
     """A folder with a file of the untouched skin, and one of two touches and a frame that lacks one channel."""
     folder = tmp_path_factory.mktemp("recorded")
     model = small_skin.model
     rest = np.asarray(model.voltages(small_skin.model_conductivity))
-    touched = rest * (1 + relative_changes(small_skin, [[Indent(DiscIndenter(0.02), 5e-3, one)] for one in PLACES]))
+    touches = [[Indent(DiscIndenter(0.02), 5e-3, one)] for one in PLACES]
+    touched = rest * (1 + relative_changes(small_skin, touches, resting))
     for name, frames in (("rest", rest[None]), ("touched", np.concatenate([touched, touched[:1]]))):
         mask = np.ones(frames.shape, bool)
         if name == "touched":

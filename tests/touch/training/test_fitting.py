@@ -1,5 +1,6 @@
 """Networks trained from arrays: they learn, stop early, and resume after a kill, to the same bits."""
 
+import dataclasses
 import os
 import signal
 import subprocess
@@ -56,8 +57,8 @@ def trained():
 def test_training_reduces_the_loss(trained):
     """x y has a variance of 1/9. A straight line explains nothing of it."""
     assert trained.course.validation[trained.course.best] < 0.02 / 9
-    assert float(compiled_held_out(trained.network, rows(300, 2)).mean()) < 0.03 / 9
-    assert float(compiled_held_out(network(), rows(300, 2)).mean()) > 1 / 9
+    assert float(compiled_held_out(trained.network, rows(100, 2)).mean()) < 0.03 / 9
+    assert float(compiled_held_out(network(), rows(100, 2)).mean()) > 1 / 9
 
 
 def test_the_best_network_is_kept(trained):
@@ -74,11 +75,11 @@ def test_a_key_determines_everything(trained):
 
 def test_it_stops_early():
     """Targets of noise: training on some makes others worse."""
-    inputs, _ = rows(64)
-    noise = np.random.default_rng(1).normal(size=(64, 1)).astype(np.float32)
-    other = np.random.default_rng(2).normal(size=(64, 1)).astype(np.float32)
-    plan = TrainingPlan(rate=3e-2, batch=16, epochs=500, patience=5)
-    found = fit_network(network(), OBJECTIVE, (inputs, noise), (inputs, other), plan, key=KEY)
+    inputs, _ = rows(500)
+    noise = np.random.default_rng(1).normal(size=(500, 1)).astype(np.float32)
+    other = np.random.default_rng(2).normal(size=(100, 1)).astype(np.float32)
+    plan = dataclasses.replace(PLAN, epochs=500, patience=5)
+    found = fit_network(network(), OBJECTIVE, (inputs, noise), (inputs[:100], other), plan, key=KEY)
     assert found.reason == "no better at 5 looks in a row"
     assert len(found.course.steps) == found.course.best + 6 < 500
 
@@ -140,14 +141,15 @@ def test_killed_at_any_moment(tmp_path, trained):
 
 
 def test_a_checkpoint_of_another_training_is_refused(tmp_path):
-    given = network(), OBJECTIVE, rows(100), rows(50, 1)
-    fit_network(*given, TrainingPlan(epochs=2), key=KEY, checkpoint=tmp_path / "state")
+    given = network(), OBJECTIVE, rows(500), rows(100, 1)
+    plan = dataclasses.replace(PLAN, epochs=2)
+    fit_network(*given, plan, key=KEY, checkpoint=tmp_path / "state")
     with pytest.raises(ValueError, match="of another training \\(plan was"):
-        fit_network(*given, TrainingPlan(epochs=3), key=KEY, checkpoint=tmp_path / "state")
+        fit_network(*given, dataclasses.replace(plan, epochs=3), key=KEY, checkpoint=tmp_path / "state")
     with pytest.raises(ValueError, match="training was"):
-        fit_network(*given[:2], rows(101), given[3], TrainingPlan(epochs=2), key=KEY, checkpoint=tmp_path / "state")
+        fit_network(*given[:2], rows(501), given[3], plan, key=KEY, checkpoint=tmp_path / "state")
     with pytest.raises(ValueError, match="key was"):
-        fit_network(*given, TrainingPlan(epochs=2), key=jax.random.key(0), checkpoint=tmp_path / "state")
+        fit_network(*given, plan, key=jax.random.key(0), checkpoint=tmp_path / "state")
 
 
 class Chunks:
@@ -255,8 +257,7 @@ def test_bad_plans(change):
 
 
 def test_losses_that_are_not_finite():
-    inputs, targets = rows(100)
+    inputs, targets = rows(500)
+    plan = dataclasses.replace(PLAN, epochs=1)
     with pytest.raises(ValueError, match="are all rows finite"):
-        fit_network(
-            network(), OBJECTIVE, (inputs, np.full_like(targets, np.nan)), rows(50), TrainingPlan(epochs=1), key=KEY
-        )
+        fit_network(network(), OBJECTIVE, (inputs, np.full_like(targets, np.nan)), rows(100, 1), plan, key=KEY)

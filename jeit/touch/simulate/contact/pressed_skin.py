@@ -50,6 +50,13 @@ def standard_normal(key: Array, shape: tuple[int, ...]) -> Float[np.ndarray, "..
     return np.asarray(jax.random.normal(key, (1 << max(num_draws - 1, 0).bit_length(),)))[:num_draws].reshape(shape)
 
 
+def split_keys(key: Array, number: int) -> list[Array]:
+    """Split a random key into a list of keys. Iterating over an array of keys would compile a program for each length
+    of the array."""
+    keys = jax.random.split(key, number)
+    return [keys[index] for index in range(number)]
+
+
 def random_walk(
     key: Array, seconds: Float[np.ndarray, " T"], trend: float, deviation: float, count: int
 ) -> Float[np.ndarray, "T k"]:
@@ -274,7 +281,7 @@ class PressedSkin(Module):
         voltages_of_recordings = np.split(
             exact_voltages, np.cumsum([len(recording_times) for recording_times in times])[:-1]
         )
-        recording_keys = jax.random.split(key, len(times))
+        recording_keys = split_keys(key, len(times))
         return [
             self.read(recording_key, recording_voltages, recording_times)
             for recording_key, recording_voltages, recording_times in zip(

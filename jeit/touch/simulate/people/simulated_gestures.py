@@ -13,7 +13,7 @@ from jeit.arguments import check_key, check_kind, check_name, describe, is_numbe
 from jeit.data import GestureSet
 from jeit.mesh import Domain
 from jeit.touch.simulate.contact.press import MovingPress
-from jeit.touch.simulate.contact.pressed_skin import PressedSkin
+from jeit.touch.simulate.contact.pressed_skin import PressedSkin, split_keys
 from jeit.touch.simulate.people.person import GESTURES, Person
 
 # Maximum time since the reference frame, during which the skin drifts, in seconds.
@@ -90,7 +90,7 @@ def simulate_gestures(
     for first_row in range(0, len(person_gesture_pairs), _RECORDINGS_AT_ONCE):
         motions_and_times, row_keys = (
             [],
-            jax.random.split(jax.random.fold_in(touch_key, first_row), _RECORDINGS_AT_ONCE + 1),
+            split_keys(jax.random.fold_in(touch_key, first_row), _RECORDINGS_AT_ONCE + 1),
         )
         for row_key, (person, gesture) in zip(
             row_keys[1:], person_gesture_pairs[first_row : first_row + _RECORDINGS_AT_ONCE], strict=False
@@ -182,9 +182,7 @@ def simulate_gesture_stream(
     rng = np.random.default_rng(np.asarray(jax.random.bits(draw_key, (4,))).tolist())
     gestures, person_indices = rng.choice(GESTURES, number), rng.integers(len(people), size=number)
     touch_motions, next_frame, first_frames = [], int(_TIME_BEFORE_FIRST * rate), []
-    for motion_key, gesture, person_index in zip(
-        jax.random.split(touch_key, number), gestures, person_indices, strict=True
-    ):
+    for motion_key, gesture, person_index in zip(split_keys(touch_key, number), gestures, person_indices, strict=True):
         motion, times = people[person_index].touch(motion_key, str(gesture), outline, rate=rate)
         touch_motions.append(motion)
         first_frames.append(next_frame)

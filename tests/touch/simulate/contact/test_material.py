@@ -13,6 +13,7 @@ from jeit.touch.simulate.contact.pressed_skin import (
     draw_gains,
     held_pressure,
     random_walk,
+    split_keys,
     standard_normal,
     unloaded_state,
     white_noise,
@@ -140,3 +141,8 @@ def test_draws_are_those_of_jax_for_any_number(shape):
     drawn = standard_normal(KEY, shape)
     assert drawn.shape == shape
     np.testing.assert_allclose(drawn, jax.random.normal(KEY, shape), rtol=1e-14)
+
+
+def test_keys_are_those_of_jax():
+    keys = [jax.random.key_data(key) for key in split_keys(KEY, 3)]
+    np.testing.assert_array_equal(keys, jax.random.key_data(jax.random.split(KEY, 3)))

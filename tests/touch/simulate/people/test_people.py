@@ -16,6 +16,7 @@ from jeit.layout import perimeter
 from jeit.mesh import Disk, Rectangle
 from jeit.protocol import reference_electrode
 from jeit.touch.simulate import DiscIndenter, MovingPress, PressedSkin, material
+from jeit.touch.simulate.contact.pressed_skin import split_keys
 from jeit.touch.simulate.people import GESTURES, MANNERS, TRAITS, Person, simulate_gestures
 
 KEY = jax.random.key(0)
@@ -39,12 +40,11 @@ def still_skin():
 
 
 def motions(gesture, number=40):
-    people = [Person.draw(key) for key in jax.random.split(KEY, number)]
-    return [one.touch(key, gesture, SHEET) for one, key in zip(people, jax.random.split(KEY, number), strict=True)]
+    return [Person.draw(key).touch(key, gesture, SHEET) for key in split_keys(KEY, number)]
 
 
 def test_people_are_log_normally_distributed_about_a_gesture():
-    medians = np.stack([Person.draw(key).medians for key in jax.random.split(KEY, 500)])
+    medians = np.stack([Person.draw(key).medians for key in split_keys(KEY, 500)])
     for row, name in enumerate(GESTURES):
         own = MANNERS[name]
         moving = slice(0, 5 if own.moves else 3)
@@ -56,7 +56,7 @@ def test_people_are_log_normally_distributed_about_a_gesture():
 
 def test_one_person_varies_less_than_many():
     one = Person.draw(KEY)
-    own = [one.touch(key, "push", SHEET)[0].load.max() for key in jax.random.split(KEY, 40)]
+    own = [one.touch(key, "push", SHEET)[0].load.max() for key in split_keys(KEY, 40)]
     many = [motion.load.max() for motion, _ in motions("push")]
     assert np.std(np.log(own)) < np.std(np.log(many))
 
@@ -118,7 +118,7 @@ def test_recordings_together_are_those_of_each():
 
 
 def test_a_set_is_generated_and_saved(tmp_path):
-    people = [Person.draw(key) for key in jax.random.split(KEY, 2)]
+    people = [Person.draw(key) for key in split_keys(KEY, 2)]
     noisy = skin(material("conductive fabric"))
     made = simulate_gestures(KEY, noisy, SHEET, people, 1, gestures=("tap", "slap"))
     assert made.gesture.tolist() == ["tap", "slap"] * 2
