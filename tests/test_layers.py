@@ -55,13 +55,16 @@ def parsed(path: Path) -> ast.Module:
 @functools.cache
 def imported(path: Path) -> set[str]:
     """Dotted names that a file imports anywhere: modules, and names taken from them."""
-    names = set()
-    for node in ast.walk(parsed(path)):
+    names, left = set(), [parsed(path)]
+    while left:  # through statements only, because walking through expressions takes most of the time
+        node = left.pop()
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: a relative import"
             names |= {f"{node.module}.{alias.name}" for alias in node.names}
+        for part in ("body", "orelse", "handlers", "finalbody", "cases"):
+            left += getattr(node, part, ())
     return names
 
 
