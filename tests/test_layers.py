@@ -148,6 +148,11 @@ def test_solvers_do_not_import_jeit():
         ({"attic/box.py": ""}, "is in no room"),
         ({"mesh/up.py": "from jeit.forward import ForwardModel"}, "looks up"),
         ({"mesh/up.py": "def f():\n    from jeit.forward.model import ForwardModel"}, "looks up"),
+        (
+            {"mesh/up.py": "if 1:\n    pass\nelse:\n    try:\n        pass\n    finally:\n        import jeit.live"},
+            "up",
+        ),
+        ({"mesh/up.py": "try:\n    x = 2\nexcept OSError:\n    import jeit.forward"}, "looks up"),
         ({"forward/sly.py": "from jeit.mesh._surface import orient_surface"}, "is private"),
         ({"forward/sly.py": "from jeit.mesh import _surface"}, "is private"),
     ],
