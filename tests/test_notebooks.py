@@ -14,6 +14,7 @@ from jeit.imaging import ImagingSettings, image_difference
 from jeit.inverse import Imager, one_step
 from jeit.layout import named_layout
 from jeit.mesh import Disk, Rectangle, Solid, centroids, surface_of
+from jeit.report import notebook
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +44,21 @@ def shown():
         "merit": merit,
         "surface": surface_of(Solid(Disk(0.1), 0.05).mesh(num_points=300)),
     }
+
+
+@pytest.fixture(scope="module", autouse=True)
+def pictures_drawn_once():
+    """Both representations call `picture`, and most of the time is drawing."""
+    draw, drawn = notebook.picture, {}
+
+    def drawn_once(value):
+        if id(value) not in drawn:
+            drawn[id(value)] = value, draw(value)  # with the object, so that its number is not given to another
+        return drawn[id(value)][1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(notebook, "picture", drawn_once)
+        yield
 
 
 PICTURES = ("measurement", "merit", "imaged", "mesh", "series", "layout", "skin", "surface")

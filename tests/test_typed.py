@@ -1,6 +1,7 @@
 """Types as seen by a user's type checker: both packages have markers, and every parameter of a public function has a
 type."""
 
+import functools
 import importlib
 import inspect
 import pkgutil
@@ -15,6 +16,7 @@ import jeit_solvers
 ROOT = Path(__file__).resolve().parents[1]
 
 
+@functools.cache
 def rooms() -> list[str]:
     """Packages with public names."""
     found = ["jeit", "jeit_solvers"]
@@ -53,6 +55,7 @@ def untyped(function: Callable) -> list[str]:
     ]
 
 
+@functools.cache
 def offered() -> dict[str, Callable]:
     """Every public function, constructor and method, by package and name."""
     found = {}

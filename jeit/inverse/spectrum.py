@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jeit_solvers import symmetric_eigen
-from jeit_solvers.engines import adjoint, either_engine, has_values, host, namespace
+from jeit_solvers.engines import adjoint, either_engine, evaluate_in_numpy, has_values, host, namespace
 from jeit_solvers.module import Module
 
 # Approximate number of cells over which an image is averaged.
@@ -108,7 +108,7 @@ class Spectrum(Module):
     def squared_modes(self) -> Float[np.ndarray, " k"]:
         """Squared absolute value of each of the `modes`, averaged over all cells, or on large meshes over a subset of
         about `_NUM_MEAN_CELLS` cells."""
-        images, weights = (np.asarray(factor) for factor in _mode_factors(self))
+        images, weights = evaluate_in_numpy(_mode_factors, self)
         sampled_images = images[:: max(1, len(images) // _NUM_MEAN_CELLS)]
         return np.mean(np.abs(sampled_images @ weights) ** 2, axis=0)
 

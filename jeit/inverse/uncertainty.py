@@ -31,6 +31,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jeit.arguments import check_has_values, check_key, check_kind
 from jeit.inverse.nonlinear.problem import Inversion
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
+from jeit.inverse.prior.bases import expand_rows
 from jeit.inverse.prior.penalties import AbstractNormal
 from jeit.mesh import measures
 from jeit_solvers import Status
@@ -156,11 +157,9 @@ def posterior(reconstruction: Reconstruction) -> Posterior:
     inversion, coefficients = reconstruction.inversion, reconstruction.coefficients
     if has_values(reconstruction.outcome) and Status.FAILED.number in np.ravel(reconstruction.outcome):
         raise ValueError(f"posterior: the reconstruction failed. {reconstruction.reason}")
-    runs_uncompiled = inversion.model.mesh.dimension == 3 or not inversion.penalty.is_standard_normal
-    if not (has_values(inversion, coefficients) and runs_uncompiled):
+    if not has_values(inversion, coefficients):
         return _compute_posterior(inversion, coefficients)
-    # For a solid body, compiled programs would store several copies of the Jacobian; with sparse factors, compilation
-    # takes seconds.
+    # Compilation takes seconds, and for a solid body compiled programs would store several copies of the Jacobian.
     with np.errstate(all="ignore"):
         host_inversion, host_coefficients = on_host((inversion, coefficients))
         jacobian, cross, data_covariance, normal = _data_space_matrices(host_inversion, host_coefficients)
@@ -207,7 +206,7 @@ def _sample_estimates(posterior: Posterior):
     num_rows = len(posterior.root)
     for start in range(0, num_rows, _ROWS_AT_ONCE):
         gain = posterior.root[start : start + _ROWS_AT_ONCE] @ posterior.cross
-        row_images = xp.stack([basis.expand(row[:num_basis]) for row in gain])
+        row_images = expand_rows(basis, gain[:, :num_basis])
         for index, image in enumerate(unknown_images):
             row_images = row_images + gain[:, num_basis + index, None] * image
         variance = variance - (row_images**2).sum(axis=0)

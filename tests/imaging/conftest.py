@@ -4,7 +4,7 @@ import pickle
 
 import pytest
 
-from jeit.imaging import preparation
+from jeit.imaging import describe, preparation
 
 MADE = {}
 
@@ -21,5 +21,6 @@ def meshes_made_once():
         return MADE[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(preparation, "body_mesh", made_once)
+        for module in (describe, preparation):
+            patch.setattr(module, "body_mesh", made_once)
         yield

@@ -23,20 +23,28 @@ DISK = {"shape": "disk", "radius": 0.1}
 RING = {"layout": "ring", "width": 0.012}
 
 
+@pytest.fixture(scope="module", autouse=True)
+def coarse_models():
+    """There is no option for the meshes of the compared descriptions."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jeit.imaging.describe._NODES", {2: 300})
+        yield
+
+
 @functools.cache
 def empty_disk():
     """A model of the empty disk with eight electrodes."""
     electrodes = {**RING, "number": 8, "contact_impedance": 3.0}
     tables = {"geometry": DISK, "electrodes": electrodes, "protocol": {"current": 1e-3, "kind": "adjacent"}}
-    return parse_description(tables, "a.toml").model("a.csv", num_points=900)
+    return parse_description(tables, "a.toml").model("a.csv", num_points=600)
 
 
-def simulated(table):
+def simulated(table, conductivity=1e-5):
     """Voltages (2, M) of a disk, empty and with a rod at (50, 0) mm, with the protocol of a table."""
     table = {"number": 8, "current": 1e-3, **table}
     model = empty_disk().with_protocol(parse_description({"protocol": table}, "a.toml").protocol(Path("a.csv")))
     away = np.asarray(centroids(model.mesh)) - [0.05, 0]
-    rod = np.where(np.linalg.norm(away, axis=1) < 0.025, 1e-5, 2e-3)
+    rod = np.where(np.linalg.norm(away, axis=1) < 0.025, conductivity, 2e-3)
     voltages = np.stack([model.voltages(2e-3), model.voltages(rod)])
     return voltages * (1 + 1e-4 * np.random.default_rng(0).normal(size=voltages.shape)), model.protocol
 
@@ -112,7 +120,7 @@ def test_half_of_the_channels_leaves_the_order_open(tmp_path):
 
 
 def test_an_insufficient_explanation_is_reported(tmp_path):
-    random = np.random.default_rng(0).normal(size=(2, 40))
+    random = np.random.default_rng(0).normal(size=(2, 10))
     empty, rod = saved(tmp_path, random)
     found = find_description(rod, DISK, RING, reference=empty)
     assert "not good enough to go on" in found.fault
@@ -254,7 +262,7 @@ def test_for_a_file_with_its_protocol_the_body_is_described(tmp_path):
 
 
 def test_command(tmp_path, capsys, monkeypatch):
-    voltages, _ = simulated(KINDS[1])
+    voltages, _ = simulated(KINDS[1], conductivity=1.7e-3)  # imaged in one step
     empty, rod = saved(tmp_path, -voltages, "\t")
     given = ["describe", str(rod), "--reference", str(empty), "--output", str(tmp_path / "out")]
     monkeypatch.setattr("sys.stdin", io.StringIO())

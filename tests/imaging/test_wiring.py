@@ -146,7 +146,7 @@ def test_an_image_is_refused_with_the_explanation_and_computed_unchanged_on_requ
     near = np.linalg.norm(np.asarray(centroids(MODEL.mesh)) - [0.02, 0.01], axis=1) < 0.012
     object_ = measured(places=places, conductivity=np.where(near, 0.04, 0.02), name="object")
     with pytest.raises(ValueError, match=r"'empty' does not fit .* electrodes 3 and 7 look exchanged.*as_is=True"):
-        prepare_difference(object_, measured(places=places))
+        prepare_difference(object_, measured(places=places), num_points=400)
     plain = ImagingSettings(method="one-step", hyperparameter=10.0, as_is=True, num_points=400, raster_shape=(64, 64))
     result = image_difference(object_, measured(places=places), plain)
     assert "electrodes 3 and 7 look exchanged" in report_image(result)["wiring"]["fault"]

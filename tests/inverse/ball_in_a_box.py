@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jeit.electrodes import FaceDiscs
@@ -45,6 +44,6 @@ def sharp(num_points, along=3):
 def shape_problem(given):
     """A shape problem for the voltages of the bath alone."""
     number: Any = given.protocol.num_measurements
-    every, noise = jnp.ones(number, bool), jnp.full(number, 1e-6)
+    every, noise = np.ones(number, bool), np.full(number, 1e-6)
     small, data = independent_data(given, given.voltages(BATH), every, noise, at_once=True)  # pyright: ignore
     return ShapeProblem(small, data, np.full(given.mesh.num_cells, BATH))

@@ -33,8 +33,8 @@ def frame(model):
     """Difference voltages of an inclusion on another mesh, with noise of 1 % of their root mean square, and that
     noise."""
     fine = ForwardModel(disk(0.1, num_points=600), model.electrodes, model.protocol)
-    inside = jnp.linalg.norm(centroids(fine.mesh) - jnp.array([0.05, 0.02]), axis=1) < 0.025
-    change = np.asarray(fine.voltages(jnp.where(inside, 1.2, 1.0)) - fine.voltages(1.0))
+    inside = np.linalg.norm(np.asarray(centroids(fine.mesh)) - [0.05, 0.02], axis=1) < 0.025
+    change = np.asarray(fine.voltages(np.where(inside, 1.2, 1.0))) - np.asarray(fine.voltages(1.0))
     noise = 1e-2 * float(np.sqrt(np.mean(change**2)))
     return change + noise * np.random.default_rng(3).normal(size=change.shape), noise
 
@@ -69,9 +69,11 @@ def test_curves_and_gcv_equal_their_definitions(linear, model, data):
         image = matrix @ data
         residual = data - jacobian @ image
         hat = np.trace(np.eye(CHANNELS) - jacobian @ matrix)
-        assert choice.residual[index] == pytest.approx(np.linalg.norm(residual), rel=1e-6)
-        assert choice.penalty[index] == pytest.approx(np.sqrt(image @ precision @ image), rel=1e-6)
-        assert choice.criterion[index] == pytest.approx(CHANNELS * residual @ residual / hat**2, rel=1e-6)
+        curves = (np.asarray(curve)[index] for curve in (choice.residual, choice.penalty, choice.criterion))
+        residual_norm, penalty, criterion = curves
+        assert residual_norm == pytest.approx(np.linalg.norm(residual), rel=1e-6)
+        assert penalty == pytest.approx(np.sqrt(image @ precision @ image), rel=1e-6)
+        assert criterion == pytest.approx(CHANNELS * residual @ residual / hat**2, rel=1e-6)
     assert choice.hyperparameter == choice.candidates[np.argmin(choice.criterion)]
     assert choice.target is None
 

@@ -35,7 +35,7 @@ def tank():
     rng = np.random.default_rng(0)
     degrees, impedance = 1.5 * rng.normal(size=16), 0.005 * np.exp(0.7 * rng.normal(size=16))
     electrodes = BoundaryElectrodes(turned(degrees), WIDTH, impedance)
-    voltages = np.asarray(ForwardModel(body_mesh(DISK, electrodes, 4000), electrodes, PROTOCOL).voltages(SIGMA))
+    voltages = np.asarray(ForwardModel(body_mesh(DISK, electrodes, 2000), electrodes, PROTOCOL).voltages(SIGMA))
     return degrees, voltages * (1 + 0.002 * rng.normal(size=len(voltages)))
 
 
@@ -43,7 +43,7 @@ def test_electrode_positions_are_estimated(tank):
     """Except for conformal maps of the disk onto itself, which hardly change a homogeneous disk's voltages: a common
     rotation, and displacements proportional to cos θ and sin θ."""
     degrees, voltages = tank
-    model = ForwardModel(body_mesh(DISK, DESCRIBED, 1500), DESCRIBED, PROTOCOL)
+    model = ForwardModel(body_mesh(DISK, DESCRIBED, 800), DESCRIBED, PROTOCOL)
     placed = place_electrodes(model, voltages, deviation=np.deg2rad(2) * RADIUS)
     place = np.asarray(DESCRIBED.position) / RADIUS
     hidden = np.column_stack([np.ones(16), place])
@@ -66,7 +66,7 @@ def measured(voltages, name):
 
 def test_a_difference_is_prepared_with_the_estimated_positions(tank):
     _, voltages = tank
-    prepared = prepare_difference(measured(1.01 * voltages, "frame"), measured(voltages, "reference"), num_points=1500)
+    prepared = prepare_difference(measured(1.01 * voltages, "frame"), measured(voltages, "reference"), num_points=800)
     assert prepared.calibration.shift.shape == (16, 1)
     assert float(prepared.calibration.misfit) < 0.01
     left = prepared.calibration.contact_deviation
@@ -106,7 +106,7 @@ def test_positions_that_increase_the_relative_misfit_are_rejected(tank, monkeypa
     """Even if they explain the small voltages."""
     _, voltages = tank
     monkeypatch.setattr(calibration, "_MAX_MISFIT_RATIO", 1e-3)
-    prepared = prepare_difference(measured(1.01 * voltages, "frame"), measured(voltages, "reference"), num_points=1500)
+    prepared = prepare_difference(measured(1.01 * voltages, "frame"), measured(voltages, "reference"), num_points=800)
     assert prepared.calibration.shift is None
     assert prepared.calibration.model_error is not None
 
@@ -117,7 +117,7 @@ def test_errors_of_a_difference_include_its_uncertainty_and_rounding(tank):
     known = Uncertainty(position=0.0, drift=0.4, size=0.03, other=0.1)
     one, base = (np.array([float(f"{each:.1e}") for each in times * voltages]) for times in (1.1, 1.0))
     frame, reference = replace(measured(one, "frame"), uncertainty=known), measured(base, "reference")
-    prepared = prepare_difference(frame, reference, num_points=1500)
+    prepared = prepare_difference(frame, reference, num_points=800)
     accuracy, rounding = prepared.accuracy, rounding_of_difference(frame, reference)
     assert (accuracy.size, accuracy.model_error.drift) == (known.size, known.drift)
     assert np.abs(accuracy.model_error.factor[:16]).max() < 1e-12  # positions are exact
@@ -134,7 +134,7 @@ def test_errors_of_a_difference_include_its_uncertainty_and_rounding(tank):
 
 def test_setups_without_adjustable_positions_are_refused(tank):
     _, voltages = tank
-    model = ForwardModel(DISK.mesh(num_points=800), DESCRIBED, PROTOCOL)
+    model = ForwardModel(DISK.mesh(num_points=300), DESCRIBED, PROTOCOL)
     with pytest.raises(ValueError, match="opposite sign"):
         place_electrodes(model, -voltages, deviation=1e-3)
     for wrong in (-1e-3, 1.0, np.nan, "1 mm", None):

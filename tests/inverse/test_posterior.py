@@ -1,7 +1,6 @@
 """Posterior uncertainty against dense algebra and by simulation, and invalid input."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -24,12 +23,23 @@ def model():
 
 @pytest.fixture(scope="module")
 def noise(model):
-    return 1e-2 * jnp.abs(model.voltages(1.0))
+    return noise_of(model)
+
+
+@pytest.fixture(scope="module")
+def small():
+    """A model with eight electrodes and 60 nodes, which compiles in half of the time."""
+    electrodes = BoundaryElectrodes(ring(0.1, 8), 0.012, 1e-3)
+    return ForwardModel(Disk(0.1).mesh(num_points=60), electrodes, adjacent(8))
+
+
+def noise_of(model):
+    return 1e-2 * np.abs(np.asarray(model.voltages(1.0)))
 
 
 def press(model):
     inside = np.linalg.norm(np.asarray(centroids(model.mesh)) - [0.03, 0.02], axis=1) < 0.03
-    return model.voltages(jnp.where(inside, 0.6, 1.0))
+    return np.asarray(model.voltages(np.where(inside, 0.6, 1.0)))
 
 
 @pytest.mark.parametrize(
@@ -37,19 +47,19 @@ def press(model):
     [pytest.param(Gaussian(LENGTH), marks=pytest.mark.slow), pytest.param(Laplace(), marks=pytest.mark.slow), Noser()],
     ids=["gaussian", "laplace", "noser"],
 )
-def test_against_dense_algebra(prior, model, noise):
-    result = reconstruct(model, press(model), 1.0, prior=prior, noise=noise, hyperparameter=2.0)
+def test_against_dense_algebra(prior, small):
+    result = reconstruct(small, press(small), 1.0, prior=prior, noise=noise_of(small), hyperparameter=2.0)
     found = posterior(result)
     inversion = result.inversion
     _, jacobian = inversion.linearise(result.coefficients)
     seen = np.asarray(inversion.data.whiten(jacobian))
     covariance = np.linalg.inv(seen.T @ seen + np.eye(seen.shape[1]))
-    shapes = np.asarray(jax.vmap(inversion.basis.expand, in_axes=1, out_axes=1)(jnp.eye(seen.shape[1])))
+    shapes = np.stack([np.asarray(inversion.basis.expand(one)) for one in np.eye(seen.shape[1])], axis=1)
     values = np.asarray(result.conductivity)
     expected = values * np.sqrt(np.einsum("ij,jk,ik->i", shapes, covariance, shapes))
     np.testing.assert_allclose(found.standard_deviation(), expected, rtol=1e-6)
-    cells = np.asarray(centroids(model.mesh))[:, 0] > 0.02
-    weight = np.where(cells, measures(model.mesh), 0)
+    cells = np.asarray(centroids(small.mesh))[:, 0] > 0.02
+    weight = np.where(cells, measures(small.mesh), 0)
     weight = weight / weight.sum()
     mean, deviation = found.region(cells)
     assert mean == pytest.approx(weight @ values, rel=1e-12)
@@ -112,15 +122,14 @@ def test_intervals_cover_the_truth_at_the_nominal_rate(model, noise):
     ("ask", "message"),
     [
         (lambda found: found.credible_interval(1.0), "between 0 and 1"),
-        (lambda found: found.region(np.zeros(551, bool)), "none is chosen"),
+        (lambda found: found.region(np.zeros(found.inversion.model.mesh.num_cells, bool)), "none is chosen"),
         (lambda found: found.region([10**6]), "indices from 0"),
         (lambda found: found.region(np.ones(3, bool)), "booleans"),
         (lambda found: found.region([0.5]), "booleans"),
     ],
 )
-def test_bad_input(ask, message, model, noise):
-    found = posterior(
-        reconstruct(model, press(model), 1.0, prior=Noser(), noise=noise, solver=GaussNewton(max_steps=2))
-    )
+def test_bad_input(ask, message, small):
+    solver, noise = GaussNewton(max_steps=2), noise_of(small)
+    found = posterior(reconstruct(small, press(small), 1.0, prior=Noser(), noise=noise, solver=solver))
     with pytest.raises(ValueError, match=message):
         ask(found)

@@ -48,17 +48,17 @@ def model_of(num_points):
 
 @pytest.fixture(scope="module")
 def model():
-    return model_of(600)
+    return model_of(400)
 
 
 @pytest.fixture(scope="module")
 def frame():
     """Voltages of a disk with an inclusion of three times its conductivity, with noise of 0.1 %, and this noise."""
-    fine = model_of(2500)
+    fine = model_of(1500)
     inside = np.linalg.norm(centroids(fine.mesh) - CENTRE, axis=1) < INCLUSION
-    voltages = fine.voltages(jnp.where(inside, 3.0, 1.0))
-    noise = 1e-3 * jnp.abs(voltages)
-    return voltages + noise * jax.random.normal(jax.random.key(0), voltages.shape), noise
+    voltages = np.asarray(fine.voltages(np.where(inside, 3.0, 1.0)))
+    noise = 1e-3 * np.abs(voltages)
+    return voltages + noise * np.random.default_rng(0).normal(size=voltages.shape), noise
 
 
 def contrast_and_centroid(model, conductivity):
@@ -165,7 +165,7 @@ def test_masked_channels_are_ignored(model, frame):
     voltages, noise = frame
     mask = np.ones(208, bool)
     mask[3::20] = False
-    incomplete = jnp.where(mask, voltages, jnp.nan)
+    incomplete = np.where(mask, voltages, np.nan)
     result = reconstruct(model, incomplete, 1.0, prior=Gaussian(0.02), noise=noise, mask=mask, hyperparameter="gcv")
     _, centroid = contrast_and_centroid(model, result.conductivity)
     assert result.status == "converged"
@@ -191,9 +191,9 @@ def test_voltages_of_the_background_are_at_the_minimum(model, solver):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"voltages": jnp.zeros(208)}, "current source"),
-        ({"voltages": jnp.full(208, jnp.nan)}, "NaN"),
-        ({"voltages": jnp.ones(96)}, "208 channels"),
+        ({"voltages": np.zeros(208)}, "current source"),
+        ({"voltages": np.full(208, np.nan)}, "NaN"),
+        ({"voltages": np.ones(96)}, "208 channels"),
         ({"mask": np.zeros(208, bool)}, "every channel"),
         ({"mask": np.ones(208)}, "booleans"),
         ({"noise": 0.0}, "noise"),
@@ -201,7 +201,7 @@ def test_voltages_of_the_background_are_at_the_minimum(model, solver):
         ({"background": 5.0, "parametrisation": Parametrisation(link=Bounded(0.5, 4.0))}, "between 0.5 and 4"),
         ({"background": np.ones(3)}, "cells"),
         ({"background": 1 + 0.1j}, "real conductivity"),
-        ({"voltages": (1 + 0.1j) * jnp.ones(208)}, "complex"),
+        ({"voltages": (1 + 0.1j) * np.ones(208)}, "complex"),
         ({"noise": np.ones(3)}, "each channel"),
         ({"prior": "noser"}, "Noser"),
         ({"solver": "newton"}, "gauss-newton"),

@@ -184,7 +184,7 @@ def test_polygons(vertices, holes, options):
 
 
 def test_graded_rectangle_keeps_its_tags_and_boundary_nodes():
-    mesh = rectangle(0.3, 0.2, num_points=800, refine=Refine(factor=3), boundary_points=[0.1, 0.35])
+    mesh = rectangle(0.3, 0.2, num_points=300, refine=Refine(factor=3), boundary_points=[0.1, 0.35])
     check(mesh)
     boundary = np.asarray(mesh.points)[np.asarray(mesh.facets)[:, 0]]
     for place in ([-0.05, -0.1], [0.15, -0.05]):
@@ -194,7 +194,7 @@ def test_graded_rectangle_keeps_its_tags_and_boundary_nodes():
 
 
 def test_meshes_are_reproducible():
-    first, second = (disk(0.1, num_points=400, refine=Refine(EDGE_POINTS, factor=5)) for _ in range(2))
+    first, second = (disk(0.1, num_points=150, refine=Refine(EDGE_POINTS, factor=5)) for _ in range(2))
     np.testing.assert_array_equal(first.points, second.points)
     np.testing.assert_array_equal(first.cells, second.cells)
 

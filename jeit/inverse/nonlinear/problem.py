@@ -34,7 +34,7 @@ from jeit.forward.model import (
 from jeit.inverse.channels import Data, IndependentChannels, relative_noise
 from jeit.inverse.linearisation import check_mask
 from jeit.inverse.nonlinear.parametrisation import AbstractLink, AbstractUnknown
-from jeit.inverse.prior.bases import AbstractBasis, DenseBasis
+from jeit.inverse.prior.bases import AbstractBasis, DenseBasis, expand_rows
 from jeit.inverse.prior.penalties import AbstractPenalty
 from jeit_solvers import QuadraticModel, as_minimum, symmetric_eigen, symmetric_inverse
 from jeit_solvers.engines import either_engine, has_values, host, namespace, on_device, on_host
@@ -177,9 +177,8 @@ def keep_informed_shapes(inversion: Inversion, min_signal: float, persistence: f
     scale = np.sqrt(
         _expected_variance(squared_singular_values[is_informed], persistence) / squared_singular_values[is_informed]
     )
-    shapes = host.asarray(
-        jax.vmap(inversion.basis.expand)(jnp.asarray(scale[:, None] * scaled_right_vectors[is_informed])).T, np.float32
-    )
+    combinations = scale[:, None] * scaled_right_vectors[is_informed]
+    shapes = host.asarray(expand_rows(on_host(inversion.basis), combinations).T, np.float32)
     informed_inversion = eqx.tree_at(lambda problem: problem.basis, inversion, DenseBasis(shapes))
     return informed_inversion if namespace(inversion) is np else on_device(informed_inversion)
 

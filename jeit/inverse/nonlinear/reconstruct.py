@@ -352,8 +352,8 @@ def _have_same_unknowns(first: Inversion, second: Inversion) -> bool:
 
 def _mismatch_reason(model: ForwardModel, measured, background, used_indices) -> str:
     """Sentence on wrong units or polarity if measured voltages and those of the background differ in size or sign."""
-    background_voltages = model.voltages(background)[used_indices]
-    ratio = float(jnp.vdot(measured, background_voltages) / jnp.vdot(background_voltages, background_voltages))
+    background_voltages = np.asarray(model.voltages(background))[used_indices]
+    ratio = float(np.asarray(measured) @ background_voltages / (background_voltages @ background_voltages))
     if 0.1 < ratio < 10:
         return ""
     return f" The voltages are {ratio:.2g} times those of the background; are they in volts, and their signs right?"

@@ -325,3 +325,10 @@ class RegionBasis(AbstractBasis):
     def pooled(self, regions):
         """Not available, because the basis has regions already. Raises `ValueError`."""
         raise ValueError("This basis has regions already.")
+
+
+def expand_rows(basis: AbstractBasis, rows: Float[Array, "k n"]) -> Float[Array, "k m"]:
+    """Image changes S c for every row c. Dense shapes are read once for all rows, which takes most of the time."""
+    if isinstance(basis, DenseBasis):
+        return (rows.astype(basis.shapes.dtype) @ basis.shapes.T).astype(rows.dtype)
+    return namespace(basis, rows).stack([basis.expand(row) for row in rows])

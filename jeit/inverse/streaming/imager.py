@@ -8,8 +8,6 @@ a masked channel remains in the arrays, with a variance so large that the channe
 
 from __future__ import annotations
 
-import functools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -27,9 +25,11 @@ from jeit.inverse.nonlinear.parametrisation import Parametrisation, as_parametri
 from jeit.inverse.nonlinear.problem import Inversion, check_background, check_frame, check_noise, keep_informed_shapes
 from jeit.inverse.nonlinear.reconstruct import pose
 from jeit.inverse.nonlinear.solvers import AbstractSolver, GaussNewton, as_solver, expand, residual
+from jeit.inverse.prior.bases import expand_rows
 from jeit.inverse.prior.matern import smooth_prior
 from jeit.inverse.prior.priors import AbstractPrior, check_prior
-from jeit_solvers.engines import as_array
+from jeit_solvers.dense import inverse_cholesky
+from jeit_solvers.engines import as_array, either_engine, namespace
 from jeit_solvers.module import Module
 
 FRAME_STEPS = 4
@@ -271,24 +271,27 @@ def _check_reference(measured, predicted) -> None:
         )
 
 
+@either_engine
 def _masked_noise(noise, used) -> Float[Array, " M"]:
-    return jnp.where(used, noise, _MASKED_NOISE_RATIO * jnp.max(jnp.where(used, noise, 0)))
+    xp = namespace(noise, used)
+    return xp.where(used, noise, _MASKED_NOISE_RATIO * xp.max(xp.where(used, noise, 0)))
 
 
-@functools.partial(jax.jit, static_argnames="persistence")
+@either_engine
 def _compute_linear_map(inversion: Inversion, weighing: Weighing, offset, persistence: float) -> LinearMap:
-    start = jnp.zeros(inversion.num_coefficients)
+    xp = namespace(inversion, weighing, offset)
+    start = xp.zeros(inversion.num_coefficients)
     problem = eqx.tree_at(lambda inverse_problem: inverse_problem.data, inversion, weighing.combine(offset))
     residual, jacobian = problem.linearise(start)
-    lower_factor = jnp.linalg.cholesky(jacobian @ jacobian.T + problem.data.covariance)
-    gain = jax.scipy.linalg.cho_solve((lower_factor, True), jacobian).T
+    inverse_factor = inverse_cholesky((jacobian @ jacobian.T + problem.data.covariance)[None])[0]
+    gain = (inverse_factor.T @ (inverse_factor @ jacobian)).T
     if inversion.num_coefficients <= len(residual):
-        shapes = jnp.eye(inversion.num_coefficients)
+        shapes = xp.eye(inversion.num_coefficients)
         carry_matrix = persistence * (shapes - gain @ jacobian)
     else:  # not reached with a memory: there are then no more shapes than data
-        shapes, gain = gain.T, jnp.eye(len(residual))
-        carry_matrix = jnp.zeros_like(gain)
-    matrix = jax.vmap(inversion.basis.expand)(shapes).T * inversion.link.slope(inversion.reference)[:, None]
+        shapes, gain = gain.T, xp.eye(len(residual))
+        carry_matrix = xp.zeros_like(gain)
+    matrix = expand_rows(inversion.basis, shapes).T * inversion.link.slope(inversion.reference)[:, None]
     constant_image = inversion.link.conductivity(inversion.reference) - matrix @ (gain @ residual)
     return LinearMap(matrix, gain @ (weighing.weight[:, None] * weighing.estimator), constant_image, carry_matrix)
 
