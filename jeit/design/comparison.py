@@ -184,7 +184,7 @@ def check_same_outline(first: Layout | SurfaceLayout, second: Layout | SurfaceLa
     sizes = []
     for layout in (first, second):
         low_x, high_x, low_y, high_y = layout.known_outline.extent
-        sizes.append((high_x - low_x, high_y - low_y, layout.known_outline.area))
+        sizes.append((high_x - low_x, high_y - low_y, float(layout.known_outline.area)))
     if any(
         abs(first_length - second_length) > 1e-3 * first_length
         for first_length, second_length in zip(*sizes, strict=True)

@@ -304,8 +304,8 @@ def _check_number(candidates: Candidates, number: int, criterion: Criterion) -> 
         raise ValueError(f"number must be a whole number from 1 to {candidates.num_candidates}; it is {number!r}.")
 
 
-@partial(jax.jit, static_argnames=("number", "criterion", "limit"))
-def _select_with_swaps(candidates: Candidates, number: int, criterion: Criterion, limit: int) -> Selection:
+@partial(jax.jit, static_argnames=("number", "criterion"))
+def _select_with_swaps(candidates: Candidates, number: int, criterion: Criterion, limit) -> Selection:
     selected, gains = _greedy_selection(candidates, number, criterion)
     total, _ = _information_and_slope(candidates, jnp.ones(candidates.num_candidates), criterion)
 

@@ -196,7 +196,8 @@ def write_svg(layout: Layout, file: BinaryIO) -> None:
     group = _add_element(root, "g", id="ELECTRODES", stroke="#0000ff", **line_style)
     text_style = {"text-anchor": "middle", "dominant-baseline": "central", "font-family": "sans-serif"}
     label_group = _add_element(root, "g", id="LABELS", fill="#808080", **text_style)
-    for centre, diameter, label in zip(layout.centres, layout.diameters, layout.labels, strict=True):
+    centres, diameters = np.asarray(layout.centres), np.asarray(layout.diameters)
+    for centre, diameter, label in zip(centres, diameters, layout.labels, strict=True):
         circle = _add_circle(centre, diameter)
         _add_element(group, "circle", **circle)
         text_position = {"x": circle["cx"], "y": circle["cy"], "font-size": str(millimetres(float(diameter) / 3))}

@@ -358,19 +358,21 @@ def _draw_figures(image: SavedImage, camera, levels, planes, axis: str, slices: 
         plot_isosurfaces(mesh, values, electrodes, levels=levels, camera=cameras[name], ax=panel, **options)
         panel.set_title(name or _angle_text(first_camera), fontsize=10)
 
-    figures = {
-        "overview.png": plot_solid(mesh, values, electrodes, levels=levels, camera=first_camera, **options),
-        "isosurfaces.png": draw_panels(draw_side, list(cameras), 12, 10),
-        "slices.png": plot_slices(mesh, values, electrodes, axis=axis, at=slices, **options),
-    }
+    # Sections are drawn first: they are fast, and report planes that miss the body and axes that do not exist.
+    sections = {}
     if planes:
 
         def draw_section(plane, panel):
             plot_slice(mesh, values, plane, electrodes, ax=panel, **options)
 
         num_rows = math.ceil(len(planes) / 2)
-        figures["planes.png"] = draw_panels(draw_section, list(planes), 5.6 * min(2, len(planes)), 5 * num_rows)
-    return figures
+        sections["planes.png"] = draw_panels(draw_section, list(planes), 5.6 * min(2, len(planes)), 5 * num_rows)
+    sections = {"slices.png": plot_slices(mesh, values, electrodes, axis=axis, at=slices, **options), **sections}
+    return {
+        "overview.png": plot_solid(mesh, values, electrodes, levels=levels, camera=first_camera, **options),
+        "isosurfaces.png": draw_panels(draw_side, list(cameras), 12, 10),
+        **sections,
+    }
 
 
 def _angle_text(camera: "Camera") -> str:

@@ -10,7 +10,7 @@ from jeit.layout import Layout, grid, named_layout, write_layout
 from jeit.mesh import Rectangle
 
 SKIN = Rectangle(0.06, 0.05)
-OPTIONS = ["--places", 10, "--margin-mm", 5, "--taxels", 8, "--cell-mm", 5, "--pairs", 6]
+OPTIONS = ["--places", 6, "--margin-mm", 5, "--taxels", 8, "--cell-mm", 6, "--pairs", 6]
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def test_the_second_layout_is_checked_before_the_first_is_simulated(layouts, run
     write_layout(Layout(grid(0.04, 0.0, 3, 1), 8e-3, outline=SKIN), tmp_path / "three.svg")
     for second, message in (
         ("none.svg", "none.svg"),
-        ("small.svg", "--cell-mm is 5 mm; give no more than 4.5 mm, as electrodes of 'small' are 3 mm across"),
+        ("small.svg", "--cell-mm is 6 mm; give no more than 4.5 mm, as electrodes of 'small' are 3 mm across"),
         ("three.svg", "--pairs is 6; 'three' has 3 electrodes, and they make 3 pairs"),
     ):
         command = ["layout", "compare", layouts[0], tmp_path / second, "--output", tmp_path / "out", *OPTIONS]

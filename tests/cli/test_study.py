@@ -5,10 +5,12 @@ import os
 import signal
 import sys
 
+import numpy as np
 import pytest
 from studies import SMALL
 
 from jeit.design.study import read_study
+from jeit.design.study import run as study_run
 from jeit.design.study.lock import locked
 from jeit.design.study.store import Store
 
@@ -30,6 +32,20 @@ def failed(result):
     return error
 
 
+@pytest.fixture
+def drawn(monkeypatch):
+    """The results of every chunk are drawn, since tests/design/test_study_results.py proves how they are solved."""
+
+    def solve_chunk(study, number, *_):
+        sensitivity = np.random.default_rng(number).uniform(1e-4, 1e-3, (1, study.columns * study.rows))
+        least, mean = sensitivity.min(axis=1), sensitivity.mean(axis=1)
+        uniformity = mean / np.sqrt((sensitivity**2).mean(axis=1))
+        return {"sensitivity": sensitivity, "minimum": least, "mean": mean, "uniformity": uniformity}
+
+    monkeypatch.setattr(study_run, "solve_chunk", solve_chunk)
+
+
+@pytest.mark.usefixtures("drawn")
 def test_run_stop_resume_and_report(file, run, monkeypatch):
     assert "not begun; 2 points in 2 chunks" in run("study", "status", file)[1]
     assert "begin with 'jeit study run" in failed(run("study", "resume", file))

@@ -30,7 +30,7 @@ from jeit.mesh import Polygon, Rectangle
 OUTLINE = Rectangle(0.06, 0.05)
 LAYOUT = Layout(grid(0.04, 0.03, 3, 2), 8e-3, outline=OUTLINE, name="six")
 GRID = touches_away_from_the_edge(OUTLINE, 5e-3, 6, 6)
-OPTIONS = {"num_layers": 4, "cell_size": 6e-3}
+OPTIONS = {"num_layers": 5, "cell_size": 6e-3}
 
 
 def respond(*, num_pairs=6, num_taxels=8, contrast=0.0, **options):
@@ -63,7 +63,7 @@ def test_a_comparison_with_itself_has_no_blind_spot():
     ("options", "message"),
     [
         ({"contrast": 1.0}, "contrast must be a factor"),
-        ({"cell_size": 1e-5}, r"cell_size is 0\.01 mm, which makes about 1\.8e\+08 nodes; give 0\.14 mm or more"),
+        ({"cell_size": 1e-5}, r"cell_size is 0\.01 mm, which makes about 2\.2e\+08 nodes; give 0\.15 mm or more"),
         (
             {"cell_size": 0.05},
             r"cell_size is 50 mm; give no more than 12 mm, as electrodes of 'six' are 8 mm across\.$",

@@ -11,7 +11,7 @@ from studies import SMALL
 
 from jeit.design.reports import study as pictures
 from jeit.design.reports import write_study_report
-from jeit.design.study import open_results, read_study, run_study
+from jeit.design.study import open_results, read_study
 from jeit.design.study.store import Store
 
 pytest.importorskip("xarray")
@@ -24,10 +24,16 @@ name = "inside <b>or</b> around"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
+    """A study, its store of drawn results, and their report."""
     folder = tmp_path_factory.mktemp("report")
     (folder / "study.toml").write_text(TEXT, "utf-8")
     study = read_study(folder / "study.toml")
-    run_study(study, folder / "study.zarr")
+    store = Store(study, folder / "study.zarr")
+    for number, sensitivity in enumerate(np.random.default_rng(0).uniform(1e-4, 1e-3, (2, 1, 30))):
+        mean = sensitivity.mean(axis=1)
+        uniformity = mean / np.sqrt((sensitivity**2).mean(axis=1))
+        least = sensitivity.min(axis=1)
+        store.write(number, {"sensitivity": sensitivity, "minimum": least, "mean": mean, "uniformity": uniformity})
     write_study_report(study, folder / "study.zarr", folder / "study.html")
     return folder
 

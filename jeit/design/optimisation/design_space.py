@@ -206,7 +206,7 @@ def minimise_from_starts(
     def value_and_gradient(variables):
         costs, scores, gradients = cost(variables)
         last_evaluation.update(variables=np.asarray(variables), score=np.asarray(scores))
-        return jnp.sum(costs), gradients
+        return np.asarray(costs).sum(), gradients
 
     def record_step(variables):
         is_last_evaluation = np.array_equal(last_evaluation["variables"], variables)

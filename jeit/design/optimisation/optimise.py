@@ -25,6 +25,7 @@ from jeit.design.scores import Scores
 from jeit.design.skin.skin import Skin, check_skin
 from jeit.layout import Layout, SurfaceLayout
 from jeit.mesh import Domain
+from jeit_solvers.engines import on_host
 from jeit_solvers.module import Module
 
 # Stages of the optimisation: weight w of the penalty, and fraction of all steps after which the stage ends.
@@ -242,12 +243,12 @@ def _random_starts(variables: Variables, constraints: Constraints, num_layouts: 
     keep-out domains."""
     layouts_variables, num_generators = [], variables.num_generators
     for layout_key in jax.random.split(key, num_layouts) if num_layouts else ():
-        unit_positions = jax.random.uniform(layout_key, (_NUM_DRAWN_POSITIONS, 2))
+        unit_positions = np.asarray(jax.random.uniform(layout_key, (_NUM_DRAWN_POSITIONS, 2)))
         positions = unit_positions * variables.size + variables.low
-        is_allowed = constraints.outline.contains(positions)
+        is_allowed = np.asarray(constraints.outline.contains(positions))
         for domain in constraints.keep_out:
-            is_allowed &= ~domain.contains(positions)
-        allowed_positions = np.asarray(unit_positions)[np.asarray(is_allowed)]
+            is_allowed = is_allowed & ~np.asarray(domain.contains(positions))
+        allowed_positions = unit_positions[is_allowed]
         if len(allowed_positions) < num_generators:
             raise ValueError("keep_out: it leaves no room for the electrodes inside the outline; give less.")
         other_variables = variables.start[2 * num_generators :]
@@ -266,7 +267,7 @@ _violations_by_name = eqx.filter_jit(Constraints.violations_by_name)
 def _largest_violation(constraints: Constraints, centres, radii) -> float:
     """Largest violation of a constraint, metres; zero or negative if all constraints are satisfied."""
     violations = _violations_by_name(constraints, centres, radii)
-    return max(float(np.max(values, initial=-np.inf)) for values in violations.values())
+    return max(float(np.max(np.asarray(values), initial=-np.inf)) for values in violations.values())
 
 
 def _make_feasible(variables: Variables, constraints: Constraints, start_variables):
@@ -274,7 +275,7 @@ def _make_feasible(variables: Variables, constraints: Constraints, start_variabl
     succeeds."""
 
     def cost(start_variables):
-        penalties, gradients = _penalty_and_gradient(start_variables, variables, constraints)
+        penalties, gradients = on_host(_penalty_and_gradient(start_variables, variables, constraints))
         return penalties, -penalties, gradients
 
     return minimise_from_starts(cost, start_variables, 500, Record(), tolerance=0.0)[0]

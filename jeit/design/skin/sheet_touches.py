@@ -13,7 +13,7 @@ from jeit.design.skin.touched_cells import TouchedCells, touched_cells
 from jeit.design.skin.touches import AbstractIndentation
 from jeit.mesh import Mesh, centroids
 from jeit.mesh.geodesic import Geodesics, Triangles
-from jeit_solvers.engines import gather, host, namespace, sum_into
+from jeit_solvers.engines import gather, host, namespace, on_host, sum_into
 from jeit_solvers.module import Module
 
 
@@ -74,11 +74,14 @@ def sheet_touches(
         distance = jnp.sqrt(jnp.sum((place - centroid) ** 2) + 1e-18)
         return (contrast - 1) * indentation.depth_at(distance) / thickness
 
-    cell_centroids, origins = centroids(mesh)[touched.cells], touched.places
+    # In NumPy where values are known, so that only the derivative is compiled.
+    all_centroids, known = on_host((centroids(mesh), touched))
+    cell_centroids, origins = gather(all_centroids, known.cells), known.places
     if mesh.is_surface:
-        cell_centroids, origins = _flatten_centroids(mesh, touched, indentation.reach), jnp.zeros_like(origins[:, :2])
-    slopes = jax.jit(jax.vmap(jax.vmap(jax.grad(relative_change), (None, 0))))(origins, cell_centroids)
-    slopes = jnp.where(touched.change[..., None] != 0, slopes, 0.0)
+        cell_centroids = _flatten_centroids(mesh, touched, indentation.reach)
+        origins = np.zeros((len(touched.places), 2))
+    slopes = on_host(jax.jit(jax.vmap(jax.vmap(jax.grad(relative_change), (None, 0))))(origins, cell_centroids))
+    slopes = jnp.asarray(namespace(known, slopes).where(known.change[..., None] != 0, slopes, 0.0))
     return SheetTouches(touched, slopes, jnp.asarray(thickness, float), float(indentation.depth_at(host.zeros(()))))
 
 

@@ -27,7 +27,7 @@ from jeit.mesh import Domain, Mesh, Rectangle, layer, shell
 from jeit.mesh.generate.unstructured import MOST_POINTS
 from jeit.mesh.geodesic import Triangles
 from jeit.protocol import Protocol
-from jeit_solvers.engines import host
+from jeit_solvers.engines import host, on_host
 from jeit_solvers.module import Module
 
 # Number of nodes of a plane mesh times (cell size)² / area: 1.155 for equilateral cells, and slightly more due to the
@@ -282,10 +282,10 @@ def _can_share_mesh(skin: Skin, layout: Layout | SurfaceLayout) -> bool:
         return (
             isinstance(skin_layout, SurfaceLayout)
             and skin_layout.outward == layout.outward
-            and bool(eqx.tree_equal(skin_layout.surface, layout.surface))
+            and bool(eqx.tree_equal(on_host(skin_layout.surface), on_host(layout.surface)))
         )
     # The outline of a curved skin is another kind of object, which equals no outline of a flat skin.
-    return bool(eqx.tree_equal(skin.outline, plain_outline(layout.known_outline)))
+    return bool(eqx.tree_equal(on_host(skin.outline), on_host(plain_outline(layout.known_outline))))
 
 
 def check_skin(name: str, skin) -> None:
@@ -314,7 +314,7 @@ def plain_outline(outline: Domain) -> Domain:
         return outline
     low_x, high_x, low_y, high_y = outline.extent
     width, height = high_x - low_x, high_y - low_y
-    if abs(width * height - outline.area) > 1e-6 * width * height:
+    if abs(width * height - float(outline.area)) > 1e-6 * width * height:
         return outline
     return Rectangle(width, height, ((low_x + high_x) / 2, (low_y + high_y) / 2))
 

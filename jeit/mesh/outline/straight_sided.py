@@ -25,7 +25,7 @@ from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.generate.unstructured import Target, check_total, mesh_within
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline.domain import Domain, Pen, check_length, check_near_origin, check_position, numerics
-from jeit_solvers.engines import as_array, either_engine, has_values, namespace
+from jeit_solvers.engines import as_array, either_engine, has_values, namespace, on_host
 
 Loop = Float[Array, "k 2"]
 
@@ -268,8 +268,8 @@ def loop_length(loop: Loop) -> Float[Array, ""]:
 
 def area_of_loops(loops: Sequence[Loop]) -> Float[Array, ""]:
     """Area inside the first loop minus the area of the holes, m² (shoelace formula)."""
-    outer, *holes = (_shoelace(loop) for loop in loops)
-    return sum(holes, outer)
+    outer, *holes = (_shoelace(loop) for loop in on_host(loops))
+    return as_array(sum(holes, outer))
 
 
 @either_engine
@@ -337,8 +337,9 @@ def _side_lengths(loop: Loop) -> Float[Array, " k"]:
 
 
 def _shoelace(loop: Loop) -> Float[Array, ""]:
+    xp = namespace(loop)
     x, y = loop[:, 0], loop[:, 1]
-    return 0.5 * jnp.sum(x * jnp.roll(y, -1) - jnp.roll(x, -1) * y)
+    return 0.5 * (x * xp.roll(y, -1) - xp.roll(x, -1) * y).sum()
 
 
 def _is_inside(loop: Loop, points: Float[Array, "... 2"]) -> Bool[Array, "..."]:
