@@ -107,7 +107,7 @@ def test_without_an_image_the_status_says_so(served, run, files):
         patch.setattr(sys, "stdin", lines)
         status, _, error = run(*given)
     lines.close()
-    assert (status, "3 frames, and none could be imaged: The frame is" in error) == (1, True)
+    assert (status, "3 frames, and none could be imaged: The frame has 7 numbers" in error) == (1, True)
 
 
 def test_obstacles_are_found_before_anything_is_prepared(run, files, monkeypatch):
