@@ -49,6 +49,8 @@ def fitting_protocol(
     ):
         candidates, reason = [*same_protocols, *candidates], f"as of '{like.name}'"
     chosen_protocol, options = candidates[0]
+    if len(candidates) == 1 and not options:
+        return chosen_protocol, ()
     first_error = _mean_frame_error(frames, chosen_protocol)
     if _MAX_TRUSTED_ERROR < first_error < np.inf:
         errors = [_mean_frame_error(frames, candidate) for candidate, _ in candidates]

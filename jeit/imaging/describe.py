@@ -6,111 +6,52 @@ by the misfit of a uniform body of the described shape to a frame of the empty b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import product
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jeit.arguments import counted, did_you_mean, names_text, percent
-from jeit.data import Measurement, read
-from jeit.data.description import Description, TableLayout, parse_description
+from jeit.arguments import counted, names_text, percent
+from jeit.data import read
+from jeit.data.description import parse_description
 from jeit.data.exchange import assignments
 from jeit.data.formats import quadrupoles
 from jeit.data.formats.boards import OpenEit
-from jeit.data.formats.table import measurement_in
-from jeit.data.formats.text import Frames, frames_in_table, frames_in_text, read_text
 from jeit.data.quality import reciprocity_error
 from jeit.data.registry import format_with_protocol
 from jeit.data.unstated import channel_gains, with_signs
 from jeit.electrodes.face_patches import body_mesh
-from jeit.files import matlab, npy_array, npz_arrays
 from jeit.forward import ForwardModel
-from jeit.imaging.wiring import Wiring, find_wiring
+from jeit.imaging.possible_protocols import (
+    MAX_ELECTRODES,
+    MIN_ELECTRODES,
+    Candidate,
+    FileNumbers,
+    channel_counts,
+    fitting_candidates,
+    spread_of,
+)
+from jeit.imaging.wiring import find_wiring
 from jeit.mesh import Solid
-from jeit.protocol import Protocol
 
-# Minimum and maximum number of electrodes of the protocols that are tried; number of nodes of the mesh on which the
-# protocols are compared, for a sheet and for a solid.
-_MIN_ELECTRODES, _MAX_ELECTRODES, _NODES = 4, 64, {2: 700, 3: 4000}
+# Number of nodes of the mesh on which protocols are compared, for a sheet and for a solid.
+_NODES = {2: 700, 3: 4000}
 # Unexplained share of the empty body's voltages above which the best protocol is refused: in general; and if its kind
-# is known, or if the channels in a different order would leave `_MIN_ORDER_RATIO` times as much unexplained.
-_MAX_UNEXPLAINED, _MAX_UNEXPLAINED_KNOWN, _MIN_ORDER_RATIO = 0.25, 0.5, 2.0
+# is known, or if the order of the channels matters (`Candidate.ordered`).
+_MAX_UNEXPLAINED, _MAX_UNEXPLAINED_KNOWN = 0.25, 0.5
 # Maximum spread of the frames of an empty body.
 _MAX_SPREAD = 0.2
-# Minimum number of channels for each electrode.
-_MIN_CHANNELS = 2
 # Maximum number of candidate protocols whose misfit is computed. A candidate is ruled out if its unexplained share is
 # at least `_RIVAL_RATIO` times that of the best candidate plus `_RIVAL_MARGIN`.
 _MAX_COMPARED, _RIVAL_RATIO, _RIVAL_MARGIN = 12, 1.3, 0.01
-# Maximum number of frames of a file with which protocols are compared; of more frames, some at regular intervals.
-_MAX_FRAMES = 32
 # Minimum reciprocity error for which gains are estimated.
 _MIN_GAIN_ERROR = 0.03
 # Maximum ratio of the reciprocity error after the correction by estimated gains to the error before.
 _MAX_GAIN_RATIO = 0.4
-# Layout of a table of numbers about which nothing is known.
-_UNKNOWN_LAYOUT = TableLayout()
 # Contact impedance of a new description, times conductivity, divided by the size of the body.
 _RELATIVE_CONTACT = 0.01
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """Candidate for the protocol of a file. **Fields**: `protocol`: table `[protocol]` of a description, without the
-    current; `frames`: number of frames; `spread`: relative deviation of the empty body's frames from their mean;
-    `reciprocity`: reciprocity error of the mean frame, None if no two channels are reciprocal; `measurement`: the mean
-    frame, read with this protocol; `wiring`: the wiring with which a uniform body explains this frame; `gains`: gains
-    of the measurement patterns, if they explain the reciprocity error."""
-
-    protocol: dict[str, Any]
-    frames: int
-    spread: float
-    reciprocity: float | None
-    measurement: Measurement
-    wiring: Wiring | None = None
-    gains: np.ndarray | None = None
-
-    @property
-    def is_cut_off(self) -> bool:
-        """Whether the last frame of the file, or of its reference, is incomplete."""
-        return any("is cut off after" in note for note in self.measurement.notes)
-
-    @property
-    def misfit(self) -> float:
-        """Relative misfit of a uniform body to the mean frame; infinite if the misfit was not computed."""
-        if self.wiring is None:
-            return np.inf
-        return self.wiring.misfit if self.reversed_signs else self.wiring.described
-
-    @property
-    def reversed_signs(self) -> bool:
-        """Whether a uniform body explains the voltages with the opposite sign and an otherwise unchanged wiring."""
-        return self.wiring is not None and self.wiring == Wiring(tuple(range(len(self.wiring.places))), "", True)
-
-    @property
-    def unexplained(self) -> float:
-        """Relative error with which this protocol explains all frames: root of the sum of squares of misfit, spread,
-        and 1/√2 of the reciprocity error, which has twice the variance of the noise."""
-        return float(np.sqrt(self.misfit**2 + self.spread**2 + (self.reciprocity or 0) ** 2 / 2))
-
-    @property
-    def ordered(self) -> bool:
-        """Whether a uniform body would explain the voltages far worse if the channels were in a different order. On
-        average, a share √(1 - r²) would then be unexplained, where r is the squared mean of the voltages divided by
-        their mean square."""
-        values = np.asarray(self.measurement.voltages)[np.asarray(self.measurement.mask)]
-        mean_ratio = abs(values.mean()) ** 2 / np.mean(np.abs(values) ** 2)
-        return bool(_MIN_ORDER_RATIO * self.unexplained < np.sqrt(1 - mean_ratio**2))
-
-    @property
-    def name(self) -> str:
-        """Kind, number of electrodes and options of the protocol, in words."""
-        options = {key: value for key, value in self.protocol.items() if key not in ("kind", "number")}
-        option_text = ", ".join(f"{key} {str(value).lower()}" for key, value in options.items())
-        return f"{self.protocol['kind']}, {self.protocol['number']} electrodes{option_text and ', ' + option_text}"
 
 
 @dataclass(frozen=True)
@@ -186,15 +127,15 @@ def find_description(
     if not known and OpenEit.recognises(path):
         known = OpenEit.protocol_table(path)
     number = (known or {}).get("number")
-    if number is not None and not _MIN_ELECTRODES <= number <= _MAX_ELECTRODES:
-        raise ValueError(f"number must be from {_MIN_ELECTRODES} to {_MAX_ELECTRODES} electrodes; it is {number}.")
+    if number is not None and not MIN_ELECTRODES <= number <= MAX_ELECTRODES:
+        raise ValueError(f"number must be from {MIN_ELECTRODES} to {MAX_ELECTRODES} electrodes; it is {number}.")
     progress("read")
-    numbers = _Numbers.read(path, keys[0], excluded=keys[1] if reference is None else None)
-    base_numbers = numbers if reference is None and keys[1] is None else _Numbers.read(reference or path, keys[1])
+    numbers = FileNumbers.read(path, keys[0], excluded=keys[1] if reference is None else None)
+    base_numbers = numbers if reference is None and keys[1] is None else FileNumbers.read(reference or path, keys[1])
     progress("protocols that fit")
-    candidates = list(_fitting(numbers, base_numbers, geometry, electrodes, known or {}, current))
+    candidates = list(fitting_candidates(numbers, base_numbers, geometry, electrodes, known or {}, current))
     if not candidates:
-        counts = _channel_counts(known or {})
+        counts = channel_counts(known or {})
         count_text = f" (of what is known: {names_text(counts)})" if counts else ""
         raise ValueError(
             f"{path.name}: no protocol of common kinds has as many channels{count_text} as there are numbers: "
@@ -243,7 +184,7 @@ def _described_body(
     description = parse_description(tables, "the description")
     empty_frame = replace(base.mean_frame(), domain=description.domain, electrodes=description.electrodes)
     empty_frame = with_signs(replace(empty_frame, voltages=np.real(np.asarray(empty_frame.voltages))))
-    spread = _spread(np.real(np.asarray(base.filled())))
+    spread = spread_of(np.real(np.asarray(base.filled())))
     models: dict[int, ForwardModel] = {}
     protocol = {"kind": format, "number": number}
     candidate = Candidate(protocol, data.num_frames, spread, reciprocity_error(empty_frame), empty_frame)
@@ -252,166 +193,6 @@ def _described_body(
     shape = f"{counted(data.num_frames, 'frame')} of {data.num_channels}"
     text = _text(path, shape, {}, candidate, (), {"geometry": geometry, "electrodes": {**contact, **entries}})
     return Findings((candidate,), (), text, known=True)
-
-
-@dataclass(frozen=True)
-class _Numbers:
-    """The numbers in a file. **Fields**: `frames`: function that arranges the numbers in frames, for given possible
-    numbers of channels; `shape`: their shape in words; `sizes`: possible numbers of values in a frame; `data`: entries
-    of a description's table `[data]` for this arrangement."""
-
-    path: Path
-    frames: Callable[[Sequence[int]], Frames]
-    shape: str
-    sizes: tuple[int, ...]
-    data: dict[str, Any] = field(default_factory=dict)
-
-    @classmethod
-    def read(cls, path: Path, key: str | None, excluded: str | None = None) -> _Numbers:
-        """Read the numbers in a file; `key`: name of the array of frames; `excluded`: an array without frames."""
-        if path.suffix.lower() in (".mat", ".npz", ".npy"):
-            table, axis = _array(path, key, excluded)
-            shape = " × ".join(map(str, table.shape))
-            sizes = tuple(sorted({*table.shape, table.size}, reverse=True))
-            return cls(
-                path, lambda counts: frames_in_table(table, counts, _UNKNOWN_LAYOUT, default_axis=axis), shape, sizes
-            )
-        if key is not None:
-            raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
-        if OpenEit.recognises(path):
-            table = OpenEit.numbers(path)[0]
-            shape, sizes = f"{counted(len(table), 'line')} of {table.shape[1]}", table.shape[1:]
-            return cls(path, lambda counts: frames_in_table(table, counts, _UNKNOWN_LAYOUT), shape, sizes)
-        text = read_text(path)
-        length, lines = int(text.lengths[0]), len(text.lengths)
-        total, shape = len(text.values), f"{counted(lines, 'line')} of {length}"
-        # A frame that is wrapped over several lines ends with a line.
-        wrapped = {total // k for k in range(1, 1 + total // max(length, 1)) if length < total // k}
-        wrapped.intersection_update(np.cumsum(text.lengths).tolist())
-        table = text.values.reshape(lines, length) if total == lines * length else np.zeros((0, 0))
-        sizes = tuple({length, length - 1, lines, *wrapped})
-        if text.part_size:  # a separator begins a frame or a part of one
-            sizes = tuple(size for size in sizes if size % text.part_size == 0)
-        if lines == length == len(table) and _spread(table.T) < _spread(table):  # columns resemble each other more
-            data = {"frames_in": "columns"}
-            return cls(path, lambda counts: frames_in_table(table.T, counts, _UNKNOWN_LAYOUT), shape, sizes, data)
-        return cls(path, lambda counts: frames_in_text(text, counts, _UNKNOWN_LAYOUT, path.name), shape, sizes)
-
-
-def _spread(rows: np.ndarray) -> float:
-    """Norm of the deviations of rows from their mean, divided by the norm of the rows."""
-    values = np.where(np.isfinite(rows), rows, 0)
-    norm = float(np.linalg.norm(values))
-    return float(np.linalg.norm(values - values.mean(axis=0))) / norm if norm else 0.0
-
-
-def _array(path: Path, key: str | None, excluded: str | None) -> tuple[np.ndarray, str]:
-    """The array of frames in a file, and whether its frames are usually its "rows" or its "columns"."""
-    if path.suffix.lower() == ".npy":
-        return np.atleast_2d(npy_array(path)), "rows"
-    if path.suffix.lower() == ".mat":
-        sizes, axis = matlab.shapes(path), "columns"
-    else:
-        arrays = npz_arrays(path, *([key] if key else ["voltages"]))
-        sizes, axis = {item: np.shape(arrays[item]) if item in arrays else () for item in np.ravel(arrays[""])}, "rows"
-    name = key
-    if name is None:
-        tables = [item for item, shape in sizes.items() if item != excluded and int(np.prod(shape)) > 3]
-        if len(tables) != 1:
-            names = (
-                names_text([f"{item} ({' × '.join(map(str, sizes[item]))})" for item in tables]) if tables else "none"
-            )
-            raise ValueError(f"{path.name}: arrays of numbers are {names}. Name that of the frames by key=.")
-        name = tables[0]
-    if name not in sizes:
-        raise ValueError(
-            f"key: {path.name} has no array {name!r}{did_you_mean(name, sizes)}; it has {names_text(sizes)}."
-        )
-    if path.suffix.lower() == ".npz":
-        return np.atleast_2d(npz_arrays(path, name)[name]), axis
-    table = matlab.numbers(matlab.load(path, name), name, path)
-    return table.reshape(-1, 1) if 1 in table.shape else table, axis
-
-
-def _protocols(number: int) -> Iterator[dict[str, Any]]:
-    """Yield the table `[protocol]` of every common protocol for `number` electrodes."""
-    common_options = {"driven_electrodes": (False, True), "order": ("rotating", "fixed")}
-    for kind, options in (
-        ("adjacent", {**common_options, "reciprocal": ("all", "half")}),
-        ("two_terminal", {}),
-        ("opposite", {**common_options, "drives": ("distinct", "all")}),
-        *(("skip", {"skipped": (skipped,), **common_options}) for skipped in range(1, number // 2)),
-    ):
-        for values in product(*options.values()):
-            defaults = {"driven_electrodes": False, "reciprocal": "all", "drives": "distinct"}
-            entries = {key: value for key, value in zip(options, values, strict=True) if defaults.get(key) != value}
-            yield {"kind": kind, "number": number, **entries}
-
-
-def _fitting(
-    numbers: _Numbers, base_numbers: _Numbers, geometry: dict, electrodes: dict, known: dict, current: float
-) -> Iterator[Candidate]:
-    """Yield candidates whose number of channels fits the file and its reference; of equal protocols, only the first."""
-    counts, found_protocols = set(numbers.sizes), set()
-    for number in [known["number"]] if "number" in known else range(_MIN_ELECTRODES, _MAX_ELECTRODES + 1):
-        if not any(number * (number - 4) / 4 <= count <= number**2 for count in counts):
-            continue
-        for table in _protocols(number):
-            if any(table.get(key, value) != value for key, value in known.items()):
-                continue
-            protocol = _protocol({**table, "current": current}, numbers.path)
-            if protocol is None or protocol.num_measurements not in counts:
-                continue
-            if protocol.num_measurements < _MIN_CHANNELS * number:
-                continue
-            protocol_key = number, protocol.drive_index.tobytes(), protocol.channel_measurement.tobytes()
-            if protocol_key in found_protocols:
-                continue
-            found_protocols.add(protocol_key)
-            description = _describe_body(geometry, electrodes, table, current)
-            num_frames, measurement = _measurement_of(numbers, description, protocol)
-            base = measurement if base_numbers is numbers else _measurement_of(base_numbers, description, protocol)[1]
-            if measurement is not None and base is not None:
-                empty_frame = base.mean_frame()
-                spread = _spread(np.asarray(base.filled()))
-                yield Candidate(table, num_frames, spread, reciprocity_error(empty_frame), empty_frame)
-
-
-def _channel_counts(known: dict) -> list[int]:
-    """Numbers of channels of protocols that have the `known` entries; empty without the number of electrodes."""
-    tables = _protocols(known["number"]) if "number" in known else ()
-    fitting = [table for table in tables if all(table.get(key, value) == value for key, value in known.items())]
-    protocols = [_protocol({**table, "current": 1.0}, Path("a")) for table in fitting]
-    return sorted({protocol.num_measurements for protocol in protocols if protocol is not None})
-
-
-def _describe_body(geometry: dict, electrodes: dict, protocol: dict, current: float) -> Description:
-    places = {"contact_impedance": 1.0, **electrodes, "number": protocol["number"]}
-    tables = {"geometry": geometry, "electrodes": places, "protocol": {**protocol, "current": current}}
-    return parse_description(tables, "the description")
-
-
-def _protocol(table: dict, path: Path) -> Protocol | None:
-    """The protocol of a description's table `[protocol]`; None if the protocol has no channels."""
-    try:
-        return parse_description({"protocol": table}, "the description").protocol(path)
-    except ValueError:  # none of its channels is left, or there are too few electrodes
-        return None
-
-
-def _measurement_of(numbers: _Numbers, description: Description, protocol: Protocol) -> tuple[int, Measurement | None]:
-    """Number of frames of a file with `protocol`, and at most `_MAX_FRAMES` of them as a measurement; None if the
-    numbers do not fit the protocol."""
-    try:
-        frames = numbers.frames([protocol.num_measurements])
-        if frames.table.shape[1] != protocol.num_measurements:
-            return 0, None
-        num_frames = len(frames.table)
-        chosen = np.unique(np.linspace(0, num_frames - 1, _MAX_FRAMES).round().astype(int))
-        some_frames = frames._replace(table=frames.table[chosen], times=None)
-        return num_frames, measurement_in(numbers.path, description, some_frames, [(protocol, "")])
-    except ValueError:
-        return 0, None
 
 
 def _with_misfit(candidate: Candidate, models: dict[int, ForwardModel]) -> Candidate:

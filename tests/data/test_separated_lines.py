@@ -6,7 +6,7 @@ import pytest
 
 from jeit.data import read
 from jeit.data.formats.text import read_text
-from jeit.imaging.describe import _Numbers
+from jeit.imaging.possible_protocols import FileNumbers
 
 DESCRIPTION = """
 [geometry]
@@ -109,6 +109,6 @@ def test_a_frame_is_a_number_of_whole_parts(values, tmp_path):
     """What a description can be found for: one part, or several."""
     path = written(recording(values), tmp_path / "a.txt")
     assert read_text(path).part_size == 40
-    sizes = _Numbers.read(path, None).sizes
+    sizes = FileNumbers.read(path, None).sizes
     assert 40 in sizes
     assert {size % 40 for size in sizes} == {0}

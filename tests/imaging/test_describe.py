@@ -14,7 +14,8 @@ import scipy.io
 from jeit import data
 from jeit.cli import main
 from jeit.data.description import parse_description
-from jeit.imaging.describe import Candidate, Findings, find_description
+from jeit.imaging.describe import Findings, find_description
+from jeit.imaging.possible_protocols import Candidate
 from jeit.imaging.wiring import Wiring
 from jeit.layout import ring
 from jeit.mesh import centroids
