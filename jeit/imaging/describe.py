@@ -145,10 +145,14 @@ def find_description(
     candidates.sort(key=lambda item: np.hypot(item.spread, 0.3 if item.reciprocity is None else item.reciprocity))
     progress("uniform body")
     models: dict[int, ForwardModel] = {}
-    compared = [_with_misfit(item, models) for item in candidates[:_MAX_COMPARED]]
+    compared: list[Candidate] = []
+    for candidate in candidates[:_MAX_COMPARED]:
+        rival_limit = min((_rival_limit(item) for item in compared), default=np.inf)
+        is_ruled_out = candidate.least_unexplained >= rival_limit
+        compared.append(candidate if is_ruled_out else _with_misfit(candidate, models))
     compared.sort(key=lambda item: (round(item.unexplained, 3), len(item.protocol)))
     winner = compared[0]
-    rivals = [item for item in compared[1:] if item.unexplained < _RIVAL_RATIO * winner.unexplained + _RIVAL_MARGIN]
+    rivals = [item for item in compared[1:] if item.unexplained < _rival_limit(winner)]
     if not winner.is_cut_off:
         rivals = [item for item in rivals if not item.is_cut_off]
     winner = _with_gains(winner, models)
@@ -158,6 +162,11 @@ def find_description(
     tables["protocol"] = {**winner.protocol, "current": current}
     text = _text(path, numbers.shape, numbers.data, winner, rivals, tables)
     return Findings((*compared, *candidates[_MAX_COMPARED:]), tuple(rivals), text, known="kind" in (known or {}))
+
+
+def _rival_limit(candidate: Candidate) -> float:
+    """Unexplained share above which other candidates are ruled out by this one."""
+    return _RIVAL_RATIO * candidate.unexplained + _RIVAL_MARGIN
 
 
 def _described_body(

@@ -68,10 +68,16 @@ class Candidate:
         return self.wiring is not None and self.wiring == Wiring(tuple(range(len(self.wiring.places))), "", True)
 
     @property
+    def least_unexplained(self) -> float:
+        """Relative error of all frames without the misfit: root of the sum of squares of spread and 1/√2 of the
+        reciprocity error, which has twice the variance of the noise."""
+        return float(np.hypot(self.spread, (self.reciprocity or 0) / np.sqrt(2)))
+
+    @property
     def unexplained(self) -> float:
-        """Relative error with which this protocol explains all frames: root of the sum of squares of misfit, spread,
-        and 1/√2 of the reciprocity error, which has twice the variance of the noise."""
-        return float(np.sqrt(self.misfit**2 + self.spread**2 + (self.reciprocity or 0) ** 2 / 2))
+        """Relative error with which this protocol explains all frames: root of the sum of squares of misfit and
+        `least_unexplained`."""
+        return float(np.hypot(self.misfit, self.least_unexplained))
 
     @property
     def ordered(self) -> bool:
