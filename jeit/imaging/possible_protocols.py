@@ -132,9 +132,15 @@ class FileNumbers:
         wrapped = {total // k for k in range(1, 1 + total // max(length, 1)) if length < total // k}
         wrapped.intersection_update(np.cumsum(text.lengths).tolist())
         table = text.values.reshape(lines, length) if total == lines * length else np.zeros((0, 0))
+        if text.separators.examples:  # a separator begins a frame or a part of one
+            try:
+                part_size = text.separators.complete(text.values, text.lengths, (), path.name).size
+            except ValueError:
+                if text.separators.unreadable:
+                    raise
+                wrapped, part_size = set(), 1  # parts of different sizes: lines are frames, or too many are missing
+            wrapped = {size for size in wrapped if size % part_size == 0}
         sizes = tuple({length, length - 1, lines, *wrapped})
-        if text.part_size:  # a separator begins a frame or a part of one
-            sizes = tuple(size for size in sizes if size % text.part_size == 0)
         if lines == length == len(table) and spread_of(table.T) < spread_of(table):  # columns resemble each other more
             data = {"frames_in": "columns"}
             return cls(path, lambda counts: frames_in_table(table.T, counts, _UNKNOWN_LAYOUT), shape, sizes, data)

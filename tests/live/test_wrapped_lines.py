@@ -41,6 +41,14 @@ def test_damaged_frames_are_refused_alone():
     np.testing.assert_allclose(np.stack([first, third, last]), frames[[0, 2, 4]], rtol=1e-9)
 
 
+def test_words_before_the_separator_of_later_frames():
+    """The reference comes after its own word."""
+    frames = noisy(4)
+    lines = [*lines_of(frames[0], "ref:"), "diff:", *(line for frame in frames[1:] for line in lines_of(frame))]
+    found = [one for one in read_lines(lines) if not isinstance(one, str)]
+    np.testing.assert_allclose(np.stack(found), frames, rtol=1e-9)
+
+
 def test_lines_that_are_frames_are_not_joined():
     """A device that sends a frame a line, and text at its start; one line is cut off."""
     line = [1.0] * CHANNELS

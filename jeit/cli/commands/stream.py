@@ -171,7 +171,10 @@ def stream(
                 reference_measurement = measured if base is None else base
             imager, calibration = prepare_imager(reference_measurement, settings, measurement=measured, progress=step)
         if data == "-":
-            frames, num_frames = read_lines(sys.stdin, LineReading(description, reference_measurement)), None
+            frames, num_frames = (
+                read_lines(getattr(sys.stdin, "buffer", sys.stdin), LineReading(description, reference_measurement)),
+                None,
+            )
         else:
             measured = measured if settings.as_is else mask_spikes(measured, reference_measurement)
             frames, num_frames = frames_of(measured), measured.num_frames

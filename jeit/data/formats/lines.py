@@ -213,10 +213,10 @@ class LineReading:
         return np.where(usable, np.real(np.asarray(self.reference.voltages)).mean(axis=0), np.nan)
 
 
-def read_lines(lines: Iterable[str], reading: LineReading) -> Iterator[Float[np.ndarray, " M"] | str]:
+def read_lines(lines: Iterable[str | bytes], reading: LineReading) -> Iterator[Float[np.ndarray, " M"] | str]:
     """Yield the frames of lines of text as they arrive, in volts, and the text of lines that are not frames."""
     for line in lines:
-        found = reading(line.encode()) if line.strip() else None
+        found = reading(line if isinstance(line, bytes) else line.encode()) if line.strip() else None
         if found is not None:
             yield found
 

@@ -20,7 +20,7 @@ from jeit.arguments import counted
 # A separator occurs at least so many times in the first lines of a file.
 _MIN_REPEATED = 2
 # Minimum number of complete parts, and maximum share of damaged ones, with which a file is read.
-_MIN_COMPLETE, _MAX_DAMAGED = 3, 0.1
+_MIN_COMPLETE, _MAX_DAMAGED = 2, 0.1
 # Maximum number of characters of a separator in a note.
 _MAX_EXAMPLE = 20
 
@@ -40,83 +40,124 @@ def separator_patterns(lines: Sequence[str], holds_numbers: Callable[[str], bool
     return repeated if len(words) < len(lines) else set()
 
 
-class CompleteParts(NamedTuple):
-    """Numbers of a file in which every part is complete. **Fields**: `numbers`: all numbers; `lengths`: number of
-    numbers in each line; `size`: number of numbers in a part; `notes`: how many parts are damaged."""
+class Parts(NamedTuple):
+    """Numbers of a file, with every damaged part replaced by NaN. **Fields**: `numbers`: all numbers; `lengths`: number
+    of numbers in each line; `size`: number of numbers in a part; `note`: how many parts are damaged, empty if none
+    is."""
 
     numbers: Inexact[np.ndarray, " n"]
     lengths: Int[np.ndarray, " lines"]
     size: int
-    notes: tuple[str, ...] = ()
+    note: str = ""
+
+
+class _Partition(NamedTuple):
+    """Division of a file into parts. **Fields**: `parts`: separator before each part; `starts`: first line of each
+    part; `sizes`: number of numbers in each part; `size`: most frequent one."""
+
+    parts: list[Separator]
+    starts: list[int]
+    sizes: Int[np.ndarray, " parts"]
+    size: int
+
+    @classmethod
+    def create(cls, parts: list[Separator], number_ends: Int[np.ndarray, " lines"]) -> _Partition:
+        """Divide a file; `number_ends`: number of numbers before each line, and in all."""
+        starts = [part.line for part in parts]
+        sizes = np.diff(number_ends[[*starts, len(number_ends) - 1]])
+        return cls(parts, starts, sizes, Counter(sizes[sizes > 0].tolist()).most_common(1)[0][0])
+
+
+class Separator(NamedTuple):
+    """A separator. **Fields**: `line`: the line of numbers that follows, counted among the lines of numbers;
+    `position`: line number in the file; `text`: text."""
+
+    line: int
+    position: int
+    text: str
 
 
 @dataclass
 class Separators:
-    """The separators between the lines of numbers of a file. **Fields**: `starts`: for each part, its first line,
-    counted among the lines of numbers; `positions`: the same, as a line number of the file; `unreadable`: lines that
-    contain anything but numbers, counted among the lines of numbers; `examples`: text of the separators between lines
-    of numbers, shortened."""
+    """The separators between the lines of numbers of a file. **Fields**: `found`: all separators; `unreadable`: lines
+    that contain anything but numbers, counted among the lines of numbers; `fault`: what the first of them contains."""
 
-    starts: list[int] = field(default_factory=lambda: [0])
-    positions: list[int] = field(default_factory=lambda: [1])
+    found: list[Separator] = field(default_factory=list)
     unreadable: list[int] = field(default_factory=list)
-    examples: list[str] = field(default_factory=list)
+    fault: str = ""
 
-    def add(self, line: int, position: int, text: str) -> None:
-        """Begin a part at a `line` of numbers; the separator `text` is at the line number `position`. Separators
-        without numbers between them count as one."""
-        if line:
-            self.examples.append(text.strip()[:_MAX_EXAMPLE])
-        if line > self.starts[-1]:
-            self.starts.append(line)
-            self.positions.append(position)
+    @property
+    def examples(self) -> list[str]:
+        """Texts of the separators between lines of numbers, shortened."""
+        return [separator.text[:_MAX_EXAMPLE] for separator in self.found if separator.line]
 
-    def complete(self, numbers: Inexact[np.ndarray, " n"], lengths: Int[np.ndarray, " lines"]) -> CompleteParts | None:
-        """Replace damaged parts by NaN; None if too many parts are damaged, or if they have different sizes.
+    def complete(
+        self, numbers: Inexact[np.ndarray, " n"], lengths: Int[np.ndarray, " lines"], counts: Sequence[int], name: str
+    ) -> Parts:
+        """Replace damaged parts of the file `name` by NaN. Parts are what is between any two separators, or between
+        those of one kind, if these are as far apart as one of the `counts`.
 
-        A part is damaged if it is not as long as most parts, or contains an unreadable line. A last part that is
-        shorter than the others is not changed.
+        A part is damaged if its size is not that of most parts, or a multiple of it where separators are missing, or if
+        it contains an unreadable line. A last part that is shorter than the others is not changed. Raises `ValueError`
+        if too many parts are damaged.
         """
-        starts = [start for start in self.starts if start < len(lengths)]
-        if len(starts) < _MIN_COMPLETE:
-            return None
-        line_ends = [*starts[1:], len(lengths)]
         number_ends = np.concatenate([[0], np.cumsum(lengths)])
-        sizes = np.diff(number_ends[[*starts, len(lengths)]])
-        size = Counter(sizes.tolist()).most_common(1)[0][0]
-        is_unreadable = np.zeros(len(starts), bool)
+        partitions = [
+            _Partition.create(self._parts(kind), number_ends)
+            for kind in (None, *dict.fromkeys(line_pattern(separator.text) for separator in self.found))
+        ]
+        parts, starts, sizes, size = next((part for part in partitions if part.size in counts), partitions[0])
+        line_ends = [*starts[1:], len(lengths)]
+        is_unreadable = np.zeros(len(sizes), bool)
         is_unreadable[np.searchsorted(starts, self.unreadable, side="right") - 1] = True
-        is_damaged = (sizes != size) | is_unreadable
+        is_damaged = (sizes % size != 0) | (sizes == 0) | is_unreadable
         is_damaged[-1] &= sizes[-1] > size or is_unreadable[-1]
         damaged = np.flatnonzero(is_damaged)
-        num_complete = int(((sizes == size) & ~is_damaged).sum())
-        if num_complete < _MIN_COMPLETE or len(damaged) > max(1, _MAX_DAMAGED * len(starts)):
-            return None
         if not damaged.size:
-            return CompleteParts(numbers, lengths, size)
-        first_complete = int(np.flatnonzero((sizes == size) & ~is_damaged)[0])
-        complete_lengths = lengths[starts[first_complete] : line_ends[first_complete]]
+            return Parts(numbers, lengths, size)
+        complete = np.flatnonzero((sizes == size) & ~is_damaged)
+        note = (
+            f"{len(damaged)} of {counted(len(sizes), 'part')} between lines such as {self.examples[0]!r} lack numbers "
+            f"or contain something else, the first from line {parts[damaged[0]].position} on"
+        )
+        if len(complete) < _MIN_COMPLETE or len(damaged) > max(1, _MAX_DAMAGED * len(sizes)):
+            hint = f" {self.fault}" if self.fault else ""
+            raise ValueError(f"{name}: {note}: too many to be left out.{hint}")
+        complete_lengths = lengths[starts[complete[0]] : line_ends[complete[0]]]
         number_parts, length_parts = [], []
         for start, end, damage in zip(starts, line_ends, is_damaged, strict=True):
             number_parts.append(np.full(size, np.nan) if damage else numbers[number_ends[start] : number_ends[end]])
             length_parts.append(complete_lengths if damage else lengths[start:end])
-        note = (
-            f"{len(damaged)} of {counted(len(starts), 'part')} between such lines lack numbers or contain something "
-            f"else, the first from line {self.positions[damaged[0]]} on: they are left empty (NaN)."
-        )
-        return CompleteParts(np.concatenate(number_parts), np.concatenate(length_parts), size, (note,))
+        note = f"{note}: they are left empty (NaN)."
+        return Parts(np.concatenate(number_parts), np.concatenate(length_parts), size, note)
+
+    def _parts(self, kind: str | None) -> list[Separator]:
+        """The separators that begin a part: those of one kind, or all. Different separators without numbers between
+        them count as one; between equal ones, a part is empty."""
+        parts, last_kind = [Separator(0, 1, "")], ""
+        for separator in self.found:
+            separator_kind = line_pattern(separator.text)
+            if kind not in (None, separator_kind):
+                continue
+            is_later = separator.line > parts[-1].line
+            if is_later or (separator.line and separator_kind == last_kind):
+                parts.append(separator)
+            if is_later or not separator.line or not last_kind:
+                last_kind = separator_kind
+        return parts
 
 
 class WrappedLines:
     """Joins the lines of a frame that a device sends as several lines of numbers after a separator line.
 
     `channels`: number of channels of a frame. Lines that are frames themselves, and text that is not a separator, are
-    returned as they are. The first separator cannot be recognised, and is returned as text.
+    returned as they are. A separator is recognised once a frame has followed it; before, it is returned as text.
     """
 
     def __init__(self, channels: int):
         self.channels = channels
-        self._separator = self._last_text = ""
+        self._separators: set[str] = set()
+        self._last_text = ""
         self._numbers: list[float] | None = None  # of the frame that arrives, None outside of frames
         self._is_damaged = False  # the frame that arrives has been reported already
 
@@ -136,14 +177,15 @@ class WrappedLines:
             return None
         numbers, self._numbers = self._numbers, None
         if len(numbers) == self.channels:
-            self._separator = self._last_text
+            self._separators.add(self._last_text)
         return numbers
 
     def _add_text(self, text: str) -> list[float] | str | None:
         incomplete, pattern = self._numbers, line_pattern(text)
-        self._is_damaged = bool(self._separator) and pattern != self._separator
+        is_separator = pattern in self._separators
+        self._is_damaged = bool(self._separators) and not is_separator and (self._is_damaged or bool(incomplete))
         if self._is_damaged:
             self._numbers = None
             return text
         self._last_text, self._numbers = pattern, []
-        return text if not self._separator else incomplete or None
+        return (incomplete or None) if is_separator else text

@@ -13,7 +13,7 @@ from __future__ import annotations
 import re
 from array import array
 from collections.abc import Iterator, Sequence
-from itertools import islice
+from itertools import islice, takewhile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ from jaxtyping import Float, Inexact
 
 from jeit.arguments import counted
 from jeit.data.description import TableLayout
-from jeit.data.formats.separated import Separators, line_pattern, separator_patterns
+from jeit.data.formats.separated import Separator, Separators, line_pattern, separator_patterns
 from jeit.files import check_memory
 
 # Bytes of memory per byte of text: a number may take only two characters, and is stored twice, in eight bytes each.
@@ -48,14 +48,14 @@ _MIN_MILLISECOND_STEP = 5
 
 class Text(NamedTuple):
     """The numbers of a text file. **Fields**: `values`: all numbers; `lengths`: number of values in each line;
-    `heading`: cells of the last line of the heading; `notes`: detected properties; `part_size`: number of values
-    between two separator lines, 0 without separators."""
+    `heading`: cells of the last line of the heading; `notes`: detected properties; `separators`: lines between
+    the numbers, and lines that contain anything else."""
 
     values: Inexact[np.ndarray, " n"]
     lengths: np.ndarray
     heading: tuple[str, ...]
     notes: tuple[str, ...]
-    part_size: int = 0
+    separators: Separators = Separators()
 
 
 class _NumberFormat(NamedTuple):
@@ -125,8 +125,8 @@ def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = 
     """Read the numbers of a text file. The `delimiter` between numbers and `skip_rows`, the number of heading lines,
     are detected if they are None.
 
-    Between separator lines, a few parts of which some numbers are missing or unreadable are replaced by NaN. Raises
-    `ValueError`, with the line, for a file that contains anything else but numbers or that was cut off.
+    Raises `ValueError`, with the line, for a file that contains anything but numbers or that was cut off. Unreadable
+    lines between separator lines are allowed, and refused later unless they can be left out.
     """
     check_memory(path.name, _MEMORY_FACTOR * path.stat().st_size)
     num_skipped = skip_rows or 0
@@ -138,19 +138,19 @@ def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = 
     patterns = {line_pattern(heading_line) for heading_line in lines[:num_heading]}
     patterns |= separator_patterns(lines, lambda line: any(map(_is_number, number_format.cells(line))))
     values, imaginary, lengths, label = array("d"), array("d"), array("q"), ""
-    separators, fault = Separators(), ""
+    separators = Separators()
     line, cells, row = "\n", [], []
     for line_number, line in islice(_content_lines(path, num_skipped), num_heading, None):
-        if fault and not separators.examples:  # it is not in the last line, which may be cut off
-            raise ValueError(fault)
+        if separators.fault and not patterns:  # it is not in the last line, which may be cut off
+            raise ValueError(separators.fault)
         if line_pattern(line) in patterns or _LONE_LABEL.fullmatch(line):
-            separators.add(len(lengths), line_number, line)
+            separators.found.append(Separator(len(lengths), line_number, line.strip()))
             continue
         cells = number_format.cells(line)
         row = _numbers_until_a_fault(cells)
         if len(row) < len(cells):
             message = _not_a_number_message(cells, number_format, is_first=not lengths)
-            fault = fault or f"{path.name}, line {line_number}{message}"
+            separators.fault = separators.fault or f"{path.name}, line {line_number}{message}"
             separators.unreadable.append(len(lengths))
         if not lengths and (label_match := _LABEL.match(line)):
             label = label_match[1].strip()
@@ -163,9 +163,8 @@ def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = 
     if is_cut_off:
         separators.unreadable.pop()
     numbers = np.array(values) + 1j * np.array(imaginary) if imaginary else np.array(values)
-    parts = separators.complete(numbers, np.array(lengths))
-    if separators.unreadable and parts is None:
-        raise ValueError(fault)
+    if separators.unreadable and not (separators.examples and values):
+        raise ValueError(separators.fault)
     if not values:
         raise ValueError(f"{path.name} holds no numbers.")
     notes = [f"numbers are separated by {number_format}."] if delimiter is None and number_format != _CSV_FORMAT else []
@@ -174,20 +173,36 @@ def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = 
     if separators.examples:
         number_text = counted(len(separators.examples), "line")
         notes.append(f"between the numbers, {number_text} such as {separators.examples[0]!r} are left out.")
-    notes += [] if parts is None else parts.notes
     notes += [f"{label!r} stands before each line, and is left out."] if label else []
     if is_cut_off:
         notes.append(f"the last number, {cells[-1][:20]!r}, is cut off, and left out.")
     elif not line.endswith("\n") and len(cells) > 1 and len(cells[-1]) < min(map(len, cells[:-1])):
         notes.append(f"no line end follows the last number, {cells[-1][:20]}: is it cut off?")
     heading_cells = tuple(number_format.cells(lines[num_heading - 1])) if num_heading else ()
-    if parts is None:
-        return Text(numbers, np.array(lengths), heading_cells, tuple(notes))
-    return Text(parts.numbers, parts.lengths, heading_cells, tuple(notes), parts.size)
+    return Text(numbers, np.array(lengths), heading_cells, tuple(notes), separators)
+
+
+def complete_parts(text: Text, counts: Sequence[int], name: str) -> Text:
+    """Replace damaged parts between separator lines by NaN, if frames are wrapped over several lines. `counts`: numbers
+    of channels that a frame may have. Raises `ValueError` if too many parts are damaged, or if frames do not begin at
+    separators."""
+    line_length = int(np.bincount(text.lengths).argmax())
+    if not text.separators.examples or any(line_length in (count, count + 1) for count in counts):
+        return text
+    parts = text.separators.complete(text.values, text.lengths, counts, name)
+    if not any(count % parts.size == 0 or parts.size % count == 0 for count in counts):
+        raise ValueError(
+            f"{name}: between lines such as {text.separators.examples[0]!r} are {counted(parts.size, 'number')}, and a "
+            f"frame has {counts[0]}: are lines missing, or is the protocol another?"
+        )
+    return Text(parts.numbers, parts.lengths, text.heading, (*text.notes, *([parts.note] if parts.note else [])))
 
 
 def rectangle(text: Text, name: str) -> Inexact[np.ndarray, "R C"]:
-    """The numbers of a text file as a matrix. Raises `ValueError` if lines have different lengths."""
+    """The numbers of a text file as a matrix. Raises `ValueError` if lines have different lengths or are
+    unreadable."""
+    if text.separators.unreadable:
+        raise ValueError(text.separators.fault)
     length = int(text.lengths[0])
     if (unequal_rows := np.flatnonzero(text.lengths != length)).size:
         raise ValueError(
@@ -254,9 +269,14 @@ def _content_lines(path: Path, num_skipped: int) -> Iterator[tuple[int, str]]:
     1."""
     with path.open("rb") as file:
         is_utf16 = file.read(2) in (b"\xff\xfe", b"\xfe\xff")  # as spreadsheets write "Unicode text"
+    num_lines = 0
     try:
-        with path.open(encoding="utf-16" if is_utf16 else "utf-8-sig") as file:
+        # A byte that is no character may be one that a serial port has disturbed; a file that is not text begins so.
+        with path.open(encoding="utf-16" if is_utf16 else "utf-8-sig", errors="replace") as file:
             for line_number, line in enumerate(file, start=1):
+                if "\0" in line or ("\ufffd" in line and not num_lines):
+                    raise UnicodeError
+                num_lines += 1
                 if line_number > num_skipped and line.strip() and not line.lstrip().startswith(_COMMENT_MARKS):
                     yield line_number, line
     except UnicodeError:
@@ -279,6 +299,8 @@ def _not_a_number_message(cells: list[str], number_format: _NumberFormat, *, is_
 
 def _number(cell: str) -> complex:
     """The real or complex number in a cell. Raises `ValueError` for anything else."""
+    if "_" in cell:  # Python's float accepts 1_0
+        raise ValueError(cell)
     try:
         return float(cell)
     except ValueError:
@@ -289,13 +311,10 @@ def _number(cell: str) -> complex:
 
 def _numbers_until_a_fault(cells: list[str]) -> list[float | complex]:
     """The numbers in cells, up to the first cell that contains anything else."""
-    numbers: list[float | complex] = []
-    for cell in cells:
-        try:
-            numbers.append(_number(cell))
-        except ValueError:
-            break
-    return numbers
+    try:
+        return [_number(cell) for cell in cells]
+    except ValueError:
+        return [_number(cell) for cell in takewhile(_is_number, cells)]
 
 
 def _is_number(cell: str) -> bool:
@@ -322,6 +341,8 @@ def frames_in_text(text: Text, counts: Sequence[int], layout: TableLayout, name:
     A last line or frame that is cut off is left out. Raises `ValueError` for lines of unequal length that are not
     frames wrapped over several lines.
     """
+    if layout.frames_in is None:
+        text = complete_parts(text, counts, name)
     if layout.frames_in is None and (wrapped_counts := _wrapped_frames(text, counts)) is not None:
         num_channels, num_left_over = wrapped_counts
         num_frames = len(text.values) // num_channels
