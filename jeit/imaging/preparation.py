@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -40,14 +41,15 @@ def chosen_frame(measurement: Measurement, frame: int | str | None = None) -> in
 @contextmanager
 def naming_frame(measurement: Measurement, number: int) -> Iterator[None]:
     """Context manager that adds the frame number to a `ValueError` that names the measurement, if the measurement has
-    several frames."""
+    several frames. A reference may have the same name."""
     try:
         yield
     except ValueError as error:
         name = f"'{measurement.name}'"
-        if measurement.num_frames < 2 or name not in str(error):
+        named = re.compile(f"(?<!reference ){re.escape(name)}")
+        if measurement.num_frames < 2 or not named.search(str(error)):
             raise
-        raise ValueError(str(error).replace(name, f"{name}, frame {number}", 1)) from error
+        raise ValueError(named.sub(lambda _: f"{name}, frame {number}", str(error), count=1)) from error
 
 
 # Default number of mesh nodes for a solid and for a sheet.

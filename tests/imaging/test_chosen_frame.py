@@ -65,6 +65,8 @@ def test_a_frame_without_readings_is_named():
         prepare_difference(nothing, tank(EMPTY), frame=1, num_points=300)
     with pytest.raises(ValueError, match=r"^the reference 'empty' has no usable voltage"):
         prepare_difference(tank(FULL), tank(EMPTY, np.nan * EMPTY, name="empty").frame(1), num_points=300)
+    with pytest.raises(ValueError, match=r"^the reference 'tank' has no usable voltage"):  # a frame of the same file
+        prepare_difference(tank(FULL, FULL), tank(EMPTY, np.nan * EMPTY).frame(1), frame=1, num_points=300)
 
 
 def test_a_frame_that_cannot_be_imaged_is_named_and_its_reference_is_not():
