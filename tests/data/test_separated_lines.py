@@ -175,3 +175,11 @@ def test_a_frame_is_a_number_of_whole_parts(values, tmp_path):
     sizes = FileNumbers.read(path, None).sizes
     assert 40 in sizes
     assert {size % 40 for size in sizes if size > LENGTH} == {0}
+
+
+def test_dashes_in_place_of_frames_are_no_separators(values, tmp_path):
+    """They would be left out without a word, and later frames would move."""
+    frames = [[" ".join(f"{value:.2f}" for value in frame.ravel())] for frame in values]
+    frames[3] = frames[7] = ["-- -- --"]
+    with pytest.raises(ValueError, match=r"line 4, column 1: '--' is no number"):
+        read(written(frames, tmp_path / "a.txt"))
