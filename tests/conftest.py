@@ -54,6 +54,17 @@ def pytest_configure(config):
                 config.addinivalue_line("filterwarnings", f"error::{category}:{module}")
 
 
+def pytest_collection_finish():
+    """Exclude what has been imported from garbage collection: it stays until the end."""
+    gc.freeze()
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish():
+    """Exclude everything: pytest and Python collect garbage six times at the end, for up to ten seconds."""
+    gc.freeze()
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
     """Mark the tests of `repeated.txt` as slow: quicker ones reach the same code (see `find_repeated.py`)."""

@@ -30,7 +30,7 @@ from jeit.protocol import two_terminal
 
 SKIN = Rectangle(0.1, 0.1)
 SPACING, NUMBER = 0.02, 8
-MESH = rectangle(0.1, 0.1, num_points=200)
+MESH = rectangle(0.1, 0.1, num_points=62)
 PLACES = touch_grid(SKIN, 5, 5).places
 # A poor layout: all electrodes along one side and a half.
 START = Layout(
