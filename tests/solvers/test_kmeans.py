@@ -173,8 +173,8 @@ def test_inertia_equals_scikit_learn():
     threads = pytest.importorskip("threadpoolctl", reason=reason)
     points = skin()
     with threads.threadpool_limits(1):
-        theirs = [cluster.KMeans(30, n_init=10, tol=0, random_state=seed).fit(points).inertia_ for seed in range(5)]
-    mine = [float(kmeans(points, 30, jax.random.key(seed)).inertia) for seed in range(5)]
+        theirs = [cluster.KMeans(30, n_init=10, tol=0, random_state=seed).fit(points).inertia_ for seed in range(3)]
+    mine = [float(kmeans(points, 30, jax.random.key(seed)).inertia) for seed in range(3)]
     assert np.median(mine) == pytest.approx(np.median(theirs), rel=0.01)
 
 
@@ -215,6 +215,7 @@ def test_a_larger_tolerance_takes_fewer_steps():
     assert whole.inertia <= sooner.inertia <= 1.1 * whole.inertia
 
 
+@pytest.mark.slow
 def test_as_many_clusters_as_points():
     points = skin(side=4)
     found = kmeans(points, 16, jax.random.key(7), restarts=1)
@@ -231,8 +232,8 @@ def test_one_cluster_is_at_the_mean():
 
 def test_more_clusters_than_distinct_points():
     """Every point is at its centre, and the iteration ends although duplicate points could be exchanged for ever."""
-    points = np.repeat(skin(side=2), 4, axis=0)
-    found = kmeans(points, 16, jax.random.key(8), restarts=1)
+    points = np.repeat(skin(side=4), 25, axis=0)
+    found = kmeans(points, 30, jax.random.key(8))
     assert found.converged
     assert np.isfinite(found.centres).all()
     assert float(found.inertia) == pytest.approx(0, abs=1e-20)
