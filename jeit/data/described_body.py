@@ -264,7 +264,8 @@ def _positions(table: PlacedTable, body: Body | None, origin: str) -> np.ndarray
 def _edge_positions(table: PlacedTable, outline: Domain, num_electrodes: int) -> np.ndarray:
     """Positions (electrodes, 2) of electrodes along the edge of an outline."""
     if table.layout == "perimeter":
-        return perimeter(outline, num_electrodes, start=table.start)
+        positions = perimeter(outline, num_electrodes, start=table.start)
+        return np.roll(positions[::-1], 1, axis=0) if table.clockwise else positions
     if not isinstance(outline, Disk):
         raise ValueError('layout = "ring" needs a disk or a cylinder; use "perimeter" for other shapes.')
     return ring(

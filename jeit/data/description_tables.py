@@ -129,6 +129,10 @@ class PlacedTable(Table):
             raise fault("is missing; give it, or positions.", "layout")
         elif self.number is None:
             raise fault("is missing; give it: how many electrodes.", "number")
+        elif self.layout == "ring" and "start" in self.model_fields_set:
+            raise fault('has no effect on layout = "ring"; give start_angle_degrees.', "start")
+        elif self.layout == "perimeter" and "start_angle_degrees" in self.model_fields_set:
+            raise fault('has no effect on layout = "perimeter"; give start, in metres.', "start_angle_degrees")
         return self
 
 

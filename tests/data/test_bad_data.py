@@ -84,6 +84,14 @@ BAD_FILES = {
         r"needs \[geometry\]",
     ),
     "unknown layout": (changed('"ring"', '"spiral"'), "ring, perimeter"),
+    "start of another layout": (
+        changed('"ring"', '"ring"\nstart = 0.01'),
+        r'electrodes\.start has no effect on layout = "ring"; give start_angle_degrees',
+    ),
+    "angle of another layout": (
+        changed('"ring"', '"perimeter"\nstart_angle_degrees = 0'),
+        r'electrodes\.start_angle_degrees has no effect on layout = "perimeter"; give start',
+    ),
     "no width": (changed("width = 0.005", ""), r"electrodes\.width is missing"),
     "negative width": (
         changed("width = 0.005", "width = -1"),
