@@ -89,6 +89,20 @@ class Candidate:
         return bool(_MIN_ORDER_RATIO * self.unexplained < np.sqrt(1 - mean_ratio**2))
 
     @property
+    def num_zeros(self) -> int:
+        """Number of channels that are zero in every frame, apart from channels on driven electrodes."""
+        voltages, mask = np.asarray(self.measurement.voltages), np.asarray(self.measurement.mask)
+        return int((mask & (voltages == 0)).sum())
+
+    @property
+    def explains_zeros(self) -> bool:
+        """Whether the channels on driven electrodes, and no others, are zero in every frame: the device does not measure
+        there, and fills in zeros."""
+        on_driven = np.asarray(self.measurement.protocol.channels_on_driven_electrodes())
+        is_measured = np.asarray(self.measurement.mask)[..., on_driven]
+        return bool(on_driven.any()) and not is_measured.any() and self.num_zeros == 0
+
+    @property
     def name(self) -> str:
         """Kind, number of electrodes and options of the protocol, in words."""
         options = {key: value for key, value in self.protocol.items() if key not in ("kind", "number")}
