@@ -63,15 +63,25 @@ def touches(microphone_array):
     )
 
 
+@pytest.fixture(scope="module")
+def located(known, touches):
+    """The results for the touches."""
+    return locate(intensities_of(touches[1], name="desk", overlap=4.0), known)
+
+
+@pytest.fixture(scope="module")
+def located_with_fixed_gains(known, touches):
+    return locate(intensities_of(touches[1]), known, gain_drift=0)
+
+
 def coverage(found, places, frames=slice(None)):
     error = (found.position - places)[frames]
     square = np.einsum("fi,fij,fj->f", error, np.linalg.inv(found.covariance[frames]), error)
     return np.mean(square < 5.991)
 
 
-def test_touches(known, touches):
-    places, power = touches
-    found = locate(intensities_of(power, name="desk"), known)
+def test_touches(located, touches):
+    places, found = touches[0], located
     # One in ten thousand is reported as a misfit, and places near the edge may be reported as outside.
     assert np.mean(found.status == "touch") > 0.95
     assert found.counts()["touch"] == (found.status == "touch").sum()
@@ -85,18 +95,15 @@ def test_touches(known, touches):
     assert found.notes == ()
     assert found.name == "desk"
     np.testing.assert_array_equal(found.times, 0.05 * np.arange(FRAMES))
-    assert found.overlap == 1
+    assert found.overlap == 4  # that of the measurement
     assert np.isnan(found.second).all()
     assert np.isnan(found.second_strength).all()
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1e12])
-def test_any_unit(scale, known, touches):
+def test_any_unit(scale, known, touches, located):
     """Intensities and their floor in another unit give the same places."""
-    plain, other = (
-        locate(intensities_of(touches[1]), known),
-        locate(intensities_of(scale * touches[1], floor=scale * FLOOR), known),
-    )
+    plain, other = located, locate(intensities_of(scale * touches[1], floor=scale * FLOOR), known)
     np.testing.assert_allclose(other.position, plain.position, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(other.strength, scale * plain.strength, rtol=1e-6)
     np.testing.assert_array_equal(other.status, plain.status)
@@ -186,7 +193,7 @@ def test_exact_two_touches(known, in_numpy):
     microphone_array = array(9, relative=0.01)
     first, second = pair_of_places()
     power = received_power(microphone_array, first, 8.0) + received_power(microphone_array, second, 5.0)
-    found = locate(intensities_of(power, floor=0), calibration(microphone_array))
+    found = locate(intensities_of(power, floor=0), calibration(microphone_array), gain_drift=0)
     both = found.status == "two touches"
     # One in ten looks, to a single source, as if from outside the outline, and is reported as such.
     assert both.mean() > 0.8
@@ -226,7 +233,7 @@ def test_misfit(known, in_numpy):
     assert any("is this the calibration of this array" in note for note in found.notes)
 
 
-def test_unusable_frames(known, touches):
+def test_unusable_frames(known, touches, located_with_fixed_gains):
     """Two readings are not enough. Three are."""
     power = touches[1].copy()
     power[5, 2:] = np.nan
@@ -239,7 +246,7 @@ def test_unusable_frames(known, touches):
     assert found.has_position.sum() == FRAMES - 2
     np.testing.assert_array_equal(found.used[5], np.arange(9) < 2)
     others = np.setdiff1d(np.arange(FRAMES), [5, 6, 7])
-    whole = locate(intensities_of(touches[1]), known, gain_drift=0)
+    whole = located_with_fixed_gains
     np.testing.assert_allclose(found.position[others], whole.position[others], rtol=1e-6, atol=1e-9)
     np.testing.assert_array_equal(found.status[others], whole.status[others])
     assert "NaN or infinite in 3 of 64 windows" in found.faults[8]
@@ -258,7 +265,7 @@ def test_another_number_of_microphones(known):
         locate(intensities_of(np.ones((4, 8))), known)
 
 
-@pytest.mark.parametrize("dead", range(1, 6))
+@pytest.mark.parametrize("dead", [2, 4, *(pytest.param(number, marks=pytest.mark.slow) for number in (1, 3, 5))])
 def test_dead_microphones(dead, microphone_array):
     """Exact data stay exact, noisy ones have errors near the bound for the rest, and the faults are reported."""
     places = inside(FRAMES, seed=9, reach=0.6)
@@ -310,7 +317,7 @@ def test_an_uncalibrated_microphone_is_not_used(microphone_array, touches):
 def test_exchanged_microphones_are_named(known, touches, in_numpy):
     order = np.arange(9)
     order[[2, 6]] = [6, 2]
-    found = locate(intensities_of(touches[1][:, order]), known)
+    found = locate(intensities_of(touches[1][:24, order]), known)
     assert len(found.notes) == 1
     assert found.notes[0].startswith("microphones 2 and 6 look exchanged")
     assert np.isin(found.status, ["misfit", "outside", "two touches"]).mean() > 0.3
@@ -329,12 +336,9 @@ def test_exact_data(method):
     assert found.misfit.max() < 1e-6
 
 
-def test_results_of_the_papers_loss_are_judged_by_the_likelihood(known, touches):
+def test_results_of_the_papers_loss_are_judged_by_the_likelihood(known, touches, located):
     """The same misfits and statuses, at other places."""
-    mine, papers = (
-        locate(intensities_of(touches[1]), known),
-        locate(intensities_of(touches[1]), known, method="consistency"),
-    )
+    mine, papers = located, locate(intensities_of(touches[1]), known, method="consistency")
     np.testing.assert_array_equal(papers.status, mine.status)
     np.testing.assert_allclose(papers.misfit, mine.misfit)
     apart = np.linalg.norm(papers.position - mine.position, axis=1)
@@ -343,11 +347,10 @@ def test_results_of_the_papers_loss_are_judged_by_the_likelihood(known, touches)
 
 
 @pytest.mark.slow
-def test_a_fine_raster_gives_the_same_places(known, touches):
+def test_a_fine_raster_gives_the_same_places(known, touches, located):
     """The paper's 200 × 200."""
-    plain = locate(intensities_of(touches[1]), known)
     fine = locate(intensities_of(touches[1]), known, map_shape=(200, 200))
-    apart = np.linalg.norm(fine.position - plain.position, axis=1)
+    apart = np.linalg.norm(fine.position - located.position, axis=1)
     assert np.mean(apart < 1e-6) > 0.95
 
 
@@ -366,9 +369,9 @@ def test_noise_is_estimated_from_negative_intensities():
     assert coverage(found, np.concatenate([places, places]), slice(0, 32)) > 0.8
 
 
-def test_frames_do_not_depend_on_each_other(known, touches):
+def test_frames_do_not_depend_on_each_other(known, touches, located_with_fixed_gains):
     """Apart from notes and gains, which concern all frames: part of the frames gives the same results as the whole."""
-    whole = locate(intensities_of(touches[1]), known, gain_drift=0)
+    whole = located_with_fixed_gains
     for part in (slice(0, 33), slice(31, 64)):
         some = locate(intensities_of(touches[1][part]), known, gain_drift=0)
         np.testing.assert_allclose(some.position, whole.position[part], rtol=1e-6, atol=1e-9)
@@ -385,7 +388,7 @@ def test_every_status_is_documented():
 )
 def test_bad_options(options, message, known, touches):
     with pytest.raises(ValueError, match=message):
-        locate(intensities_of(touches[1]), known, **options)
+        locate(intensities_of(touches[1][:2]), known, **options)
 
 
 def test_a_place_that_is_not_determined_is_ambiguous():
@@ -401,26 +404,22 @@ def test_a_place_that_is_not_determined_is_ambiguous():
     np.testing.assert_allclose(result["covariance"][0], 1e-6 * np.eye(2))
 
 
-def test_the_overlap_of_windows_is_that_of_the_measurement(known, touches):
-    assert locate(intensities_of(touches[1], overlap=4.0), known).overlap == 4
-
-
 @pytest.mark.parametrize(
     ("scale", "beginning"),
     [(1e-9, "touches are 1e-08 times"), (1e9, "touches are 1e+08 times"), (1e-3, ""), (1e3, "")],
 )
-def test_another_unit_is_noted(scale, beginning, known, touches):
+def test_another_unit_is_noted(scale, beginning, known, touches, located):
     """Beyond 40 dB from the taps. A smaller difference may be a light touch or a blow."""
-    typical = float(np.median(locate(intensities_of(touches[1]), known).strength))
+    typical = float(np.median(located.strength))
     known_strengths = eqx.tree_at(
         lambda one: one.strengths, known, (0.1 * typical, 10 * typical), is_leaf=lambda one: one is None
     )
     scaled = intensities_of(scale * touches[1], floor=scale * FLOOR)
-    notes = locate(scaled, known_strengths).notes
+    notes = locate(scaled, known_strengths, gain_drift=0).notes
     assert [note.startswith(beginning) and note.endswith("same gain and unit?") for note in notes] == [True] * bool(
         beginning
     )
-    assert locate(scaled, known).notes == ()
+    assert locate(scaled, known, gain_drift=0).notes == ()
 
 
 def test_another_unit_is_noted_even_if_all_frames_are_below_the_noise():

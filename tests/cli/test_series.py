@@ -42,6 +42,7 @@ def recording(tmp_path_factory):
 
 def test_results_are_written(recording, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("jeit.plot.imaging.series.SERIES_FRAMES", 6)  # one row of frames instead of two
+    monkeypatch.setattr("jeit.report.series.FILM_FRAMES", 4)
     given = ["series", str(recording / "frames.csv"), "-o", str(tmp_path), "--num-points", "250"]
     asked = ["--frequency", "0.5-2", "--region", "half:1,0", "--region", "box:-0.09,-0.09,0,0.09", "--film", "a.gif"]
     assert main([*given, *asked]) == 0

@@ -11,6 +11,14 @@ from jeit.data import load_description
 from jeit.mesh import centroids
 
 
+@pytest.fixture(scope="module", autouse=True)
+def small_ensembles():
+    """Ensembles of a few members, for which the command has no option."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jeit.touch.learnt.methods._NUM_MEMBERS", 8)
+        yield
+
+
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("touch")

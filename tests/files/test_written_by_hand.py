@@ -2,6 +2,7 @@
 
 import copy
 import datetime
+import functools
 import inspect
 import json
 import math
@@ -174,10 +175,11 @@ CURVED = PLANE | {
 NUMBERS = [0, 1, 2, 3, -1, 7, 1000, 10**6, 2**63, 10**400, -(10**400), b"ff" * 2500]
 REALS = [0.0, -0.0, 0.5, -1.5, 1e-300, 1e308, 30.0, 0.02, math.nan, math.inf, -math.inf]
 TEXTS = ["", "adjacent", "disk", "sheet", "a", "[red]x[/red]", "é\n\t\x00", "x" * 5_000, "../../etc/passwd", "(a+)+$"]
-DATES = [datetime.date(2020, 2, 29), datetime.datetime(2020, 1, 1, 12), datetime.time(7, 30)]
+DATES = (datetime.date(2020, 2, 29), datetime.datetime(2020, 1, 1, 12), datetime.time(7, 30))
 KEYS = ["colour", "number", "radius", "a b", "", "x" * 5000, "[red]", "positions", "kind", "wanted", "rows"]
 
 
+@functools.cache  # Hypothesis takes milliseconds to validate a new strategy
 def values(dates):
     plain = st.sampled_from([*NUMBERS, *REALS, *TEXTS, True, False, *dates])
     return st.recursive(
@@ -296,7 +298,7 @@ def test_skins(file, case):
     check(refusal(lambda: read_described_skin(file)), case[1])
 
 
-@given(case=changed([PLANE, CURVED], dates=[None]))
+@given(case=changed([PLANE, CURVED], dates=(None,)))
 @quick
 def test_calibrations(file, case):
     file.write_text(jsoned(case[0]), "utf-8")

@@ -283,12 +283,15 @@ def test_too_few_frames_have_no_spectrum(mesh, number, further):
     assert all(len(ax.lines[0].get_xdata()) > 1 for ax in drawn.axes if ax.get_title() in titles[number + 1 :])
 
 
-def test_a_functional_image_of_a_solid_states_the_plane():
-    tank = Solid(Disk(RADIUS), 0.04).mesh(num_points=600)
-    series = ImageSeries(tank, np.ones((2, tank.num_cells)), np.arange(2.0))
-    for height, place in ((None, "20.0"), (0.03, "30.0")):
-        titles = [ax.get_title() for ax in plot_series(series, {}, height=height).axes]
-        assert f"functional image, slice at z = {place} mm" in titles
+def test_a_series_of_a_solid_is_cut_in_the_stated_plane():
+    """Of three layers, the middle one by default."""
+    tank = layer(rectangle(0.1, 0.1, num_points=60), 0.03, 3)
+    number = np.floor(np.asarray(centroids(tank))[:, 2] / 0.01) + 1.0
+    series = ImageSeries(tank, np.stack([number, number]), np.arange(2.0))
+    for height, place, expected in ((None, "15.0", 2.0), (0.025, "25.0", 3.0)):
+        axes = {ax.get_title(): ax for ax in plot_series(series, {}, height=height).axes}
+        assert f"functional image, slice at z = {place} mm" in axes
+        np.testing.assert_allclose(axes["1.00 s"].images[1].get_array(), expected)
 
 
 def test_sensitivity_is_lowest_in_the_middle(mesh, electrodes, ax):

@@ -3,6 +3,8 @@ any point."""
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
@@ -98,32 +100,39 @@ class Triangles(Module):
     @property
     def node_normals(self) -> Float[np.ndarray, "n 3"]:
         """Outward unit normals at the nodes: area-weighted means of the normals of the triangles."""
-        summed = np.zeros_like(self.points)
-        np.add.at(summed, self.cells, self._edge_cross_products[:, None])
+        products = np.repeat(self._edge_cross_products, 3, axis=0)
+        summed = np.stack([np.bincount(self.cells.ravel(), one, len(self.points)) for one in products.T], axis=1)
         return summed / np.linalg.norm(summed, axis=1, keepdims=True)
 
     @property
     def border(self) -> Int[np.ndarray, "b 2"]:
         """Edges (b, 2) that belong to one triangle only; a closed surface has none."""
         edges = self.cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-        _, first, counts = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
+        _, first, counts = np.unique(self._edge_numbers(edges), return_index=True, return_counts=True)
         return edges[first[counts == 1]]
 
-    @property
+    def _edge_numbers(self, edges: Int[np.ndarray, "e 2"]) -> Int[np.ndarray, " e"]:
+        """A number for each edge, equal for both directions and in the order of the smaller, then the larger node:
+        numbers are sorted several times faster than pairs."""
+        return edges.min(axis=1).astype(np.int64) * len(self.points) + edges.max(axis=1)
+
+    @cached_property
     def _edge_cross_products(self) -> Float[np.ndarray, "m 3"]:
         corners = self.corners
         return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+    @cached_property
+    def _centroid_tree(self) -> KDTree:
+        return KDTree(self.corners.mean(axis=1))
 
     def nearest(self, places: ArrayLike) -> SurfacePlaces:
         """Points on the surface nearest to `places` (p, 3), metres."""
         positions = np.asarray(places, float)
         num_candidates = min(_CANDIDATES, len(self.cells))
-        corners = self.corners
-        candidates = (
-            KDTree(corners.mean(axis=1)).query(positions, num_candidates)[1].reshape(len(positions), num_candidates)
-        )
-        weights = _nearest_in_triangles(corners[candidates], positions[:, None])
-        points = np.einsum("pqk,pqkd->pqd", weights, corners[candidates])
+        candidates = self._centroid_tree.query(positions, num_candidates)[1].reshape(len(positions), num_candidates)
+        corners = self.points[self.cells[candidates]]
+        weights = _nearest_in_triangles(corners, positions[:, None])
+        points = np.einsum("pqk,pqkd->pqd", weights, corners)
         distances = np.linalg.norm(points - positions[:, None], axis=-1)
         nearest_index = distances.argmin(axis=1)
         row = np.arange(len(positions))
@@ -151,12 +160,12 @@ class Triangles(Module):
 
     def finer(self) -> "Triangles":
         """Divide each triangle into four at the midpoints of its sides."""
-        edges = np.sort(self.cells[:, [[1, 2], [2, 0], [0, 1]]], axis=2)
-        distinct_edges, edge_index = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
+        edges = self.cells[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2)
+        _, first, edge_index = np.unique(self._edge_numbers(edges), return_index=True, return_inverse=True)
         a, b, c = self.cells.T
         p, q, r = (edge_index.reshape(-1, 3) + len(self.points)).T
         cells = np.concatenate([np.stack(nodes, axis=1) for nodes in ((a, r, q), (r, b, p), (q, p, c), (p, q, r))])
-        return Triangles(np.concatenate([self.points, self.points[distinct_edges].mean(axis=1)]), cells)
+        return Triangles(np.concatenate([self.points, self.points[edges[first]].mean(axis=1)]), cells)
 
 
 def _nearest_in_triangles(corners: Float[np.ndarray, "... 3 3"], points: Float[np.ndarray, "... 3"]) -> np.ndarray:

@@ -57,12 +57,17 @@ def select_frames(num_frames: int, max_frames: int) -> list[int]:
     return [int(frame) for frame in np.unique(np.linspace(0, num_frames - 1, min(num_frames, max_frames)).round())]
 
 
+def _make_raster(mesh: Mesh, height: float | None = None) -> Raster:
+    """Make the raster on which the images of a stream are sampled. `height`: as for `Raster.create`."""
+    return Raster.create(mesh, shape=(_NUM_PIXELS, _NUM_PIXELS), height=height)
+
+
 class FramePicture:
     """Picture on `ax` of one frame of a stream at a time; `show` replaces it by the image of a different frame.
 
     `fitted`: colour scale of all frames; `show_numbers`: whether electrodes are numbered; `show_scale_bar`: whether a
-    scale bar is drawn. Images are sampled on a raster; for a solid, the raster lies at z = `height` in metres, by
-    default at half the height of the solid.
+    scale bar is drawn; `raster`: raster on which images are sampled, which pictures of one mesh can share; by default a
+    raster is made, for a solid at half its height.
     """
 
     def __init__(
@@ -74,10 +79,10 @@ class FramePicture:
         *,
         show_numbers: bool = True,
         show_scale_bar: bool = True,
-        height: float | None = None,
+        raster: Raster | None = None,
     ):
         self.ax, self.fitted = ax, fitted
-        self.raster = Raster.create(mesh, shape=(_NUM_PIXELS, _NUM_PIXELS), height=height)
+        self.raster = _make_raster(mesh) if raster is None else raster
         extent, is_inside = self.raster.extent, np.asarray(self.raster.cell) >= 0
         body = np.where(is_inside, 0.0, np.nan)
         ax.imshow(body, extent=extent, cmap=ListedColormap([_BODY_COLOUR]), interpolation="nearest", zorder=0)
@@ -156,13 +161,14 @@ def plot_frames(
     rows = -(-len(selected) // columns)
     figure = Figure(figsize=(2.3 * columns + 1.1, 2.5 * rows + 0.3), layout="constrained")
     grid = figure.add_gridspec(rows, columns + 1, width_ratios=[1] * columns + [0.05])
-    pictures = []
+    raster, pictures = _make_raster(mesh), []
     for panel_index, frame in enumerate(selected):
         ax = figure.add_subplot(grid[panel_index // columns, panel_index % columns])
-        pictures.append(
-            FramePicture(ax, mesh, electrodes, fitted_scale, show_numbers=False, show_scale_bar=panel_index == 0)
+        picture = FramePicture(
+            ax, mesh, electrodes, fitted_scale, show_numbers=False, show_scale_bar=panel_index == 0, raster=raster
         )
-        pictures[-1].show(values[frame], frame_titles[frame])
+        picture.show(values[frame], frame_titles[frame])
+        pictures.append(picture)
     if scale.bar:
         colour_bar_axes = figure.add_subplot(grid[:, -1])
         fitted_scale.draw_bar(colour_bar_axes, pictures[0].mappable, colour_bar_axes)
@@ -213,9 +219,10 @@ def plot_series(
     figure = Figure(figsize=(11.0, 2.2 * num_lines + 3.4 * num_rows + 3.4), layout="constrained")
     subfigures: Any = figure.subfigures(2, 1, height_ratios=[2.2 * num_lines, 3.4 * num_rows + 3.4])
     frames_figure, maps_figure = subfigures
-    _draw_frames(frames_figure, series, electrodes, num_lines, height)
+    raster = _make_raster(series.mesh, height)
+    _draw_frames(frames_figure, series, electrodes, num_lines, raster)
     grid = maps_figure.add_gridspec(num_rows + 1, 3, height_ratios=[1.0] * (num_rows + 1))
-    maps = _RegionMaps(series, electrodes, height)
+    maps = _RegionMaps(series, electrodes, raster)
     functional_title = ", ".join(filter(None, ["functional image", slice_text(series.mesh, height)]))
     deviation_scale = ColourScale(difference=False, quantity="Standard deviation over time")
     maps.draw(maps_figure.add_subplot(grid[0, 0]), series.functional(), deviation_scale, functional_title)
@@ -244,7 +251,7 @@ def plot_series(
 
 
 def _draw_frames(
-    figure, series: ImageSeries, electrodes: AbstractElectrodes | None, num_lines: int, height: float | None
+    figure, series: ImageSeries, electrodes: AbstractElectrodes | None, num_lines: int, raster: Raster
 ) -> None:
     """Draw evenly spaced frames in `num_lines` lines, on one colour scale."""
     selected, fitted_scale = select_frames(len(series.times), SERIES_FRAMES), fit_scale(series.changes, series.mesh)
@@ -258,7 +265,7 @@ def _draw_frames(
             fitted_scale,
             show_numbers=False,
             show_scale_bar=panel_index == 0,
-            height=height,
+            raster=raster,
         )
         picture.show(series.changes[frame], series.titles[frame])
         if panel_index == 0:
@@ -269,9 +276,8 @@ def _draw_frames(
 class _RegionMaps:
     """Maps of values per cell, sampled on a common raster."""
 
-    def __init__(self, series: ImageSeries, electrodes: AbstractElectrodes | None, height: float | None):
-        self.mesh, self.unit, self.electrodes = series.mesh, series.unit, electrodes
-        self.raster = Raster.create(self.mesh, shape=(_NUM_PIXELS, _NUM_PIXELS), height=height)
+    def __init__(self, series: ImageSeries, electrodes: AbstractElectrodes | None, raster: Raster):
+        self.mesh, self.unit, self.electrodes, self.raster = series.mesh, series.unit, electrodes, raster
 
     def draw(self, ax: Axes, values: np.ndarray, scale: ColourScale, title: str) -> None:
         pixels = np.asarray(self.raster.sample(as_array(values)))
