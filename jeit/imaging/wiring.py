@@ -194,7 +194,7 @@ def find_wiring(
     if compared.misfit < MOST_MISFIT:  # as described, except possibly for the sign
         return replace(compared, described=described_misfit)
     best_wiring = _better_wiring(misfit_of, described_wiring, compared, orders)
-    expected = select_channels(protocol, impedances[0])
+    expected = np.asarray(select_channels(protocol, impedances[0]))
     if (has_one_sign := _has_one_sign(expected, measurement)) is not None:
         misfit_of = _comparison(protocol, impedances, measurement, orders, signs=False)
         unsigned_wiring = _better_wiring(misfit_of, described_wiring, misfit_of(described_wiring), orders)
