@@ -157,14 +157,14 @@ def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int
     """Pairs of electrodes that cover a common part of an edge, given the `start` and `end` (3, b, L) of the intervals
     of the b edges that they cover, see `_covered_intervals`."""
     start, end = start.transpose(2, 1, 0), end.transpose(2, 1, 0)
+    is_covered = (end > start).any(axis=2).astype(float)
     pairs = []
-    for first in range(start.shape[0]):
-        for second in range(first + 1, start.shape[0]):
-            common = np.minimum(end[first][:, :, None], end[second][:, None, :]) - np.maximum(
-                start[first][:, :, None], start[second][:, None, :]
-            )
-            if common.max() > max(1e-9, 1e3 * np.finfo(end.dtype).eps) * end.max():
-                pairs.append((first, second))
+    for first, second in np.argwhere(np.triu(is_covered @ is_covered.T, 1)).tolist():  # both cover a part of one edge
+        common = np.minimum(end[first][:, :, None], end[second][:, None, :]) - np.maximum(
+            start[first][:, :, None], start[second][:, None, :]
+        )
+        if common.max() > max(1e-9, 1e3 * np.finfo(end.dtype).eps) * end.max():
+            pairs.append((first, second))
     return pairs
 
 

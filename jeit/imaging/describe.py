@@ -33,7 +33,7 @@ from jeit.imaging.possible_protocols import (
     fitting_candidates,
     spread_of,
 )
-from jeit.imaging.wiring import find_wiring
+from jeit.imaging.wiring import find_wiring, uniform_impedances
 from jeit.mesh import Solid
 
 # Number of nodes of the mesh on which protocols are compared, for a sheet and for a solid.
@@ -52,6 +52,9 @@ _MIN_GAIN_ERROR = 0.03
 _MAX_GAIN_RATIO = 0.4
 # Contact impedance of a new description, times conductivity, divided by the size of the body.
 _RELATIVE_CONTACT = 0.01
+
+# For each number of electrodes: the model of the empty body, and its impedances (`uniform_impedances`).
+_Models = dict[int, tuple[ForwardModel, list[np.ndarray]]]
 
 
 @dataclass(frozen=True)
@@ -146,7 +149,7 @@ def find_description(
         candidates = [item for item in candidates if item.num_zeros == 0]
     candidates.sort(key=lambda item: np.hypot(item.spread, 0.3 if item.reciprocity is None else item.reciprocity))
     progress("uniform body")
-    models: dict[int, ForwardModel] = {}
+    models: _Models = {}
     compared: list[Candidate] = []
     for candidate in candidates[:_MAX_COMPARED]:
         rival_limit = min((_rival_limit(item) for item in compared), default=np.inf)
@@ -159,7 +162,7 @@ def find_description(
         rivals = [item for item in rivals if not item.is_cut_off]
     winner = _with_gains(winner, models)
     compared[0] = winner
-    contact = {"contact_impedance": _contact_impedance(winner, models[winner.protocol["number"]])}
+    contact = {"contact_impedance": _contact_impedance(winner, models[winner.protocol["number"]][0])}
     tables = {"geometry": geometry, "electrodes": {**contact, **electrodes, "number": winner.protocol["number"]}}
     tables["protocol"] = {**winner.protocol, "current": current}
     text = _text(path, numbers.shape, numbers.data, winner, rivals, tables)
@@ -196,30 +199,33 @@ def _described_body(
     empty_frame = replace(base.mean_frame(), domain=description.domain, electrodes=description.electrodes)
     empty_frame = with_signs(replace(empty_frame, voltages=np.real(np.asarray(empty_frame.voltages))))
     spread = spread_of(np.real(np.asarray(base.filled())))
-    models: dict[int, ForwardModel] = {}
+    models: _Models = {}
     protocol = {"kind": format, "number": number}
     candidate = Candidate(protocol, data.num_frames, spread, reciprocity_error(empty_frame), empty_frame)
     candidate = _with_misfit(candidate, models)
-    contact = {"contact_impedance": _contact_impedance(candidate, models[number])}
+    contact = {"contact_impedance": _contact_impedance(candidate, models[number][0])}
     shape = f"{counted(data.num_frames, 'frame')} of {data.num_channels}"
     text = _text(path, shape, {}, candidate, (), {"geometry": geometry, "electrodes": {**contact, **entries}})
     return Findings((candidate,), (), text, known=True)
 
 
-def _with_misfit(candidate: Candidate, models: dict[int, ForwardModel]) -> Candidate:
+def _with_misfit(candidate: Candidate, models: _Models) -> Candidate:
     """The candidate with the wiring that explains the empty body best. Candidates with equally many electrodes share a
-    mesh."""
+    mesh and its impedances."""
     number, empty_frame = candidate.protocol["number"], candidate.measurement
     assert empty_frame.domain is not None
     assert empty_frame.electrodes is not None
     if number not in models:
         is_solid = isinstance(empty_frame.domain, Solid)
         mesh = body_mesh(empty_frame.domain, empty_frame.electrodes, _NODES[3 if is_solid else 2])
-        models[number] = ForwardModel(mesh, empty_frame.electrodes, empty_frame.protocol)
-    return replace(candidate, wiring=find_wiring(models[number].with_protocol(empty_frame.protocol), empty_frame))
+        model = ForwardModel(mesh, empty_frame.electrodes, empty_frame.protocol)
+        models[number] = model, uniform_impedances(model)
+    model, impedances = models[number]
+    wiring = find_wiring(model.with_protocol(empty_frame.protocol), empty_frame, impedances)
+    return replace(candidate, wiring=wiring)
 
 
-def _with_gains(candidate: Candidate, models: dict[int, ForwardModel]) -> Candidate:
+def _with_gains(candidate: Candidate, models: _Models) -> Candidate:
     """The candidate with gains of its measurement patterns, if they explain most of the reciprocity error."""
     if candidate.reciprocity is None or candidate.reciprocity < _MIN_GAIN_ERROR:
         return candidate

@@ -12,7 +12,7 @@ frame, up to a scale factor.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -165,7 +165,9 @@ class Wiring:
         return cycles
 
 
-def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
+def find_wiring(
+    model: ForwardModel, measurement: Measurement, impedances: Sequence[Float[np.ndarray, "L L"]] | None = None
+) -> Wiring:
     """Find the wiring that explains the first frame of `measurement`, a frame of the empty body. The result is the
     described wiring unless a different wiring has a far smaller misfit.
 
@@ -174,6 +176,9 @@ def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
     or if their signs are those that the described wiring implies. Such voltages are also compared without signs, and
     the result is used if it explains the frame better. Errors that leave the voltages unchanged, such as a rotation of
     the electrodes of a symmetric body, cannot be found.
+
+    `impedances`: those of the model (see `uniform_impedances`), which are the same for all protocols; computed here if
+    not given.
     """
     num_electrodes, orders = model.protocol.num_electrodes, channel_orders(model.protocol)
     described_wiring = Wiring(tuple(range(num_electrodes)))
@@ -181,14 +186,17 @@ def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
         return replace(
             described_wiring, misfit=1.0, described=0.0
         )  # a frame without signal does not determine the wiring
-    misfit_of = _comparison(model, measurement, orders)
+    impedances = uniform_impedances(model) if impedances is None else impedances
+    protocol = on_host(model.protocol)
+    misfit_of = _comparison(protocol, impedances, measurement, orders)
     compared = misfit_of(described_wiring)
     described_misfit = 1.0 if compared.reversed_signs else compared.misfit
     if compared.misfit < MOST_MISFIT:  # as described, except possibly for the sign
         return replace(compared, described=described_misfit)
     best_wiring = _better_wiring(misfit_of, described_wiring, compared, orders)
-    if (has_one_sign := _has_one_sign(model, measurement)) is not None:
-        misfit_of = _comparison(model, measurement, orders, signs=False)
+    expected = np.asarray(select_channels(protocol, impedances[0]))
+    if (has_one_sign := _has_one_sign(expected, measurement)) is not None:
+        misfit_of = _comparison(protocol, impedances, measurement, orders, signs=False)
         unsigned_wiring = _better_wiring(misfit_of, described_wiring, misfit_of(described_wiring), orders)
         if unsigned_wiring.misfit < _MAX_STEP_RATIO * best_wiring.misfit:
             best_wiring = replace(unsigned_wiring, magnitudes=has_one_sign)
@@ -230,15 +238,16 @@ def _better_wiring(
     return best_of([with_exchanges(best_of(turned_wirings, misfit_of(described_wiring)))], best_wiring)
 
 
-def _has_one_sign(model: ForwardModel, measurement: Measurement) -> bool | None:
-    """True if all voltages have one sign; False if all signs equal, or all oppose, the signs of a uniform body with the
-    described wiring (which are assigned to magnitudes when their file is read); None for other signs."""
+def _has_one_sign(expected: Float[np.ndarray, " M"], measurement: Measurement) -> bool | None:
+    """True if all voltages have one sign; False if all signs equal, or all oppose, those of the `expected` voltages of
+    a uniform body with the described wiring (which are assigned to magnitudes when their file is read); None for other
+    signs."""
     used = np.asarray(measurement.mask)[0]
     signs = np.sign(np.real(np.asarray(measurement.filled())[0]))[used]
-    expected = np.sign(select_channels(on_host(model.protocol), _impedances(model)[0]))[used]
     if abs(signs.sum()) == np.count_nonzero(signs):
         return True
-    return False if (signs * expected >= 0).all() or (signs * expected <= 0).all() else None
+    products = signs * np.sign(expected)[used]
+    return False if (products >= 0).all() or (products <= 0).all() else None
 
 
 def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
@@ -270,13 +279,17 @@ def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
 
 
 def _comparison(
-    model: ForwardModel, measurement: Measurement, orders, *, signs: bool = True
+    protocol: Protocol,
+    impedances: Sequence[Float[np.ndarray, "L L"]],
+    measurement: Measurement,
+    orders,
+    *,
+    signs: bool = True,
 ) -> Callable[[Wiring], Wiring]:
     """Return a function that computes the misfit of a wiring to the first frame of `measurement`, and the sign of the
     voltages. Without `signs`, only magnitudes of voltages are compared."""
-    protocol = on_host(model.protocol)
     voltages, mask = np.real(np.asarray(measurement.filled())[0]), np.asarray(measurement.mask)[0]
-    impedances, voltages = _impedances(model), voltages if signs else np.abs(voltages)
+    voltages = voltages if signs else np.abs(voltages)
 
     def misfit_of(wiring: Wiring) -> Wiring:
         electrode_places, order = np.array(wiring.places), orders[wiring.order]
@@ -296,7 +309,7 @@ def _comparison(
     return misfit_of
 
 
-def _impedances(model: ForwardModel) -> list[Float[np.ndarray, "L L"]]:
+def uniform_impedances(model: ForwardModel) -> list[Float[np.ndarray, "L L"]]:
     """Transfer impedances of the uniform body of unit conductivity, for each contact impedance of
     `_RELATIVE_CONTACTS`."""
     electrodes = model.electrodes

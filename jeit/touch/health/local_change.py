@@ -204,8 +204,10 @@ class LocalChange:
             else cell_gradients * conductance_changes[:, None, None]
         )
         cell_stiffness = weighted_gradients @ np.swapaxes(cell_gradients, 1, 2)
-        stiffness = np.zeros((len(nodes), len(nodes)))
-        np.add.at(stiffness, (corners[:, :, None], corners[:, None, :]), cell_stiffness)
+        rows, columns = np.broadcast_arrays(corners[:, :, None], corners[:, None, :])
+        stiffness = scipy.sparse.csr_array(
+            (cell_stiffness.ravel(), (rows.ravel(), columns.ravel())), shape=(len(nodes), len(nodes))
+        )
         initial_solution = self.solution[nodes]
         changed_solution = np.linalg.solve(
             np.eye(len(nodes)) + self.inverse[np.ix_(nodes, nodes)] @ stiffness, initial_solution

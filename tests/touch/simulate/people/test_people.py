@@ -30,7 +30,7 @@ STILL = replace(
 def skin(own=STILL):
     places = np.vstack([perimeter(Rectangle(0.3, 0.18), 8, start=0.06), [[0.0, 0.0]]])
     electrodes = PointElectrodes(places)
-    return PressedSkin(KEY, ForwardModel(SHEET.mesh(num_points=250), electrodes, reference_electrode(8)), own)
+    return PressedSkin(KEY, ForwardModel(SHEET.mesh(num_points=100), electrodes, reference_electrode(8)), own)
 
 
 @cache
