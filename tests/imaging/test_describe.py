@@ -111,6 +111,21 @@ def test_magnitudes_with_gains(tmp_path):
         find_description(tmp_path / "a.mat", DISK, RING, keys=("rad", "empty"))
 
 
+def test_zeros_in_place_of_driven_electrodes_determine_the_protocol(tmp_path):
+    """But not zeros of a measurement pattern that is never read, which would fit another order of the channels."""
+    voltages, protocol = simulated({"kind": "adjacent", "driven_electrodes": True, "order": "fixed"})
+    filled = np.where(np.asarray(protocol.channels_on_driven_electrodes()), 0, voltages)
+    empty, rod = saved(tmp_path, filled)
+    only_one = find_description(rod, DISK, RING, reference=empty)
+    assert [item.name for item in only_one.candidates] == [
+        "adjacent, 8 electrodes, driven_electrodes true, order fixed"
+    ]
+    empty, rod = saved(tmp_path, np.where(np.asarray(protocol.measurement_index) == 1, 0, voltages))
+    several = find_description(rod, DISK, RING, reference=empty)
+    assert len(several.candidates) > 4
+    assert several.candidates[0].protocol == only_one.candidates[0].protocol
+
+
 def test_half_of_the_channels_leaves_the_order_open(tmp_path):
     """Without reciprocal channels, and in a round body, both orders explain a frame nearly as well: a question is
     asked.
@@ -270,7 +285,7 @@ def test_command(tmp_path, capsys, monkeypatch):
     given = ["describe", str(rod), "--reference", str(empty), "--output", str(tmp_path / "out")]
     monkeypatch.setattr("sys.stdin", io.StringIO())
     assert main(given) == 1
-    assert "--shape disk:0.1 --width 0.01: the file does not state" in capsys.readouterr().err
+    assert "the file does not state all sizes; add them in metres, such as --shape disk:0.1 --width 0.01" in capsys.readouterr().err
     assert main([*given, "--shape", "disk:0.1,3", "--width", "0.012"]) == 1
     assert "--shape: give one of disk:RADIUS" in capsys.readouterr().err
     assert main([*given, "--shape", "disk:0.1", "--width", "0", "--electrodes", "8"]) == 1

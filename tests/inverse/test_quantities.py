@@ -74,6 +74,19 @@ def test_quantities_of_a_fitted_body_and_wider_intervals_by_model_errors(monkeyp
     assert radii[1] > 1.2 * radii[0] > 0
 
 
+def test_a_body_fitted_with_the_other_sign_has_quantities():
+    """Of a resistive disc for which a conductive body is fitted, whose contrast is then negative."""
+    model = ForwardModel(DISK.mesh(num_points=300), DESCRIBED, PROTOCOL)
+    inside = np.linalg.norm(np.asarray(centroids(model.mesh)) - [0.02, 0.035], axis=1) < 0.025
+    voltages = np.asarray(model.voltages(SIGMA * np.where(inside, 0.6, 1.0)))
+    noise = 1e-4 * np.abs(voltages)
+    options = {"noise": noise, "prior": StarPrior(modes=1), "accuracy": Accuracy(noise, None)}
+    bodies = reconstruct_shapes(model, voltages, SIGMA, start=[(1, (0.02, 0.03), 0.02)], **options).bodies
+    found = [(one.quantities.change, one.quantities.measure, one.quantities.strength) for one in bodies]
+    assert len(found) > 0
+    assert np.isfinite(found).all()
+
+
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_the_radius_of_a_place_holds_68_percent_of_a_posterior(dimension):
     """Of centroids that depend linearly on the coefficients of the second of two bodies, against samples; with an error

@@ -84,7 +84,7 @@ def describe(
     examples = {"--shape disk:0.1": shape, "--width 0.01": width}
     missing = [example for example, value in examples.items() if value is None]
     if missing and not sys.stdin.isatty():
-        raise ValueError(f"{' '.join(missing)}: the file does not state the sizes; give them, in metres.")
+        raise ValueError(f"the file does not state all sizes; add them in metres, such as {' '.join(missing)}.")
     geometry, electrode_table = _body_tables(
         _value_or_prompt(shape, "The body in metres, such as disk:0.1"), width, height
     )

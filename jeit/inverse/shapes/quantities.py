@@ -184,6 +184,7 @@ def explore_contrast(problem: ShapeProblem, fit: Fit, k: int) -> list[ExploredCo
     improbable or at a bound. Returns the fits in ascending order of contrast."""
     bodies = fit.bodies
     contrast, slope = bodies.contrast(k, bodies.rows(fit.coefficients)[k])
+    contrast = max(contrast, np.exp(_LOG_CONTRAST_BOUNDS[0]))  # of a body fitted with the other sign, it is negative
     first_log_contrast = float(np.clip(np.log(contrast), *_LOG_CONTRAST_BOUNDS))
     deviation = problem.deviations(fit)[_radius_and_contrast_index(bodies, k)[1]] * abs(slope) / contrast
     middle_fit = _fit_with_fixed_contrast(problem, bodies, fit.coefficients, k, np.log(contrast), first_log_contrast)

@@ -24,6 +24,8 @@ _BLUR = 0.2
 # Distance from an outline, in widths of the blur, beyond which the covered share of a cell is less than 1e-12.
 _REACH = 30
 _NUM_OUTLINE_POINTS = 128
+# Minimum effect of a star on the electric field, relative to that of a weak star of the same size.
+_MIN_STRENGTH = 0.01
 
 
 @dataclass(frozen=True)
@@ -212,6 +214,7 @@ class Stars(Bodies):
         rows, is_weak = self.rows(coefficients), self.is_other_kind.copy()
         for k in indices:
             strength = np.tanh(self.contrast(k, rows[k])[0] / 2) / np.tanh(self.prior.weak_contrast / 2)
+            strength = max(strength, _MIN_STRENGTH)  # of a star fitted with the other sign, it is negative
             rows[k, 2] += np.log(strength) / 2 / self.prior.radius_spread
             rows[k, 3], is_weak[k] = 0, True
         return replace(self, is_other_kind=is_weak), np.append(coefficients[0], rows)
