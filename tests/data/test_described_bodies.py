@@ -54,8 +54,8 @@ def test_a_box_with_patches_in_two_levels():
 def test_electrodes_along_an_edge_may_be_numbered_clockwise():
     plates = {"layout": "perimeter", "number": 6, "width": 0.01, "contact_impedance": 1e-2, "start": 0.02}
     sheet = {"shape": "rectangle", "width": 0.1, "height": 0.08}
-    ahead, back = (np.asarray(described(sheet, plates | {"clockwise": way}).electrodes.position) for way in (False, True))
-    np.testing.assert_array_equal(back, ahead[[0, 5, 4, 3, 2, 1]])
+    ahead, back = (described(sheet, plates | {"clockwise": way}).electrodes for way in (False, True))
+    np.testing.assert_array_equal(back.position, np.asarray(ahead.position)[[0, 5, 4, 3, 2, 1]])
 
 
 STRIP = {"kind": "patch", "layout": "ring", "number": 8, "width": 0.01, "contact_impedance": 1e-3, "levels": [0.02]}

@@ -285,7 +285,8 @@ def test_command(tmp_path, capsys, monkeypatch):
     given = ["describe", str(rod), "--reference", str(empty), "--output", str(tmp_path / "out")]
     monkeypatch.setattr("sys.stdin", io.StringIO())
     assert main(given) == 1
-    assert "the file does not state all sizes; add them in metres, such as --shape disk:0.1 --width 0.01" in capsys.readouterr().err
+    missing = "the file does not state all sizes; add them in metres, such as --shape disk:0.1 --width 0.01"
+    assert missing in capsys.readouterr().err
     assert main([*given, "--shape", "disk:0.1,3", "--width", "0.012"]) == 1
     assert "--shape: give one of disk:RADIUS" in capsys.readouterr().err
     assert main([*given, "--shape", "disk:0.1", "--width", "0", "--electrodes", "8"]) == 1
