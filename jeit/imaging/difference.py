@@ -37,8 +37,8 @@ from jeit_solvers.engines import as_array
 _SEGMENTATION_LEVEL = 0.5
 # Minimum width of electrodes relative to their distance that raises no doubt. Misfit of the reference above which frame
 # and reference may be exchanged, and ratio of the frame's misfit to the reference's misfit below which an exchange is
-# likely.
-_MIN_RELATIVE_WIDTH, _MIN_SUSPICIOUS_MISFIT, _MAX_EXCHANGED_MISFIT = 0.005, 0.1, 0.5
+# likely, both with the scale that fits the voltages best.
+_MIN_RELATIVE_WIDTH, _MIN_SUSPICIOUS_MISFIT, _MAX_EXCHANGED_MISFIT = 0.005, 0.1, 0.7
 # Maximum misfit of an image's voltages, in standard deviations, that raises no doubt.
 _MISFIT = 3.0
 # Minimum share of usable voltages that raises no doubt.
@@ -248,14 +248,20 @@ def _doubt_of_lengths(imaged: ImagedDifference) -> str:
 def _doubt_of_order(imaged: ImagedDifference) -> str:
     """Return a sentence if the frame fits an undisturbed body much better than the reference does; otherwise an empty
     string."""
-    misfit = float(imaged.calibration.misfit)
     usable = np.asarray(imaged.measurement.mask)[0] & np.asarray(imaged.reference.mask)[0]
-    if not (misfit > _MIN_SUSPICIOUS_MISFIT and usable.any()):
+    if not usable.any():
         return ""
-    frame = np.asarray(imaged.measurement.voltages)[0][usable]
     predicted = np.asarray(imaged.calibration.voltages)[usable]
-    scale = np.vdot(predicted, frame) / np.vdot(predicted, predicted)
-    frame_misfit = float(np.linalg.norm(frame - scale * predicted) / np.linalg.norm(frame))
+
+    def misfit_of(measured: Measurement) -> float:
+        voltages = np.asarray(measured.voltages)[0][usable]
+        scale = np.vdot(predicted, voltages) / np.vdot(predicted, predicted)
+        return float(np.linalg.norm(voltages - scale * predicted) / np.linalg.norm(voltages))
+
+    misfit = misfit_of(imaged.reference)
+    if misfit <= _MIN_SUSPICIOUS_MISFIT:
+        return ""
+    frame_misfit = misfit_of(imaged.measurement)
     if frame_misfit > _MAX_EXCHANGED_MISFIT * misfit:
         return ""
     return (
