@@ -146,7 +146,7 @@ def find_description(
             "[protocol], see docs/reference/description.md."
         )
     if any(item.explains_zeros for item in candidates):
-        candidates = [item for item in candidates if item.num_zeros == 0]
+        candidates = [item for item in candidates if item.num_unread == 0]
     candidates.sort(key=lambda item: np.hypot(item.spread, 0.3 if item.reciprocity is None else item.reciprocity))
     progress("uniform body")
     models: _Models = {}

@@ -89,10 +89,11 @@ class Candidate:
         return bool(_MIN_ORDER_RATIO * self.unexplained < np.sqrt(1 - mean_ratio**2))
 
     @property
-    def num_zeros(self) -> int:
-        """Number of channels that are zero in every frame, apart from channels on driven electrodes."""
+    def num_unread(self) -> int:
+        """Number of channels that are zero in every frame or masked, apart from channels on driven electrodes."""
+        on_driven = np.asarray(self.measurement.protocol.channels_on_driven_electrodes())
         voltages, mask = np.asarray(self.measurement.voltages), np.asarray(self.measurement.mask)
-        return int((mask & (voltages == 0)).sum())
+        return int((~mask | (voltages == 0))[..., ~on_driven].sum())
 
     @property
     def explains_zeros(self) -> bool:
@@ -100,7 +101,7 @@ class Candidate:
         measure there, and fills in zeros."""
         on_driven = np.asarray(self.measurement.protocol.channels_on_driven_electrodes())
         is_measured = np.asarray(self.measurement.mask)[..., on_driven]
-        return bool(on_driven.any()) and not is_measured.any() and self.num_zeros == 0
+        return bool(on_driven.any()) and not is_measured.any() and self.num_unread == 0
 
     @property
     def name(self) -> str:
@@ -155,7 +156,8 @@ class FileNumbers:
                 wrapped, part_size = set(), 1  # parts of different sizes: lines are frames, or too many are missing
             wrapped = {size for size in wrapped if size % part_size == 0}
         sizes = tuple({length, length - 1, lines, *wrapped})
-        if lines == length == len(table) and spread_of(table.T) < spread_of(table):  # columns resemble each other more
+        # Of one frame of reciprocal voltages, a symmetric matrix, rows and columns resemble each other alike.
+        if lines == length == len(table) and 2 * spread_of(table.T) < spread_of(table):
             data = {"frames_in": "columns"}
             return cls(path, lambda counts: frames_in_table(table.T, counts, _UNKNOWN_LAYOUT), shape, sizes, data)
         return cls(path, lambda counts: frames_in_text(text, counts, _UNKNOWN_LAYOUT, path.name), shape, sizes)
@@ -231,7 +233,8 @@ def fitting_candidates(
             if protocol is None or count not in counts or count < _MIN_CHANNELS * number:
                 unfitting.add(options_of_count)
                 continue
-            protocol_key = number, protocol.drive_index.tobytes(), protocol.channel_measurement.tobytes()
+            patterns = (np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement))
+            protocol_key = number, *(pattern.tobytes() for pattern in patterns)
             if protocol_key in found_protocols:
                 continue
             found_protocols.add(protocol_key)

@@ -124,6 +124,33 @@ def test_zeros_in_place_of_driven_electrodes_determine_the_protocol(tmp_path):
     several = find_description(rod, DISK, RING, reference=empty)
     assert len(several.candidates) > 4
     assert several.candidates[0].protocol == only_one.candidates[0].protocol
+    assert any(item.protocol["kind"] == "opposite" for item in several.candidates)  # other drives, same measurements
+
+
+def test_one_frame_may_be_a_matrix_of_drives_and_measurements(tmp_path):
+    """Reciprocity makes it almost symmetric, so that noise decides whether rows or columns resemble each other more."""
+    voltages, protocol = simulated({"kind": "adjacent", "driven_electrodes": True, "order": "fixed"})
+    noise = 1 + 1e-4 * np.random.default_rng(2).normal(size=64)
+    matrix = (voltages[1] * noise).reshape(8, 8)
+    np.savetxt(tmp_path / "a.csv", matrix, delimiter=",")
+    scipy.io.savemat(tmp_path / "a.mat", {"frame": matrix})
+    for name in ("a.csv", "a.mat"):
+        found = find_description(tmp_path / name, DISK, RING)
+        assert found.candidates[0].measurement.protocol.same_patterns(protocol), name
+        assert not found.undecided, name
+        (tmp_path / "description.toml").write_text(found.text, "utf-8")
+        np.testing.assert_allclose(np.asarray(data.read(tmp_path / name).voltages), matrix.reshape(1, 64))
+
+
+@pytest.mark.slow
+def test_zeros_of_a_dead_electrode_do_not_rule_out_the_protocol(tmp_path):
+    """In counts, of which small ones are zero, too."""
+    voltages, protocol = simulated({"kind": "skip", "skipped": 3, "driven_electrodes": True, "order": "fixed"})
+    counts = np.round(voltages / np.abs(voltages).max() * 100)
+    dead = (np.asarray(protocol.channel_drive)[:, 0] != 0) | (np.asarray(protocol.channel_measurement)[:, 0] != 0)
+    _, rod = saved(tmp_path, np.where(dead, 0, counts))
+    found = find_description(rod, DISK, RING)
+    assert found.candidates[0].protocol["order"] == "fixed"
 
 
 def test_half_of_the_channels_leaves_the_order_open(tmp_path):

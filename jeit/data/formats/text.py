@@ -403,6 +403,10 @@ def frames_in_table(
     """Frames of a two-dimensional array. `counts`: see `frames_in_text`; `heading`: names of the columns;
     `default_axis`: "rows" or "columns", whichever are frames if the numbers of channels do not determine this."""
     stated_axis = layout.frames_in
+    axes_fit = any(count <= length <= count + 1 for count in counts for length in table.shape)
+    if stated_axis is None and min(table.shape) > 1 and table.size in counts and not axes_fit:
+        drives_first = table if len(table) >= table.shape[1] else table.T
+        return Frames(drives_first.reshape(1, -1), None, ("its longer side is taken for the drives of one frame.",))
     is_transposed = stated_axis == "columns" if stated_axis else _are_columns(table.shape, counts, default_axis)
     rows = table.T if is_transposed else table
     notes: tuple[str, ...] = ()
