@@ -249,7 +249,7 @@ def _doubt_of_order(imaged: ImagedDifference) -> str:
     """Return a sentence if the frame fits an undisturbed body much better than the reference does; otherwise an empty
     string."""
     usable = np.asarray(imaged.measurement.mask)[0] & np.asarray(imaged.reference.mask)[0]
-    if not usable.any():
+    if not (float(imaged.calibration.misfit) > _MIN_SUSPICIOUS_MISFIT and usable.any()):
         return ""
     predicted = np.asarray(imaged.calibration.voltages)[usable]
 

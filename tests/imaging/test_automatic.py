@@ -223,7 +223,7 @@ def test_files_are_not_taken_for_exchanged_because_of_the_scale_of_the_model():
             for factor in (of_frame, of_reference)
         ]
         return SimpleNamespace(
-            measurement=measured[0], reference=measured[1], calibration=SimpleNamespace(voltages=1.4 * rest)
+            measurement=measured[0], reference=measured[1], calibration=SimpleNamespace(voltages=1.4 * rest, misfit=0.4)
         )
 
     disturbed = 1 + 0.6 * np.cos(np.arange(len(rest)))
