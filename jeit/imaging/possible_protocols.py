@@ -97,8 +97,8 @@ class Candidate:
 
     @property
     def explains_zeros(self) -> bool:
-        """Whether the channels on driven electrodes, and no others, are zero in every frame: the device does not
-        measure there, and fills in zeros."""
+        """Whether all channels on driven electrodes, and no others, are zero in every frame or masked: the device does
+        not measure there, and fills in zeros."""
         on_driven = np.asarray(self.measurement.protocol.channels_on_driven_electrodes())
         is_measured = np.asarray(self.measurement.mask)[..., on_driven]
         return bool(on_driven.any()) and not is_measured.any() and self.num_unread == 0

@@ -13,7 +13,8 @@ import scipy.io
 
 from jeit import data
 from jeit.cli import main
-from jeit.data.description import parse_description
+from jeit.data.description import TableLayout, parse_description
+from jeit.data.formats.text import frames_in_table
 from jeit.imaging.describe import Findings, _with_misfit, find_description
 from jeit.imaging.possible_protocols import Candidate
 from jeit.imaging.wiring import Wiring
@@ -140,6 +141,14 @@ def test_one_frame_may_be_a_matrix_of_drives_and_measurements(tmp_path):
         assert not found.undecided, name
         (tmp_path / "description.toml").write_text(found.text, "utf-8")
         np.testing.assert_allclose(np.asarray(data.read(tmp_path / name).voltages), matrix.reshape(1, 64))
+
+
+def test_the_longer_side_of_a_matrix_of_one_frame_is_taken_for_its_drives():
+    """For 16 drives of 13 measurements, as rows or as columns. A side that is a frame decides."""
+    frame = np.arange(208.0)
+    for table in (frame.reshape(16, 13), frame.reshape(16, 13).T):
+        np.testing.assert_array_equal(frames_in_table(table, [208], TableLayout()).table, frame[None])
+    assert frames_in_table(frame.reshape(16, 13), [13], TableLayout()).table.shape == (16, 13)
 
 
 @pytest.mark.slow
