@@ -225,8 +225,8 @@ class Measurement(Module):
     def masked(self, usable: ArrayLike, reason: str) -> "Measurement":
         """The same measurement with fewer usable channels.
 
-        `usable`: boolean, (channels,) or (frames, channels); `reason`: text that is added to the notes. Raises
-        `ValueError` if `usable` has a different shape.
+        `usable`: boolean, (channels,) or (frames, channels); `reason`: text that is added to the notes if a voltage
+        is masked. Raises `ValueError` if `usable` has a different shape.
         """
         usable_array = jnp.asarray(usable)
         if usable_array.dtype != bool or usable_array.shape not in ((self.num_channels,), self.mask.shape):
@@ -238,6 +238,8 @@ class Measurement(Module):
         note = reason
         if has_values(mask):
             num_masked = int(self.mask.sum() - mask.sum())
+            if num_masked == 0:
+                return self
             note = f"{counted(num_masked, 'voltage')} masked: {reason}"
         return self._replace(self.voltages, mask, notes=(*self.notes, note))
 

@@ -266,7 +266,8 @@ def test_times_are_kept(tmp_path, tank, setup):
     np.testing.assert_array_equal(again.frames(slice(2, None)).voltages, made.voltages[2:])
     np.testing.assert_array_equal(again.frames(times > 0.03).times, times[2:])
     np.testing.assert_array_equal(again.frame(-1).times, times[-1:])
-    np.testing.assert_array_equal(again.masked(np.ones(40, bool), "no reason.").times, times)
+    np.testing.assert_array_equal(again.masked(np.arange(40) != 3, "no reason.").times, times)
+    assert again.masked(np.ones(40, bool), "no reason.").notes == again.notes
     assert again.frame(0).frame_rate is None
     assert again.mean_frame().times is None
 
