@@ -15,13 +15,14 @@ from jaxtyping import Array, Float, Inexact, UInt8
 from jeit.arguments import object_html, object_text, percent, picture
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality
-from jeit.electrodes import AbstractElectrodes, BoundaryElectrodes
+from jeit.electrodes import AbstractElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import Inclusion, Raster, SolidForm
 from jeit.image.inclusions import inclusion_regions
 from jeit.image.rasters import CONDUCTIVE, RESISTIVE
 from jeit.imaging.automatic import image_automatically
 from jeit.imaging.calibration import Clock, threads_for
+from jeit.imaging.doubts import doubts_of_data
 from jeit.imaging.method import AUTO, METHODS, ImagingSettings, MethodOptions, as_settings
 from jeit.imaging.preparation import prepare_difference
 from jeit.imaging.wiring import Wiring
@@ -30,26 +31,13 @@ from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes import KINDS, Ellipsoid, ShapeReconstruction, Star
 from jeit.inverse.uncertainty import image_noise
-from jeit.mesh import Domain, Mesh
+from jeit.mesh import Mesh
 from jeit_solvers import Status
 from jeit_solvers.engines import as_array
 
 _SEGMENTATION_LEVEL = 0.5
-# Minimum width of electrodes relative to their distance that raises no doubt. Misfit of the reference above which frame
-# and reference may be exchanged, and ratio of the frame's misfit to the reference's misfit below which an exchange is
-# likely, both with the scale that fits the voltages best.
-_MIN_RELATIVE_WIDTH, _MIN_SUSPICIOUS_MISFIT, _MAX_EXCHANGED_MISFIT = 0.005, 0.1, 0.7
 # Maximum misfit of an image's voltages, in standard deviations, that raises no doubt.
 _MISFIT = 3.0
-# Minimum share of usable voltages that raises no doubt.
-_MIN_USABLE_SHARE = 0.5
-# Ranges of plausible conductivities: of sheets in S, from a megohm a square to metal; of solids in S/m, from tap water
-# and fat to brine, with a margin on both sides.
-_CONDUCTIVITIES = {2: (1e-6, 1e5), 3: (1e-3, 30.0)}
-# Voltage above the range of an EIT instrument's amplifiers.
-_MAX_VOLTS = 60.0
-# Units smaller than a volt, with their number per volt.
-_SMALLER_UNITS = (("mV", 1e3), ("uV", 1e6))
 
 
 @dataclass(frozen=True)
@@ -163,7 +151,8 @@ class ImagedDifference:
     def doubts(self) -> tuple[str, ...]:
         """Reasons to doubt the image, in sentences: too few channels, an implausible background, an iteration that did
         not converge, voltages not explained by the image, or bodies whose kind the data do not determine."""
-        reconstruction, doubts = self.reconstruction, _doubts_of_data(self)
+        reconstruction = self.reconstruction
+        doubts = doubts_of_data(self.measurement, self.reference, self.calibration)
         if isinstance(reconstruction, LinearReconstruction):
             return tuple(doubts)
         if isinstance(reconstruction, Reconstruction) and reconstruction.status != Status.CONVERGED:
@@ -216,98 +205,6 @@ def _imaged_on(reconstruction, calibration: Calibration) -> ForwardModel:
     """Forward model on the mesh of a reconstruction."""
     finer_image = reconstruction.finer if isinstance(reconstruction, ShapeReconstruction) else None
     return calibration.model if finer_image is None else finer_image.model
-
-
-def _doubts_of_data(imaged: ImagedDifference) -> list[str]:
-    """Reasons to doubt the data: too few usable voltages, or a level of the voltages that is implausible."""
-    used, doubts = np.asarray(imaged.measurement.mask)[0], []
-    if (usable_share := np.mean(used)) < _MIN_USABLE_SHARE:
-        doubts.append(
-            f"only {used.sum()} of {used.size} voltages are left ({percent(float(usable_share))}): they determine "
-            "little of what is where."
-        )
-    return [*doubts, *filter(None, (_doubt_of_units(imaged), _doubt_of_lengths(imaged), _doubt_of_order(imaged)))]
-
-
-def _doubt_of_lengths(imaged: ImagedDifference) -> str:
-    """Return a sentence if electrodes on the edge of a sheet are so narrow that lengths may not be in metres; otherwise
-    an empty string."""
-    electrodes, domain = imaged.measurement.electrodes, imaged.measurement.domain
-    if not isinstance(electrodes, BoundaryElectrodes) or not isinstance(domain, Domain):
-        return ""
-    width, pitch = float(np.max(electrodes.width)), domain.perimeter / electrodes.num_electrodes
-    if width > _MIN_RELATIVE_WIDTH * pitch:
-        return ""
-    x_min, x_max, _, _ = domain.extent
-    return (
-        f"the electrodes are {1e3 * width:.3g} mm wide and {1e3 * pitch:.3g} mm apart, on a body {x_max - x_min:.3g} m "
-        "wide: are all lengths in metres?"
-    )
-
-
-def _doubt_of_order(imaged: ImagedDifference) -> str:
-    """Return a sentence if the frame fits an undisturbed body much better than the reference does; otherwise an empty
-    string."""
-    usable = np.asarray(imaged.measurement.mask)[0] & np.asarray(imaged.reference.mask)[0]
-    if not (float(imaged.calibration.misfit) > _MIN_SUSPICIOUS_MISFIT and usable.any()):
-        return ""
-    predicted = np.asarray(imaged.calibration.voltages)[usable]
-
-    def misfit_of(measured: Measurement) -> float:
-        voltages = np.asarray(measured.voltages)[0][usable]
-        scale = np.vdot(predicted, voltages) / np.vdot(predicted, predicted)
-        return float(np.linalg.norm(voltages - scale * predicted) / np.linalg.norm(voltages))
-
-    misfit = misfit_of(imaged.reference)
-    if misfit <= _MIN_SUSPICIOUS_MISFIT:
-        return ""
-    frame_misfit = misfit_of(imaged.measurement)
-    if frame_misfit > _MAX_EXCHANGED_MISFIT * misfit:
-        return ""
-    return (
-        f"the frame fits an undisturbed body better ({percent(frame_misfit)} misfit) than the reference does "
-        f"({percent(misfit)}): are the two exchanged?"
-    )
-
-
-def _doubt_of_units(imaged: ImagedDifference) -> str:
-    """Return a sentence that suggests a unit if the level of the voltages is implausible. Returns an empty string
-    otherwise, and if notes of the measurement or its reference say that the scale is not known."""
-    lower, upper = _CONDUCTIVITIES[imaged.mesh.dimension]
-    background = abs(complex(imaged.calibration.conductivity))
-    frames = [
-        np.abs(np.asarray(frame.voltages)[np.asarray(frame.mask)]) for frame in (imaged.measurement, imaged.reference)
-    ]
-    max_voltage = max(float(voltages.max(initial=0)) for voltages in frames)
-    is_scale_unknown = any(
-        "trust relative changes" in note for note in (*imaged.measurement.notes, *imaged.reference.notes)
-    )
-    if is_scale_unknown or (lower < background < upper and max_voltage < _MAX_VOLTS):
-        return ""
-    is_solid = imaged.mesh.dimension == 3
-    unit, comparison = ("S/m", "no water's, gel's or tissue's") if is_solid else ("S", "no sheet's or shallow tank's")
-    if not lower < background < upper:
-        fault = f"a background of {background:.3g} {unit} is {comparison}, which conduct {lower:g} to {upper:g} {unit}"
-    else:
-        fault = f"voltages of up to {max_voltage:.3g} V are beyond what instruments read"
-    if background < upper:
-        likely_units = [
-            f'"{name}" (a background of {background * factor:.3g} {unit})'
-            for name, factor in _SMALLER_UNITS
-            if lower < background * factor < upper and max_voltage < _MAX_VOLTS * factor
-        ]
-        key = "[data] unit"
-    else:
-        likely_units = [
-            f'"{name}"' for name, factor in (("mA", 1e3), ("uA", 1e6)) if lower < background / factor < upper
-        ]
-        key = "[protocol] current_unit"
-    likely_units = [f"{key} = {' or '.join(likely_units)}?"] if likely_units else []
-    if all((voltages == np.round(voltages)).all() for voltages in frames) and max_voltage > 1:
-        likely_units.append(
-            "They are whole numbers, as the counts of a converter are: those show relative changes, not S/m."
-        )
-    return f"{fault}: {' '.join(likely_units) or 'are currents in amperes, voltages in volts, lengths in metres?'}"
 
 
 def image_difference(

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 from contextlib import nullcontext
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from jeit.data import Measurement
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import find_inclusions
-from jeit.imaging import ImagingSettings, automatic, calibration, difference, prepare_difference
+from jeit.imaging import ImagingSettings, automatic, calibration, prepare_difference
 from jeit.imaging.automatic import linear_image_fault
 from jeit.imaging.method import METHODS
 from jeit.inverse import Gaussian, calibrate, reconstruct
@@ -211,25 +210,6 @@ def test_reasons_to_doubt_an_image_are_reported():
     stiff = image(20.0, method="gauss-newton", hyperparameter=1e3)
     assert "standard deviations: bodies may be missing" in stiff.doubts[-1]
     assert report_image(stiff)["doubts"] == list(stiff.doubts)
-
-
-def test_files_are_not_taken_for_exchanged_because_of_the_scale_of_the_model():
-    """The background may be fitted to the small voltages of a tank that differs from its model, and miss large ones."""
-    rest = np.asarray(TRUTH.voltages(0.02))
-
-    def pair(of_frame, of_reference):
-        measured = [
-            SimpleNamespace(voltages=(rest * factor)[None], mask=np.ones((1, len(rest)), bool))
-            for factor in (of_frame, of_reference)
-        ]
-        return SimpleNamespace(
-            measurement=measured[0], reference=measured[1], calibration=SimpleNamespace(voltages=1.4 * rest, misfit=0.4)
-        )
-
-    disturbed = 1 + 0.6 * np.cos(np.arange(len(rest)))
-    assert difference._doubt_of_order(pair(1.02, 1.0)) == ""  # pyright: ignore
-    assert difference._doubt_of_order(pair(disturbed, 1.0)) == ""  # pyright: ignore
-    assert "are the two exchanged?" in difference._doubt_of_order(pair(1.0, disturbed))  # pyright: ignore
 
 
 def test_exchanged_files_and_lengths_in_another_unit_are_doubted():

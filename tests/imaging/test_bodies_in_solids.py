@@ -1,6 +1,5 @@
 """A strong ball in a tank with plate electrodes, fitted beside a smooth field, with its conductivity and interval."""
 
-import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -132,42 +131,6 @@ def test_bodies_are_searched_in_solids_where_data_can_determine_them(monkeypatch
     assert bool(asked) == looks
 
 
-@pytest.mark.parametrize(
-    ("background", "dimension", "left", "volts", "expected"),
-    [
-        (0.2, 3, 0.9, 0.1, []),
-        (0.2, 3, 0.3, 0.1, ["only 3 of 10 voltages are left (30 %)"]),
-        (220.0, 3, 0.9, 0.1, [r'is no water\'s.*: \[protocol\] current_unit = "mA"\?$']),
-        (
-            2e-4,
-            3,
-            0.9,
-            5.5,
-            [r'a background of 0.0002 S/m is no water\'s.*: \[data\] unit = "mV" \(a back.*0.2 S/m\)\?$'],
-        ),
-        (2e-8, 3, 0.9, 5.5, [r'unit = "uV" \(a background of 0.02 S/m\)\?$']),
-        (2e-8, 2, 0.9, 400.0, [r'no sheet\'s.*"mV" \(a background of 2e-05 S\) or "uV" .* They are whole numbers']),
-        (2e-5, 2, 0.9, 90.5, [r'voltages of up to 90.5 V are beyond what instruments read: .* "mV" .* or "uV"']),
-        (2e-5, 2, 0.9, 5.5, []),  # a skin of 50 kilohm per square
-        (220.0, 2, 0.9, 0.1, []),  # sheets may have any
-    ],
-)
-def test_thin_data_and_impossible_units_are_doubted(background, dimension, left, volts, expected):
-    used = np.arange(10) < 10 * left
-    frame = SimpleNamespace(mask=used[None], voltages=np.full((1, 10), volts), notes=(), electrodes=None, domain=None)
-    image: Any = SimpleNamespace(
-        measurement=frame,
-        reference=frame,
-        calibration=SimpleNamespace(conductivity=background, misfit=0.0),
-        mesh=SimpleNamespace(dimension=dimension),
-    )
-    doubts = difference._doubts_of_data(image)
-    assert len(doubts) == len(expected)
-    assert all(one in doubt or re.search(one, doubt) for one, doubt in zip(expected, doubts, strict=True))
-    frame.notes = ("neither unit nor gain of the voltages is known: trust relative changes, not volts.",)
-    assert len(difference._doubts_of_data(image)) == (left < 0.5)
-
-
 @pytest.mark.parametrize("fault", ["", "it is strong"])
 @pytest.mark.parametrize("prior", ["gaussian", "noser", Laplace()])
 def test_a_requested_prior_is_that_of_the_image(monkeypatch, prior, fault):
@@ -264,11 +227,12 @@ def test_where_electrodes_do_not_distinguish_the_kind_of_a_body_it_is_doubted_an
         alternatives=(body(False, np.log(6)), None),
         alternative_deviations=(0.5, np.nan),
     )
-    calibration = SimpleNamespace(conductivity=BATH, misfit=0.0)
+    model = SimpleNamespace(mesh=SimpleNamespace(dimension=3))
+    calibration = SimpleNamespace(conductivity=BATH, misfit=0.0, model=model)
     frame = SimpleNamespace(
         mask=np.ones((1, 2), bool), voltages=np.ones((1, 2)), notes=(), electrodes=None, domain=None
     )
-    whole = SimpleNamespace(measurement=frame, reference=frame, mesh=SimpleNamespace(dimension=3))
+    whole = SimpleNamespace(measurement=frame, reference=frame)
     image: Any = SimpleNamespace(shapes=shapes, reconstruction=shapes, calibration=calibration, **vars(whole))
     own = Quantities(2.0, (1.7, 2.3), 3e-5, (2e-5, None), 1.5e-5, (1.4e-5, 1.6e-5), 1e-3)
     elsewhere = replace(body(False, np.log(6)), centroid=BALL + np.array([0.0, 0.0, 0.005]))

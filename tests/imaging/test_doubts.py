@@ -1,0 +1,66 @@
+"""Doubts about the data of a difference image, from frames and calibrations that are made up: each fault raises its
+sentence, and sound data raise none."""
+
+import re
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jeit.imaging.doubts import doubts_of_data
+
+
+def calibration(background: float, dimension: int, **fields) -> Any:
+    model = SimpleNamespace(mesh=SimpleNamespace(dimension=dimension))
+    return SimpleNamespace(**{"conductivity": background, "misfit": 0.0, "model": model, **fields})
+
+
+@pytest.mark.parametrize(
+    ("background", "dimension", "left", "volts", "expected"),
+    [
+        (0.2, 3, 0.9, 0.1, []),
+        (0.2, 3, 0.3, 0.1, ["only 3 of 10 voltages are left (30 %)"]),
+        (220.0, 3, 0.9, 0.1, [r'is no water\'s.*: \[protocol\] current_unit = "mA"\?$']),
+        (
+            2e-4,
+            3,
+            0.9,
+            5.5,
+            [r'a background of 0.0002 S/m is no water\'s.*: \[data\] unit = "mV" \(a back.*0.2 S/m\)\?$'],
+        ),
+        (2e-8, 3, 0.9, 5.5, [r'unit = "uV" \(a background of 0.02 S/m\)\?$']),
+        (2e-8, 2, 0.9, 400.0, [r'no sheet\'s.*"mV" \(a background of 2e-05 S\) or "uV" .* They are whole numbers']),
+        (2e-5, 2, 0.9, 90.5, [r'voltages of up to 90.5 V are beyond what instruments read: .* "mV" .* or "uV"']),
+        (2e-5, 2, 0.9, 5.5, []),  # a skin of 50 kilohm per square
+        (220.0, 2, 0.9, 0.1, []),  # sheets may have any
+    ],
+)
+def test_thin_data_and_impossible_units_are_doubted(background, dimension, left, volts, expected):
+    used = np.arange(10) < 10 * left
+    frame: Any = SimpleNamespace(
+        mask=used[None], voltages=np.full((1, 10), volts), notes=(), electrodes=None, domain=None
+    )
+    doubts = doubts_of_data(frame, frame, calibration(background, dimension))
+    assert len(doubts) == len(expected)
+    assert all(one in doubt or re.search(one, doubt) for one, doubt in zip(expected, doubts, strict=True))
+    frame.notes = ("neither unit nor gain of the voltages is known: trust relative changes, not volts.",)
+    assert len(doubts_of_data(frame, frame, calibration(background, dimension))) == (left < 0.5)
+
+
+def test_files_are_not_taken_for_exchanged_because_of_the_scale_of_the_model():
+    """The background may be fitted to the small voltages of a tank that differs from its model, and miss large ones."""
+    rest = np.linspace(1.0, 3.0, 40)
+
+    def frame(factor) -> Any:
+        mask = np.ones((1, len(rest)), bool)
+        return SimpleNamespace(voltages=(rest * factor)[None], mask=mask, notes=(), electrodes=None, domain=None)
+
+    def doubts(of_frame, of_reference):
+        fitted = calibration(0.02, 2, voltages=1.4 * rest, misfit=0.4)
+        return doubts_of_data(frame(of_frame), frame(of_reference), fitted)
+
+    disturbed = 1 + 0.6 * np.cos(np.arange(len(rest)))
+    assert doubts(1.02, 1.0) == doubts(disturbed, 1.0) == []
+    (exchanged,) = doubts(1.0, disturbed)
+    assert "are the two exchanged?" in exchanged
