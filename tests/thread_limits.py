@@ -5,7 +5,7 @@ from contextlib import contextmanager
 import pytest
 from threadpoolctl import ThreadpoolController
 
-from jeit.touch.learnt import extras, learnt_skin
+from jeit.touch.learnt import learnt_skin, resource_limits
 
 
 @contextmanager
@@ -14,8 +14,8 @@ def libraries_found_once():
 
     The search reads all memory maps of the process, and compiled code makes tens of thousands of them.
     """
-    with extras.one_thread(), pytest.MonkeyPatch.context() as patch:
+    with resource_limits.one_thread(), pytest.MonkeyPatch.context() as patch:
         controller = ThreadpoolController()
-        for module in (extras, learnt_skin):
+        for module in (resource_limits, learnt_skin):
             patch.setattr(module, "one_thread", lambda: controller.limit(limits=1))
         yield

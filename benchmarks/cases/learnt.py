@@ -25,7 +25,7 @@ from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
 from jeit.touch import LearntSkin, Presses
-from jeit.touch.learnt.numbers import METHODS
+from jeit.touch.learnt.regression import METHODS
 from jeit.touch.simulate import DiscIndenter, Press, PressedSkin, material
 
 RADIUS, FINGER, LOADS = 0.05, 0.016, (0.5, 8.0)  # m; a disc's diameter, m; N

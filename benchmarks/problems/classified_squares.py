@@ -15,8 +15,8 @@ from jaxtyping import Float, Int
 
 from benchmarks.harness.machine import CORES
 from benchmarks.problems.fabric import REPETITIONS, Fabric
-from jeit.touch.learnt.extras import one_thread
 from jeit.touch.learnt.methods import CLASSIFIERS, log_odds
+from jeit.touch.learnt.resource_limits import one_thread
 
 # Indices of the sixths of the observations that are held out, and maximum number of tested observations of a sixth.
 HELD_OUT, MOST = (2, 5), 2000

@@ -25,7 +25,7 @@ from .simulate import (
     simulate_tickle,
     simulate_wind,
 )
-from .touches import LocatedTouches, locate_touches, track
+from .touch_tracks import LocatedTouches, locate_touches, track
 
 __all__ = [
     "Burst",

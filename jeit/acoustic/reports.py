@@ -13,7 +13,7 @@ from jeit.acoustic.calibration.calibrate import CalibrationFit
 from jeit.acoustic.localisation.locate import microphones_in_use
 from jeit.acoustic.localisation.locations import Locations, LocationStatus
 from jeit.acoustic.localisation.pixels import last_overlay_image, map_brightness
-from jeit.acoustic.touches import Track
+from jeit.acoustic.touch_tracks import Track
 from jeit.report.folder import as_plain_values, results, version_of, write_json, write_rows
 
 

@@ -1,7 +1,7 @@
 from .description import Description, load_description
 from .exchange import from_eidors, from_pyeit, write_table
+from .frame_checks import FrameQuality, check_imageable, mask_spikes
 from .gesture_set import FrameRecording, GestureSet, join, read_frame_recording
-from .imageable import FrameQuality, check_imageable, mask_spikes
 from .measurement import Measurement
 from .quality import NoiseEstimate, channel_reciprocity_error, estimate_noise, impossible_signs, reciprocity_error
 from .registry import read

@@ -18,7 +18,7 @@ from .scores import TouchPrior, layout_scores
 from .sensitivity import sensitivity_map
 from .skin.skin import Skin
 from .skin.skin_file import describes_skin, read_described_skin
-from .skin.touches import Bell, Hemisphere, touch_grid, touches_away_from_the_edge
+from .skin.touch_shapes import Bell, Hemisphere, touch_grid, touches_away_from_the_edge
 from .study import open_results, read_study, run_study, study_progress
 from .taxels import find_taxels
 

@@ -14,8 +14,8 @@ from jeit.arguments import check_key
 from jeit.design.defaults import CONTRAST, MARGIN, NUM_TAXELS, PLACES, THRESHOLD
 from jeit.design.sensitivity import SensitivityMap
 from jeit.design.skin.skin import Skin, check_skin
+from jeit.design.skin.touch_shapes import TouchGrid, check_grid, touches_away_from_the_edge
 from jeit.design.skin.touched_cells import TouchedCells
-from jeit.design.skin.touches import TouchGrid, check_grid, touches_away_from_the_edge
 from jeit.design.taxels import Taxels, find_taxels
 from jeit.layout import Layout, SurfaceLayout
 from jeit.mesh.geodesic import Triangles

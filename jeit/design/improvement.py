@@ -16,7 +16,7 @@ from jeit.design.optimisation.optimise import Optimisation, optimise_layout
 from jeit.design.optimisation.variables import Objective
 from jeit.design.scores import Scores
 from jeit.design.skin.skin import Skin
-from jeit.design.skin.touches import touch_grid
+from jeit.design.skin.touch_shapes import touch_grid
 from jeit.layout import Layout
 from jeit.layout.surface_layout import check_layout, flat_layout
 from jeit.protocol import two_terminal

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 from jeit.design.defaults import TEMPERATURE
 from jeit.design.sensitivity import uniformity
 from jeit.design.skin.sheet_touches import SheetTouches
-from jeit.design.skin.touches import check_places
+from jeit.design.skin.touch_shapes import check_places
 from jeit.forward import ForwardModel
 from jeit.forward.system import cell_conductivity, check_conductivity
 from jeit_solvers.dense import inverse_cholesky

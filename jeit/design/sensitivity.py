@@ -7,8 +7,8 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jeit.design.defaults import CONTRAST
+from jeit.design.skin.touch_shapes import AbstractIndentation, Bell, TouchGrid, check_grid
 from jeit.design.skin.touched_cells import touched_cells
-from jeit.design.skin.touches import AbstractIndentation, Bell, TouchGrid, check_grid
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model

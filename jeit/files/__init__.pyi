@@ -1,3 +1,4 @@
+from .atomic_write import clear_unfinished, whole_files, written_whole
 from .limits import (
     MOST_ELECTRODES,
     check_electrodes,
@@ -11,7 +12,6 @@ from .limits import (
     read_toml,
 )
 from .npz_file import check_archive, npy_array, npz_arrays, require_arrays
-from .whole import clear_unfinished, whole_files, written_whole
 
 __all__ = [
     "MOST_ELECTRODES",

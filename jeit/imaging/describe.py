@@ -19,9 +19,9 @@ from jeit.data.description import parse_description
 from jeit.data.exchange import assignments
 from jeit.data.formats import quadrupoles
 from jeit.data.formats.boards import OpenEit
+from jeit.data.inferred_properties import channel_gains, with_signs
 from jeit.data.quality import reciprocity_error
 from jeit.data.registry import format_with_protocol
-from jeit.data.unstated import channel_gains, with_signs
 from jeit.electrodes.face_patches import body_mesh
 from jeit.forward import ForwardModel
 from jeit.imaging.possible_protocols import (

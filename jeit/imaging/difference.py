@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Inexact, UInt8
 
 from jeit.arguments import object_html, object_text, percent, picture
 from jeit.data import Measurement
-from jeit.data.imageable import FrameQuality
+from jeit.data.frame_checks import FrameQuality
 from jeit.electrodes import AbstractElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import Inclusion, Raster, SolidForm

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jeit.data import Measurement
-from jeit.data.imageable import check_same_setup, mask_spikes
+from jeit.data.frame_checks import check_same_setup, mask_spikes
 from jeit.files import check_memory
 from jeit.image.image_series import ImageSeries
 from jeit.imaging.calibration import Clock

@@ -252,7 +252,7 @@ def open_source(
     scheme = text.partition(":")[0]
     if text == "-" or scheme in ("serial", "tcp"):
         from jeit.data.formats.lines import LineReading
-        from jeit.live.line_source import LineSource, ReadAhead, connection_to
+        from jeit.live.frame_connection import LineSource, ReadAhead, connection_to
 
         return ReadAhead(LineSource(text, connection_to(text), LineReading(description, reference), rate))
     path = Path(text)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import lazy_loader
 
-from jeit.arguments.moved import with_moved_names as _with_moved_names
+from jeit.arguments.moved_names import with_moved_names as _with_moved_names
 
 _find, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 __getattr__ = _with_moved_names(__name__, _find)

@@ -1,4 +1,4 @@
-from .compared_rules import draw_choice, report_choice, report_measurement, write_choice
+from .hyperparameter_rules import draw_choice, report_choice, report_measurement, write_choice
 from .image import draw_image, report_image, write_image
 from .saved_image import SavedImage, read_image, write_views
 from .series import write_film, write_series

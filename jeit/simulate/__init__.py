@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from jeit.arguments.moved import with_moved_names as _with_moved_names
+from jeit.arguments.moved_names import with_moved_names as _with_moved_names
 
 __getattr__ = _with_moved_names(__name__)

@@ -17,9 +17,9 @@ from .gestures.touch_watch import NamedTouch, TouchWatch, WatchedFrame
 from .health import HealthEvent, SkinHealth, watch
 from .health.health_learning import doubts_of, learn_health
 from .kohonen import MapSchedule, PlacedMap, SelfOrganisingMap, map_quality, read_map, touches_reported, write_map
-from .learnt.file import read_skin, write_skin
 from .learnt.learnt_skin import LearntSkin, Standing
-from .learnt.presses import Presses, Touches, read_frames, read_presses
+from .learnt.recorded_presses import Presses, Touches, read_frames, read_presses
+from .learnt.skin_file import read_skin, write_skin
 from .listening import LabelledClips, Listener, SoundLabels, read_clips, sound_features, sound_images
 from .networks import (
     ImageNetwork,

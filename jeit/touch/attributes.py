@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_key, check_kind, describe, is_number, real_array
-from jeit.arguments.moved import with_moved_names as _with_moved_names
+from jeit.arguments.moved_names import with_moved_names as _with_moved_names
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.touch.contacts import Contact, ImageNoise, find_contacts
 from jeit.touch.contacts.finder import AbstractFinder

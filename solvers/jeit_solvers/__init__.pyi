@@ -34,7 +34,7 @@ from .optimise.small_problems import (
 from .sparse.choose import ColumnSolver, ConjugateGradient, DirectSolver, FrontalCholesky, SparseCholesky, choose_solver
 from .sparse.exact_fronts import Fronts, find_fronts
 from .sparse.exact_fronts_numpy import FrontalFactor, factorise_fronts
-from .sparse.near_inverse import NearInverse, Strips, near_inverse
+from .sparse.inverse_entries import NearInverse, Strips, near_inverse
 from .sparse.operator import NumpySolver, SparseSymmetric
 from .sparse.optional_packages import Multigrid, Pardiso
 from .sparse.padded_fronts import FactorisationPlan, analyse

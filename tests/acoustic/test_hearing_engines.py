@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from microphone_arrays import array, assert_same, both, inside, noisy, quick_likelihood, received_power, same_shape
 
-from jeit.acoustic import Localiser, cramer_rao, touches, track
+from jeit.acoustic import Localiser, cramer_rao, touch_tracks, track
 from jeit.acoustic.decay import DECAYS
 from jeit.acoustic.localisation.locations import Locations, LocationStatus
 from jeit.acoustic.localisation.two_sources import locate_two
@@ -105,7 +105,7 @@ def test_tracks(monkeypatch):
         name="",
     )
     at_once = track(found)
-    monkeypatch.setattr(touches, "MAX_NUMPY_FRAMES", 0)
+    monkeypatch.setattr(touch_tracks, "MAX_NUMPY_FRAMES", 0)
     compiled = track(found)
     assert_same(
         [at_once.position, at_once.covariance, at_once.velocity, at_once.rejected],

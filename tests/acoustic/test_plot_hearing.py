@@ -23,7 +23,7 @@ from jeit.acoustic.plots import (
 )
 from jeit.acoustic.plots.surface_view import ESTIMATE_COLOUR
 from jeit.acoustic.surface import make_surface
-from jeit.acoustic.touches import Touch, Track
+from jeit.acoustic.touch_tracks import Touch, Track
 from jeit.layout import grid
 
 OUTLINE = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])

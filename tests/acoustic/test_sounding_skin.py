@@ -147,7 +147,7 @@ def test_drawn_bursts_have_the_expected_power(small):
 def test_the_chunks_of_a_calibration_do_not_matter(small, monkeypatch):
     places = [(0.0, 0.01), (0.03, 0.02), (-0.08, 0.0)]
     whole = simulate_calibration_taps(small, KEY, places, repeats=2, duration=0.1)
-    monkeypatch.setattr("jeit.acoustic.simulate.touches.MAX_CHUNK_SAMPLES", 12_000)
+    monkeypatch.setattr("jeit.acoustic.simulate.touch_sounds.MAX_CHUNK_SAMPLES", 12_000)
     # Two chunks of two places, the last one twice.
     parts = simulate_calibration_taps(small, KEY, places, repeats=2, duration=0.1)
     np.testing.assert_allclose(parts.samples, whole.samples, rtol=1e-9, atol=1e-12)

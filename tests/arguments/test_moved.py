@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from jeit.arguments.moved import MOVED
+from jeit.arguments.moved_names import MOVED
 
 
 @pytest.mark.parametrize("old", MOVED)

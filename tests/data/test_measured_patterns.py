@@ -7,7 +7,7 @@ import pytest
 import scipy.io
 
 from jeit import data, protocol
-from jeit.data.imageable import assess
+from jeit.data.frame_checks import assess
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.imaging import select_frames

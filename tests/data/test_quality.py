@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from jeit import data, protocol
-from jeit.data.imageable import assess, mask_spikes
+from jeit.data.frame_checks import assess, mask_spikes
 from jeit.data.quality import channel_reciprocity_error, expected_signs, rounding_deviation
 from jeit.inverse import relative_noise
-from jeit.report.compared_rules import report_measurement
+from jeit.report.hyperparameter_rules import report_measurement
 
 
 def test_missing_saturated_and_dead_channels_are_masked_and_noted(tank, setup):

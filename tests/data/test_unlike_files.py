@@ -10,7 +10,7 @@ from jeit import data
 from jeit.data import load_description
 from jeit.data.description import TableLayout, parse_description
 from jeit.data.formats.text import frames_in_table
-from jeit.data.unstated import fitting_protocol
+from jeit.data.inferred_properties import fitting_protocol
 from jeit.protocol import adjacent
 
 TANK = """

@@ -45,11 +45,11 @@ from jeit.report.saved_image import saved_extras
 from jeit.touch import LearntSkin, PlacedMap, Presses, SelfOrganisingMap, read_presses, read_skin, write_skin
 from jeit.touch.gestures import GestureModel
 from jeit.touch.kohonen import read_map, write_map
-from jeit.touch.learnt.presses import read_frames
+from jeit.touch.learnt.recorded_presses import read_frames
 from jeit.touch.listening import LabelledClips, Listener
 from jeit.touch.networks import ImageNetwork, read_network, write_network
 from jeit.touch.networks.image_network import describe_skin
-from jeit.touch.networks.unrolled import Unrolled
+from jeit.touch.networks.unrolled_network import Unrolled
 
 
 @dataclass(frozen=True)

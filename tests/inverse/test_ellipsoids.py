@@ -22,7 +22,7 @@ from jeit.inverse.shapes import (
     search,
 )
 from jeit.inverse.shapes.ellipsoid import Ellipsoids
-from jeit.inverse.shapes.finer import refine_at_surfaces
+from jeit.inverse.shapes.finer_mesh import refine_at_surfaces
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit.mesh import box, measures
 from jeit.protocol import opposite

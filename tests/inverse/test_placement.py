@@ -7,7 +7,7 @@ import pytest
 
 from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, ring
 from jeit.data import Measurement
-from jeit.data.imageable import rounding_of_difference
+from jeit.data.frame_checks import rounding_of_difference
 from jeit.electrodes import FaceDiscs, FacePatches, NodeElectrodes, SheetDiscs
 from jeit.electrodes.face_patches import body_mesh
 from jeit.forward.changes import PlacementSensitivity, shift_electrodes

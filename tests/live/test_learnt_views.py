@@ -22,7 +22,7 @@ from jeit.mesh import Rectangle
 from jeit.touch import LearntSkin, Presses, TouchImages, TouchWatch, learn_gestures
 from jeit.touch.networks import ImageNetwork, stream_depths
 from jeit.touch.networks.linear_channels import LinearChannels, depth_centroids
-from jeit.touch.networks.unrolled import Unrolled
+from jeit.touch.networks.unrolled_network import Unrolled
 from jeit.touch.simulate.contact.indent_sets import image_places, pixel_places
 
 DESCRIPTION = parse_description(tomllib.loads(TOML), "skin.toml")

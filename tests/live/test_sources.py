@@ -12,8 +12,8 @@ from small_sensor import CHANNELS, measured, noisy
 
 from jeit.data import write_table
 from jeit.data.formats.lines import LineReading
-from jeit.live import line_source, preparation
-from jeit.live.line_source import LineSource, ReadAhead, SerialPort, Server, StandardInput, connection_to
+from jeit.live import frame_connection, preparation
+from jeit.live.frame_connection import LineSource, ReadAhead, SerialPort, Server, StandardInput, connection_to
 from jeit.live.preparation import first_frames
 from jeit.live.sources import AbstractSource, PlayedRecording, WatchedFolder, open_source
 
@@ -71,8 +71,8 @@ def are_due(seconds, expected):
 
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch):
-    monkeypatch.setattr(line_source, "_INITIAL_DELAY", 0.02)
-    monkeypatch.setattr(line_source, "_READ_TIMEOUT", 0.02)
+    monkeypatch.setattr(frame_connection, "_INITIAL_DELAY", 0.02)
+    monkeypatch.setattr(frame_connection, "_READ_TIMEOUT", 0.02)
 
 
 @posix
@@ -160,7 +160,7 @@ def test_a_source_is_closed_if_what_is_prepared_for_it_fails(monkeypatch):
 
 @posix
 def test_frames_beyond_those_that_can_wait_are_counted(monkeypatch):
-    monkeypatch.setattr(line_source, "_MAX_WAITING_FRAMES", 4)
+    monkeypatch.setattr(frame_connection, "_MAX_WAITING_FRAMES", 4)
     read, write = os.pipe()
     os.write(write, b"".join(map(line, FRAMES)))
     lines = LineSource("-", StandardInput(read), LineReading())
@@ -179,7 +179,7 @@ def test_frames_beyond_those_that_can_wait_are_counted(monkeypatch):
 
 @posix
 def test_a_loss_at_the_end_is_reported_too(monkeypatch):
-    monkeypatch.setattr(line_source, "_MAX_WAITING_FRAMES", 4)
+    monkeypatch.setattr(frame_connection, "_MAX_WAITING_FRAMES", 4)
     read, write = os.pipe()
     os.write(write, b"".join(map(line, FRAMES)))
     os.close(write)
@@ -282,7 +282,7 @@ def test_a_missing_server_is_awaited_and_can_be_cancelled():
 
 
 def test_a_silent_device_is_reported(monkeypatch):
-    monkeypatch.setattr(line_source, "_SILENCE_TIMEOUT", 0.05)
+    monkeypatch.setattr(frame_connection, "_SILENCE_TIMEOUT", 0.05)
     listening = socket.create_server(("127.0.0.1", 0))
     source = LineSource("tcp", Server("127.0.0.1", listening.getsockname()[1]), LineReading())
     with Reading(source) as reading:

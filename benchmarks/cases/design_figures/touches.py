@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from jaxtyping import Array
 
     from jeit.design.comparison import SkinResponse
-    from jeit.design.skin.touches import AbstractIndentation
+    from jeit.design.skin.touch_shapes import AbstractIndentation
 
 LAYOUTS = ("park-inner", "park-boundary")
 MARGIN, PAIRS, THICKNESS = 10e-3, 94, 10e-3

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from jeit.acoustic import Calibration, MicrophoneArray
 from jeit.acoustic.localisation.locations import Locations, LocationStatus
 from jeit.acoustic.plots.surface_view import View, draw_ellipse, draw_legend, draw_surface, outline_of, view_of
-from jeit.acoustic.touches import Touch, Track
+from jeit.acoustic.touch_tracks import Touch, Track
 from jeit.arguments import check_kind
 from jeit.plot.axes import DARK_GREY, LIGHT_GREY, axes_or_new, draw_colour_bar
 

@@ -22,7 +22,7 @@ from jeit.acoustic.simulate.sound import (
     simulate_silence,
 )
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
-from jeit.acoustic.simulate.touches import NOMINAL_SPEED
+from jeit.acoustic.simulate.touch_sounds import NOMINAL_SPEED
 from jeit.acoustic.simulate.wind_sound import TURBULENCE, simulate_room_sound, simulate_wind
 from jeit.arguments import check_key, check_kind, check_name, describe
 from jeit.arguments.checks import check_positive

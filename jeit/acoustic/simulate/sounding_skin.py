@@ -5,7 +5,7 @@ Simulated recordings replace measurements, since no openly licensed recording of
 is propagated in the frequency domain with spreading, viscoelastic loss, delays and edge echoes. The simulation thus
 differs from the decay model a/(r² + b) that the calibration fits, and is a meaningful test of this model. The setup
 follows Park et al., Science Robotics 7, eabm7187 (2022). See `jeit.acoustic.simulate.propagation` for the physics, and
-`jeit.acoustic.simulate.touches` for touches.
+`jeit.acoustic.simulate.touch_sounds` for touches.
 """
 
 from __future__ import annotations

@@ -69,8 +69,8 @@ def describe(
     from jeit.cli.commands.reconstruct import show
     from jeit.cli.console import Steps, plain_console, say_written
     from jeit.data import read
-    from jeit.data.imageable import assess
-    from jeit.files.whole import written_whole
+    from jeit.data.frame_checks import assess
+    from jeit.files.atomic_write import written_whole
     from jeit.imaging import image_difference
     from jeit.imaging.describe import find_description
     from jeit.report import write_image

@@ -26,7 +26,7 @@ def info(
     """Print what DATA contains: frames, electrodes, protocol, noise, assumptions, and masked voltages."""
     from jeit.arguments import counted, percent
     from jeit.cli.console import name_value_table, plain_console, with_unit
-    from jeit.data.imageable import MOST_IMPOSSIBLE_SIGNS
+    from jeit.data.frame_checks import MOST_IMPOSSIBLE_SIGNS
     from jeit.report import report_measurement
 
     measurement = read_file("DATA", data, format, description, key=key)

@@ -22,8 +22,8 @@ from jeit.arguments import counted, names_text
 from jeit.data.description import Description, parse_description
 from jeit.data.formats.recording import Recording, content_of, description_of, measurement_of
 from jeit.data.formats.table import description_like, find_description
+from jeit.data.inferred_properties import with_signs
 from jeit.data.measurement import Measurement
-from jeit.data.unstated import with_signs
 from jeit.protocol import Protocol
 
 # Amplitude in amperes where no description states the current.

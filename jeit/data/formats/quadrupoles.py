@@ -26,8 +26,8 @@ from jeit.arguments import counted, names_text
 from jeit.data.description import Description, load_description, parse_description
 from jeit.data.formats.recording import Recording, content_of, measurement_of
 from jeit.data.formats.table import description_like, find_description
+from jeit.data.inferred_properties import with_signs
 from jeit.data.measurement import Measurement
-from jeit.data.unstated import with_signs
 from jeit.files import check_electrodes, read_toml
 from jeit.protocol import from_channels
 

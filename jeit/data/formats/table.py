@@ -21,9 +21,9 @@ from jeit.data.formats.text import (
     rectangle,
     without_cut_line,
 )
+from jeit.data.inferred_properties import fitting_protocol, unmeasured_driven_channels, with_signs
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
-from jeit.data.unstated import fitting_protocol, unmeasured_driven_channels, with_signs
 from jeit.files import npy_array, npz_arrays
 from jeit.protocol import Protocol
 

@@ -16,7 +16,7 @@ from jeit.design.defaults import CONTRAST, CORRELATION, NOISE, TEMPERATURE
 from jeit.design.scores import Score, Scores, TouchPrior, layout_scores
 from jeit.design.skin.sheet_touches import SheetTouches
 from jeit.design.skin.skin import Skin, check_skin
-from jeit.design.skin.touches import AbstractIndentation
+from jeit.design.skin.touch_shapes import AbstractIndentation
 from jeit.electrodes import SheetDiscs
 from jeit.mesh import Domain
 from jeit_solvers.engines import as_array

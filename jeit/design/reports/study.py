@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from jeit.design.skin.touches import TouchGrid
+from jeit.design.skin.touch_shapes import TouchGrid
 from jeit.design.study.batch import study_grid
 from jeit.design.study.run import study_progress
 from jeit.design.study.spec import Study

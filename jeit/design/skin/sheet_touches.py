@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.design.defaults import CONTRAST
+from jeit.design.skin.touch_shapes import AbstractIndentation
 from jeit.design.skin.touched_cells import TouchedCells, touched_cells
-from jeit.design.skin.touches import AbstractIndentation
 from jeit.mesh import Mesh, centroids
 from jeit.mesh.geodesic import Geodesics, Triangles
 from jeit_solvers.engines import gather, host, namespace, on_host, sum_into

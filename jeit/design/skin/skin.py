@@ -15,8 +15,8 @@ from jeit.arguments import IN_MILLIMETRES, check_kind, check_metres, object_html
 from jeit.design.defaults import CELL_SIZE, CONDUCTIVITY, CONTACT_IMPEDANCE, CONTRAST, NUM_LAYERS, THICKNESS
 from jeit.design.skin.names import skin_protocol
 from jeit.design.skin.sheet_touches import SheetTouches, sheet_touches
+from jeit.design.skin.touch_shapes import AbstractIndentation, Bell
 from jeit.design.skin.touched_cells import TouchedCells, touched_cells, touched_surface
-from jeit.design.skin.touches import AbstractIndentation, Bell
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.electrodes import FaceDiscs, SheetDiscs, SurfaceDiscs
 from jeit.forward import ForwardModel

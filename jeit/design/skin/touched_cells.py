@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 from jeit.arguments import check_kind
 from jeit.design.defaults import CONTRAST, MOST_CONTRAST
-from jeit.design.skin.touches import AbstractIndentation, check_places
+from jeit.design.skin.touch_shapes import AbstractIndentation, check_places
 from jeit.electrodes.discs import smooth_step
 from jeit.forward import ForwardModel
 from jeit.mesh import Mesh, centroids

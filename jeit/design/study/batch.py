@@ -20,8 +20,8 @@ from jeit.design.scores import TouchPrior, layout_scores
 from jeit.design.sensitivity import SensitivityMap
 from jeit.design.skin.sheet_touches import SheetTouches
 from jeit.design.skin.skin import Skin, model_conductivity, smallest_diameter
+from jeit.design.skin.touch_shapes import SurfaceGrid, TouchGrid, touch_grid
 from jeit.design.skin.touched_cells import TouchedCells, touched_surface
-from jeit.design.skin.touches import SurfaceGrid, TouchGrid, touch_grid
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.design.study.spec import Point, Shape, Study
 from jeit.design.taxels import find_taxels

@@ -12,7 +12,7 @@ from datetime import datetime
 from pathlib import Path
 
 from jeit.arguments import describe
-from jeit.files.whole import boot_identifier, is_alive
+from jeit.files.atomic_write import boot_identifier, is_alive
 
 try:
     import fcntl

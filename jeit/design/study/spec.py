@@ -18,7 +18,7 @@ from jeit.design.defaults import OPTIMALITY
 from jeit.design.skin.described_surface import described_surface, surface_identity, typical_cell
 from jeit.design.skin.names import ProtocolName, curved_layout, is_layout_file, skin_protocol, study_layout
 from jeit.design.skin.skin import check_cell_size, longer_side, skin_electrodes
-from jeit.design.skin.touches import AbstractIndentation, Bell, Hemisphere
+from jeit.design.skin.touch_shapes import AbstractIndentation, Bell, Hemisphere
 from jeit.electrodes import FaceDiscs, SheetDiscs, SurfaceDiscs
 from jeit.files import check_memory, read_text
 from jeit.files.limits import parsed_toml

@@ -33,7 +33,7 @@ from jeit_solvers import one_thread_of_blas
 from jeit_solvers.engines import as_array
 
 if TYPE_CHECKING:
-    from jeit.inverse.shapes.finer import FinerModel
+    from jeit.inverse.shapes.finer_mesh import FinerModel
 
 # A body is a ghost if the objective rises by less than this factor when the body is left out and all other bodies are
 # fitted again.
@@ -296,7 +296,7 @@ def _refine_meshes(
     Ghosts due to the coarse mesh are removed. Returns the state and the last refined problem, which is None if there
     are no bodies.
     """
-    from jeit.inverse.shapes.finer import refine_at_surfaces
+    from jeit.inverse.shapes.finer_mesh import refine_at_surfaces
 
     base_setting, finer_model = state.setting, None
     for refinement in range(_MAX_REFINEMENTS):

@@ -14,7 +14,7 @@ from jeit.live.pictures import AbstractView, LiveFrame, Marker, Picture, Scene
 from jeit.live.views.conductivity import closed_outline, electrode_curves, mean_frame
 from jeit.live.views.contacts import StepwiseGenerator
 from jeit.touch import LearntSkin, Touches
-from jeit.touch.learnt.presses import NO_TOUCH
+from jeit.touch.learnt.recorded_presses import NO_TOUCH
 from jeit.touch.networks import FrameDepth, ImageNetwork, resting_frame, stream_depths
 from jeit.touch.networks.linear_channels import depth_centroids
 from jeit.touch.simulate.contact.indent_sets import pixel_places

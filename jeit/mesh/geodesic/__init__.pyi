@@ -1,7 +1,7 @@
 from .geodesics import Geodesics
 from .triangles import SurfacePlaces, Triangles
 from .unfolding import Unfolding, unfold
-from .unrolled import Unrolled, unroll
+from .unrolled_surface import Unrolled, unroll
 
 __all__ = [
     "Geodesics",

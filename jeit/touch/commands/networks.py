@@ -149,7 +149,7 @@ def _read_frame_file(
     from jeit.data import load_description, read_frame_recording
     from jeit.data.formats import table
     from jeit.imaging.stream_preparation import frames_of
-    from jeit.touch.networks.measured import check_measured
+    from jeit.touch.networks.depth_maps import check_measured
 
     has_description = kind is not None or description is not None or table.find_description(path) is not None
     if is_table or (table.recognises(path) and not has_description):

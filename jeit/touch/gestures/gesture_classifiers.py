@@ -17,9 +17,9 @@ from jeit.touch.gestures.features import (
     touch_features,
 )
 from jeit.touch.learnt.array_models import Forest
-from jeit.touch.learnt.extras import apply_over_folds
 from jeit.touch.learnt.methods import CLASSIFIERS, log_odds
 from jeit.touch.learnt.neural_networks import TemporalNetwork
+from jeit.touch.learnt.resource_limits import apply_over_folds
 
 
 def fit_logit_boost(features: Float[np.ndarray, "n k"], label: np.ndarray) -> Forest:

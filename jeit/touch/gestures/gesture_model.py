@@ -24,10 +24,10 @@ from jeit.touch.gestures.gesture_classifiers import (
     random_folds,
 )
 from jeit.touch.gestures.segmentation import StreamTouch
-from jeit.touch.learnt.answers import Standing
-from jeit.touch.learnt.extras import apply_in_parts
-from jeit.touch.learnt.file import read_plain, write_plain
+from jeit.touch.learnt.learn_from_presses import Standing
 from jeit.touch.learnt.methods import fit_sharpness, log_odds, probabilities
+from jeit.touch.learnt.resource_limits import apply_in_parts
+from jeit.touch.learnt.skin_file import read_plain, write_plain
 
 # Minimum ratio of the conductivities of two skins that are considered different, or to have different units.
 _MIN_CONDUCTIVITY_RATIO = 5.0

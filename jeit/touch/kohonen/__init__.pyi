@@ -1,6 +1,6 @@
 from .placed_map import PlacedMap, drawn_map, read_map, write_map
 from .self_organising_map import MapQuality, SelfOrganisingMap, fit_maps, learning_curves, map_quality, time_constant
-from .several_touches import MapTouch, neuron_shares, touches_reported
+from .simultaneous_touches import MapTouch, neuron_shares, touches_reported
 from .training import MapSchedule
 
 __all__ = [

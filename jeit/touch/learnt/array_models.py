@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jeit.touch.learnt.extras import apply_in_parts
+from jeit.touch.learnt.resource_limits import apply_in_parts
 
 # Number of frames evaluated at once, so that the data stay in the processor's cache.
 _CHUNK_SIZE = 128

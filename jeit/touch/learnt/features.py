@@ -15,7 +15,7 @@ from jeit.arguments import check_kind
 from jeit.forward import ForwardModel
 from jeit.inverse import calibrate, one_step
 from jeit.mesh import centroids, measures
-from jeit.touch.learnt.extras import apply_in_parts
+from jeit.touch.learnt.resource_limits import apply_in_parts
 from jeit_solvers.engines import as_array
 
 # A contact is the region of an image above this fraction of its peak, among the cells nearest to the peak.

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jeit.touch.learnt.array_models import Forest
-from jeit.touch.learnt.extras import apply_over_folds
 from jeit.touch.learnt.features import FORMS, Features, Forms, ImageReconstruction, standardisation
 from jeit.touch.learnt.methods import CLASSIFIERS, covariance_shrinkage, fit_sharpness, log_odds, probabilities
+from jeit.touch.learnt.resource_limits import apply_over_folds
 
 METHODS = ("auto", *CLASSIFIERS)
 _QUICK_METHOD = "linear-discriminant"

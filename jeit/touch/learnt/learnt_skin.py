@@ -14,14 +14,12 @@ from jeit.arguments import check_kind, check_name, counted
 from jeit.arguments.extras import need_extra
 from jeit.forward import ForwardModel
 from jeit.touch.learnt import labels as label_methods
-from jeit.touch.learnt import numbers as number_methods
-from jeit.touch.learnt.answers import METHODS, Standing, learn_quantities, places_and_folds
+from jeit.touch.learnt import regression
 from jeit.touch.learnt.channels import Channels, choose_channels
-from jeit.touch.learnt.extras import apply_over_threads, one_thread
 from jeit.touch.learnt.features import ImageReconstruction, check_imaged
 from jeit.touch.learnt.labels import LearntKeys, LearntLabels
-from jeit.touch.learnt.numbers import LearntNumbers
-from jeit.touch.learnt.presses import (
+from jeit.touch.learnt.learn_from_presses import METHODS, Standing, learn_quantities, places_and_folds
+from jeit.touch.learnt.recorded_presses import (
     NO_TOUCH,
     Presses,
     Touches,
@@ -34,6 +32,8 @@ from jeit.touch.learnt.presses import (
     reference_used,
     standardise_sessions,
 )
+from jeit.touch.learnt.regression import LearntNumbers
+from jeit.touch.learnt.resource_limits import apply_over_threads, one_thread
 
 # A frame is unlike the training set above this novelty (about 1 for the farthest training frames), or below this
 # fraction of alive channels.
@@ -333,7 +333,7 @@ def _check_fit(presses: Presses, method: str, model, num_channels: int | None, p
     check_name("method", method, METHODS)
     has_targets = presses.positions is not None or presses.force is not None
     if method != "auto" and not (
-        (has_targets and method in number_methods.METHODS)
+        (has_targets and method in regression.METHODS)
         or (presses.label is not None and method in label_methods.METHODS)
     ):
         quantities = "labels" if method in label_methods.METHODS else "places and forces"

@@ -21,8 +21,8 @@ from jeit.touch.kohonen.placed_map import PlacedMap
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 from jeit.touch.kohonen.training import MapSchedule
 from jeit.touch.learnt.array_models import Forest, NearestNeighbours, SupportVectorMachine
-from jeit.touch.learnt.extras import apply_in_parts
 from jeit.touch.learnt.neural_networks import Network
+from jeit.touch.learnt.resource_limits import apply_in_parts
 from jeit_solvers import number_of_cores
 
 # Number of presses from which kernel length and noise are estimated; maximum number of kernel centres. If there are no

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jeit.touch.learnt.array_models import Forest
-from jeit.touch.learnt.extras import one_thread
 from jeit.touch.learnt.methods import CLASSIFIERS
+from jeit.touch.learnt.resource_limits import one_thread
 from jeit.touch.listening.feature_images import SoundImages
 from jeit.touch.listening.modality_network import (
     ModalityNetwork,

@@ -15,7 +15,7 @@ from jeit.acoustic import Calibration, Recording, locate_touches
 from jeit.arguments import check_key, check_kind, check_name, counted
 from jeit.arguments.extras import need_extra
 from jeit.files import error_text
-from jeit.touch.learnt.answers import Standing
+from jeit.touch.learnt.learn_from_presses import Standing
 from jeit.touch.learnt.methods import fit_sharpness, probabilities
 from jeit.touch.listening.feature_images import NUM_BANDS, WINDOW_INTERVAL, image_blocks
 from jeit.touch.listening.labelled_clips import LabelledClips, mix_channels

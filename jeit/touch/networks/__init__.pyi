@@ -1,6 +1,6 @@
+from .depth_maps import FrameDepth, resting_frame, stream_depths
 from .image_network import DESIGNS, ImageNetwork, read_network, write_network
 from .learn import PRESETS, ImageStanding, LearntImages, NetworkPreset, learn_images
-from .measured import FrameDepth, resting_frame, stream_depths
 
 __all__ = [
     "DESIGNS",

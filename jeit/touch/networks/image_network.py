@@ -23,8 +23,8 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind, check_name, describe, is_number, real_array
 from jeit.design import Skin
 from jeit.protocol import Protocol
-from jeit.touch.networks.three_stages import ThreeStages
-from jeit.touch.networks.unrolled import Unrolled
+from jeit.touch.networks.three_stage_network import ThreeStages
+from jeit.touch.networks.unrolled_network import Unrolled
 from jeit.touch.simulate.contact.indent_sets import pixel_places
 from jeit.touch.simulate.contact.indents import relative_to
 from jeit.touch.training import check_same, read_model, write_model

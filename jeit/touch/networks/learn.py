@@ -29,8 +29,8 @@ from jeit.touch.networks.linear_channels import (
     error_statistics,
     touch_draws,
 )
-from jeit.touch.networks.three_stages import DepthAutoencoder, ThreeStages, VoltageAutoencoder
-from jeit.touch.networks.unrolled import Unrolled
+from jeit.touch.networks.three_stage_network import DepthAutoencoder, ThreeStages, VoltageAutoencoder
+from jeit.touch.networks.unrolled_network import Unrolled
 from jeit.touch.simulate import Indent, IndentSet, ball_indenter, relative_changes, simulate_presses
 from jeit.touch.simulate.contact.indent_sets import image_places
 from jeit.touch.training import (

@@ -15,8 +15,8 @@ from jeit.files import clear_unfinished, written_whole
 from jeit.report.folder import as_plain_values, results, results_folder, version_of, write_json
 from jeit.report.stream import PICTURES, GrowingRows, GrowingTable, Sample, reporting_partial_results
 from jeit.touch.networks import ImageNetwork, LearntImages
+from jeit.touch.networks.depth_maps import FrameDepth
 from jeit.touch.networks.linear_channels import depth_centroids
-from jeit.touch.networks.measured import FrameDepth
 from jeit.touch.simulate.contact.indent_sets import pixel_places
 
 LEARNT_FILES = ("network.jeit", "report.json", "learning.png")

@@ -1,3 +1,4 @@
+from .contact.combined_skins import JoinedIndenters, PlacedIndenter, TwoSheets
 from .contact.half_space import HalfSpace
 from .contact.indent_sets import IndentSet
 from .contact.indenters import (
@@ -10,7 +11,6 @@ from .contact.indenters import (
     ball_indenter,
 )
 from .contact.indents import Indent, IndentDraws, PressDraws, depth_maps, indented_cells, relative_changes
-from .contact.joined import JoinedIndenters, PlacedIndenter, TwoSheets
 from .contact.materials import Foundation, Material, material
 from .contact.press import MovingPress, Press
 from .contact.press_sets import PressSet, open_presses, simulate_presses

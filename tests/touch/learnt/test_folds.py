@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial import KDTree
 
-from jeit.touch.learnt.answers import time_folds
+from jeit.touch.learnt.learn_from_presses import time_folds
 
 RNG = np.random.default_rng(0)
 FRAMES = RNG.normal(size=(60, 4))

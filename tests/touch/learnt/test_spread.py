@@ -5,7 +5,7 @@ import pytest
 from made_skins import record
 
 from jeit.touch import LearntSkin, Presses
-from jeit.touch.learnt.numbers import DeviationModel
+from jeit.touch.learnt.regression import DeviationModel
 
 
 @pytest.fixture(scope="module")

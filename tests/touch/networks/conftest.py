@@ -9,7 +9,7 @@ from jeit.layout import named_layout
 from jeit.mesh import Rectangle
 from jeit.touch.networks import ImageNetwork, learn_images, write_network
 from jeit.touch.networks.linear_channels import LinearChannels
-from jeit.touch.networks.unrolled import Unrolled
+from jeit.touch.networks.unrolled_network import Unrolled
 from jeit.touch.simulate.contact.indent_sets import image_places
 from jeit.touch.simulate.contact.indents import resting_skin
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jeit.touch.networks.three_stages import Convolution, repeat_pixels
+from jeit.touch.networks.three_stage_network import Convolution, repeat_pixels
 
 
 def test_weights_are_the_first_of_more_draws():

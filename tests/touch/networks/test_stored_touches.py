@@ -144,7 +144,7 @@ def test_the_objectives_of_the_three_stages(stored, other, small_skin, monkeypat
     """Untrained, the first stage reconstructs nothing. The last starts from the first's results, which are frozen."""
     random = np.random.default_rng(0)
     monkeypatch.setattr(
-        "jeit.touch.networks.three_stages._draw_weights",
+        "jeit.touch.networks.three_stage_network._draw_weights",
         lambda key, shape, inputs: jnp.asarray(random.normal(size=shape) * np.sqrt(2 / inputs), jnp.float32),
     )
     indents, path, _ = stored

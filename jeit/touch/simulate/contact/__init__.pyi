@@ -1,3 +1,4 @@
+from .combined_skins import JoinedIndenters, PlacedIndenter, TwoSheets
 from .half_space import HalfSpace
 from .indent_sets import IndentSet
 from .indenters import (
@@ -10,7 +11,6 @@ from .indenters import (
     ball_indenter,
 )
 from .indents import Indent, IndentDraws, PressDraws, depth_maps, indented_cells, relative_changes
-from .joined import JoinedIndenters, PlacedIndenter, TwoSheets
 from .materials import Foundation, Material, material
 from .press import MovingPress, Press
 from .press_sets import PressSet, open_presses, simulate_presses

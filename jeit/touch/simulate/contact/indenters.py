@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 
 from jeit.arguments import check_kind, check_metres, real_array
-from jeit.design.skin.touches import AbstractIndentation, Hemisphere
+from jeit.design.skin.touch_shapes import AbstractIndentation, Hemisphere
 from jeit.mesh.outline.domain import check_length
 from jeit_solvers.engines import host
 from jeit_solvers.module import Module

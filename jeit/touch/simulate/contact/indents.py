@@ -15,8 +15,8 @@ from jeit.design import Skin
 from jeit.design.skin.touched_cells import TouchedCells, pad_rows
 from jeit.design.skin.voltage_changes import RestingSkin
 from jeit.mesh import Domain, centroids
+from jeit.touch.simulate.contact.combined_skins import check_angle, check_position
 from jeit.touch.simulate.contact.indenters import AbstractIndenter, check_indenter
-from jeit.touch.simulate.contact.joined import check_angle, check_position
 from jeit.touch.simulate.contact.materials import material
 from jeit.touch.simulate.contact.press import Press
 from jeit.touch.simulate.contact.pressed_skin import PressedSkin

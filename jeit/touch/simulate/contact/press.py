@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 
 from jeit.arguments import check_kind, describe, is_number, real_array
+from jeit.touch.simulate.contact.combined_skins import check_angle, check_position
 from jeit.touch.simulate.contact.indenters import AbstractIndenter, check_indenter
-from jeit.touch.simulate.contact.joined import check_angle, check_position
 from jeit_solvers.module import Module
 
 

@@ -19,8 +19,8 @@ from jaxtyping import Array, Float
 
 from jeit.arguments import check_key, check_kind, check_name, describe, is_number
 from jeit.mesh import Domain
+from jeit.touch.simulate.contact.combined_skins import JoinedIndenters, PlacedIndenter
 from jeit.touch.simulate.contact.indenters import DiscIndenter
-from jeit.touch.simulate.contact.joined import JoinedIndenters, PlacedIndenter
 from jeit.touch.simulate.contact.press import MovingPress
 from jeit_solvers.module import Module
 

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from jeit.touch.learnt.extras import apply_over_folds
 from jeit.touch.learnt.features import Features, Forms, ImageReconstruction
 from jeit.touch.learnt.methods import CHANNEL_METHODS, QUICK_METHODS, REGRESSORS
+from jeit.touch.learnt.resource_limits import apply_over_folds
 
 _NUM_SIMILAR, _TARGET_COVERAGES = 40, ((1.0, 0.6827), (1.96, 0.95))
 # Number of similar presses from which the variance of a prediction is estimated; for calibration, pairs of a multiple

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.touch.networks.linear_channels import LinearChannels, depth_from_strength, round_relative, strength
-from jeit.touch.networks.three_stages import Convolution, channels_to_pixels, repeat_pixels
+from jeit.touch.networks.three_stage_network import Convolution, channels_to_pixels, repeat_pixels
 from jeit_solvers.module import Module
 
 # Numbers of channels of the inner and of the outer layers of the refinement network.

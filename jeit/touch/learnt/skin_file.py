@@ -29,7 +29,7 @@ from jeit.touch.learnt.labels import LearntKeys, LearntLabels, StandardisedFeatu
 from jeit.touch.learnt.learnt_skin import LearntSkin
 from jeit.touch.learnt.methods import GaussianProcess, LinearEnsemble, QuadraticDiscriminant
 from jeit.touch.learnt.neural_networks import Network, TemporalNetwork
-from jeit.touch.learnt.numbers import DeviationModel, LearntNumbers
+from jeit.touch.learnt.regression import DeviationModel, LearntNumbers
 
 _SCHEMA_FILE = "schema.json"
 # Matches the number of an object in the schema of a skops file, also where the number is part of a file name.

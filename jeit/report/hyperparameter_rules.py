@@ -10,10 +10,10 @@ import numpy as np
 
 from jeit.arguments import counted, percent
 from jeit.data import Measurement, estimate_noise, impossible_signs, reciprocity_error
-from jeit.data.imageable import MOST_DIFFERENCE_RECIPROCITY_ERROR
+from jeit.data.frame_checks import MOST_DIFFERENCE_RECIPROCITY_ERROR
 from jeit.forward import ForwardModel
 from jeit.imaging import imaging_mesh
-from jeit.imaging.compared_rules import ComparedRules, RuleOutcome
+from jeit.imaging.hyperparameter_rules import ComparedRules, RuleOutcome
 from jeit.imaging.wiring import MOST_MISFIT, find_wiring
 from jeit.mesh import Mesh
 from jeit.report.folder import (

@@ -10,11 +10,11 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from jeit.touch.learnt import labels as label_methods
-from jeit.touch.learnt import numbers as number_methods
+from jeit.touch.learnt import regression
 from jeit.touch.learnt.features import ImageReconstruction
 from jeit.touch.learnt.labels import learn_keys, learn_labels
-from jeit.touch.learnt.numbers import LearntNumbers, learn_numbers
-from jeit.touch.learnt.presses import Presses
+from jeit.touch.learnt.recorded_presses import Presses
+from jeit.touch.learnt.regression import LearntNumbers, learn_numbers
 
 NUM_FOLDS = 5
 # Maximum mean distance of the held-out presses of a fold from the nearest press of another fold, relative to the same
@@ -141,7 +141,7 @@ def _connected_sets(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.unique(connected_components(graph, directed=False)[1][first], return_inverse=True)[1]
 
 
-METHODS = tuple(dict.fromkeys((*number_methods.METHODS, *label_methods.METHODS)))
+METHODS = tuple(dict.fromkeys((*regression.METHODS, *label_methods.METHODS)))
 
 
 @dataclass(frozen=True)
@@ -245,7 +245,7 @@ def _learn_targets(
     """Learn places or forces, the targets, from the voltage changes of presses; returns the model and its accuracy."""
     selected_reference, number_method = (
         None if reference is None else reference[rows],
-        _method_or_auto(method, number_methods),
+        _method_or_auto(method, regression),
     )
     learnt, results = learn_numbers(
         changes[rows], selected_reference, targets, folds, method=number_method, imaged=imaged, progress=progress
