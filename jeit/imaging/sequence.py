@@ -36,7 +36,7 @@ from jeit_solvers.engines import as_array
 
 # Number of frames imaged at once, and number of bytes of a stored value.
 _BATCH, _VALUE_BYTES = 256, 4
-# Minimum share of the frames that must have a channel for the channel to be used.
+# Minimum share of the frames with a valid value of a channel for the channel to be used.
 _MIN_FRAME_SHARE = 0.5
 
 

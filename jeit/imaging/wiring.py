@@ -173,9 +173,9 @@ def find_wiring(
 
     Candidates are other orders of the channels, voltages of opposite sign, other first electrodes, the reverse order of
     electrodes, and up to four successive exchanges of two electrodes. Voltages may be magnitudes if all have one sign,
-    or if their signs are those that the described wiring implies. Such voltages are also compared without signs, and
-    the result is used if it explains the frame better. Errors that leave the voltages unchanged, such as a rotation of
-    the electrodes of a symmetric body, cannot be found.
+    or if their signs are those that the described wiring implies. Such voltages are also compared by magnitude, and the
+    result is used if it fits the frame better. Errors that leave the voltages unchanged, such as a rotation of the
+    electrodes of a symmetric body, cannot be found.
 
     `impedances`: those of the model (see `uniform_impedances`), which are the same for all protocols; computed here if
     not given.

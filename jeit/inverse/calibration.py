@@ -279,7 +279,7 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
     if model.electrodes.is_point:
         contact = "fixed"
     data_norm = np.linalg.norm(measured)
-    # The starting conductivity scales the model's voltages at a conductivity of one to the data.
+    # The starting conductivity is that with which the model's voltages fit the data best.
     unit_voltages = np.where(used, model.voltages(1.0), 0)
     if not (unit_voltages @ measured).real > 0:
         raise ValueError(

@@ -158,8 +158,8 @@ def electrode_misfits(
     """Misfit of the channels that read each of L electrodes, (L,), divided by the median misfit over all electrodes.
 
     `residual` (M,): predicted - measured voltages, volts; `noise` (M,): standard deviation of the channels in volts,
-    see `relative_noise`; `mask`: True for usable channels. Electrodes that no usable channel reads get 1. A misfit far
-    above 1 indicates an electrode whose gain, offset or position differs from the model's.
+    see `relative_noise`; `mask`: True for usable channels. The ratio is 1 for electrodes that no usable channel uses. A
+    misfit far above 1 indicates an electrode whose gain, offset or position differs from the model's.
     """
     used = np.asarray(mask)
     reads_electrode = (np.asarray(protocol.channel_measurement) != 0) & used[:, None]

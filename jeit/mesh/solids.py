@@ -346,8 +346,8 @@ def base_counter(area: float, height: float, num_layers: int | None) -> Callable
 def choose_layers(
     area: float, height: float, num_points: int | None, cell_size: float | None, num_layers: int | None
 ) -> tuple[int | None, int]:
-    """Number of nodes of the base of `area` m² (None if a cell size is specified), and number of layers up to `height`
-    metres."""
+    """Numbers of nodes of the base of `area` m², and of layers up to `height` metres. The number of nodes is None if a
+    cell size is specified."""
     target = unstructured.Target.create(num_points, cell_size)
     if num_layers is not None:
         num_layers = unstructured.check_count("num_layers", num_layers, 1)

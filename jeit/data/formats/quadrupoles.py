@@ -229,7 +229,7 @@ def _read_table(path: Path) -> _QuadrupoleTable:
 
 
 def _header_positions(path: Path, preceding_lines: Sequence[tuple[int, list[str]]]) -> tuple[np.ndarray, int]:
-    """Coordinates of the electrodes, and number of measurements, from the lines before the names of the columns."""
+    """Coordinates of the electrodes, and number of measurements, from the lines above the names of the columns."""
     num_electrodes, num_stated = int(preceding_lines[0][1][0]), int(preceding_lines[-1][1][0])
     try:
         positions = np.array([[float(cell) for cell in cells] for _, cells in preceding_lines[1:-1]])

@@ -19,7 +19,7 @@ from jeit.arguments import counted
 
 # A separator occurs at least so many times in the first lines of a file.
 _MIN_REPEATED = 2
-# Minimum number of complete parts, and maximum share of damaged ones, with which a file is read.
+# A file is read if it has at least this many complete frames and at most this share of damaged ones.
 _MIN_COMPLETE, _MAX_DAMAGED = 2, 0.1
 # Maximum number of characters of a separator in a note.
 _MAX_EXAMPLE = 20
@@ -88,7 +88,7 @@ class Separators:
 
     @property
     def examples(self) -> list[str]:
-        """Texts of the separators between lines of numbers, shortened."""
+        """Text lines between the lines of numbers, shortened for messages."""
         return [separator.text[:_MAX_EXAMPLE] for separator in self.found if separator.line]
 
     def complete(

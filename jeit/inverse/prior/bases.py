@@ -273,7 +273,7 @@ def pixels(mesh: Mesh, shape: tuple[int, int]) -> Int[np.ndarray, " m"]:
     - `mesh`: the mesh of the image.
     - `shape`: numbers of rows and columns of the grid.
 
-    Raises `ValueError` for a shape that is not two whole numbers from 1.
+    Raises `ValueError` for a shape that is not two positive integers.
 
     **Example:**
 

@@ -148,8 +148,8 @@ class QuadraticForm(AbstractPenalty):
 
 
 class AbstractNormal(Module):
-    """Base of normal distributions, with precision Q, of coefficients c (n,); the coefficients of further unknowns come
-    last."""
+    """Base class of normal distributions, with precision Q, of coefficients c (n,); the coefficients of unknowns other
+    than the image come last."""
 
     @abc.abstractmethod
     def covariance_product(self, columns: Float[Array, "n k"]) -> Float[Array, "n k"]:

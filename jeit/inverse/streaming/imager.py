@@ -38,8 +38,8 @@ FRAME_STEPS = 4
 _RTOL = 1e-3
 # Default minimum signal of a shape of the prior (see `Parametrisation.informative`).
 _MIN_SIGNAL = 0.03
-# Ratio of the standard deviation assigned to masked channels to the largest noise. With a larger ratio, covariances of
-# combinations that only masked channels measure could not be inverted in double precision.
+# Standard deviation assigned to masked channels, relative to the largest standard deviation of the noise. With a larger
+# ratio, covariances to which only masked channels contribute would be singular in double precision.
 _MASKED_NOISE_RATIO = 1e3
 
 

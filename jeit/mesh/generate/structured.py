@@ -56,8 +56,8 @@ def choose_rings(num_points: int) -> tuple[int, int]:
     for num_rings in range(max(1, int(guessed_rings) - 1), int(guessed_rings) + 3):
         for num_boundary in range(max(5, int(4.9 * num_rings)), int(7.3 * num_rings) + 2):
             num_nodes = 1 + int(ring_counts(num_rings, num_boundary).sum())
-            # The most regular triangles have six times as many boundary nodes as rings; deviate from this ratio only to
-            # meet the number of nodes.
+            # Triangles are most regular with six times as many boundary nodes as rings. The ratio differs from six only
+            # as far as the number of nodes requires.
             deviation = abs(num_nodes / num_points - 1.0)
             cost = (
                 deviation > 0.03,

@@ -91,8 +91,8 @@ def _label_intervals(ax: Axes, stars: Sequence[Star]) -> None:
 
 
 def draw_inclusions(inclusions: Sequence[Inclusion], *, ax: Axes | None = None) -> Axes:
-    """Mark every inclusion by its sign at its centroid and a dashed circle of its area. In 3-D, the circle has the
-    radius of a ball of the inclusion's volume, for every height of the slice."""
+    """Mark every inclusion by a plus or minus sign at its centroid and a dashed circle of equal area. In 3-D, the
+    circle has the radius of a ball of the inclusion's volume, for every height of the slice."""
     ax = axes_or_new(ax)
     halo = [withStroke(linewidth=3, foreground="white")]
     for inclusion in inclusions:

@@ -37,7 +37,7 @@ _OBJECT_NUMBER = re.compile(r'("__id__": |"file": ")(\d+)')
 
 
 def write_sealed(content: Any, file: BinaryIO) -> None:
-    """Write arrays and estimators, or lists and dictionaries of them, to a ZIP archive with a checksum, the seal."""
+    """Write arrays and estimators, or lists and dictionaries of them, to a ZIP archive with a checksum."""
     from skops.io import dumps
 
     with zipfile.ZipFile(io.BytesIO(dumps(content))) as archive:

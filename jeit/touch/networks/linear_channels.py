@@ -178,7 +178,8 @@ class LinearChannels(NamedTuple):
 def round_relative(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Round values to a millionth of their maximum, or finer, to remove effects of the order of summation.
 
-    After rounding, the same random key gives the same training, whatever the memory addresses of NumPy's arrays.
+    NumPy's order of summation depends on the memory addresses of arrays. After rounding, training depends only on the
+    random key.
     """
     unit = 2.0 ** (np.floor(np.log2(max(float(np.abs(values).max()), 1e-300))) - 20)
     return np.round(values / unit) * unit

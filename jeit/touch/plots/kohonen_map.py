@@ -1,4 +1,4 @@
-"""Plot of a self-organising map: its net of neurons, and a value of each neuron."""
+"""Plot of a self-organising map: its lattice of neurons, and a value of each neuron."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ _MAX_COMPILED_OPERATIONS_CPU, _MAX_COMPILED_OPERATIONS = 5e7, 2e10
 # nodes.
 _OPERATIONS_PER_SECOND = 4e10
 _MULTIGRID_SECONDS, _MULTIGRID_BYTES = 5e-6, 400.0
-# A factorisation is chosen if it takes no longer than this factor times the time of multigrid, which is less accurate.
+# A direct solver is chosen if it takes at most this many times as long as multigrid, which is less accurate.
 _DIRECT_TIME_FACTOR = 1.5
 
 

@@ -118,8 +118,8 @@ def water_level(
     """Compute the level δ at which Σ area · max(δ − gap, 0) equals `volume`, as that of water over ground of height
     `gap`.
 
-    The level is 0 if every gap is infinite. If the m lowest points are under water, δ = (volume + Σ area · gap) / Σ
-    area over these points. This is exact for the smallest m for which the next point is not under water.
+    The level is 0 if every gap is infinite. If the m lowest points are below the level, δ = (volume + Σ area · gap) / Σ
+    area over these points. The result is exact for the smallest m for which the next point is above the level.
     """
     order = np.argsort(gap, axis=-1)
     heights = np.take_along_axis(gap, order, axis=-1)

@@ -56,8 +56,8 @@ class Samples(NamedTuple):
 
     @classmethod
     def from_mesh(cls, mesh: Mesh, face: str = "outer") -> "Samples":
-        """Create the samples of a sheet or a layer. Each cell of a layer bears the pressure on the surface above it; in
-        a curved layer, this surface is its outer or inner `face`."""
+        """Create the sample points of a sheet, or of a layer, whose cells each bear the pressure on the surface above.
+        In a curved layer, this surface is its outer or inner `face`."""
         if is_curved(mesh):
             return cls._from_curved_mesh(mesh, face)
         check_flat(mesh, "these presses")
