@@ -126,7 +126,7 @@ class Wiring:
     @property
     def as_described(self) -> bool:
         """Whether the wiring is the described one."""
-        return not (self.order or self.reversed_signs or self.magnitudes or self._cycles())
+        return not (self.order or self.reversed_signs or self.magnitudes or self._exchange_cycles())
 
     @property
     def fault(self) -> str:
@@ -141,7 +141,7 @@ class Wiring:
     @property
     def explanation(self) -> str:
         """The estimated wiring, in a sentence, with electrodes numbered from 1; empty for the described wiring."""
-        faults = [_exchange_text(self.places, self._cycles())]
+        faults = [_exchange_text(self.places, self._exchange_cycles())]
         faults.append(self.order and f"the channels look ordered {self.order}")
         faults.append(
             'all voltages look to have the opposite sign ([data] polarity = "reversed")' if self.reversed_signs else ""
@@ -153,7 +153,7 @@ class Wiring:
             and f"{description}: so taken the misfit is {percent(self.misfit)}, as described {percent(self.described)}."
         )
 
-    def _cycles(self) -> list[list[int]]:
+    def _exchange_cycles(self) -> list[list[int]]:
         """Cycles of the permutation of electrodes: each electrode is at the place of the next in its cycle."""
         cycles, moved = [], {k for k, place in enumerate(self.places) if place != k}
         while moved:

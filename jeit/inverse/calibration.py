@@ -58,7 +58,7 @@ def traced_fit(model: ForwardModel, measured: Float[Array, " M"], used, contact:
     frozen_start, frozen_problem = undifferentiated((start, problem))
     solution = optx.least_squares(residual, optimiser, frozen_start, frozen_problem, max_steps=max_steps, throw=False)
     parameters = as_minimum(
-        solution.value, problem, partial(_gradient, contact), partial(_inverse_normal_product, contact)
+        solution.value, problem, partial(_gradient, contact), partial(_normal_equations_solver, contact)
     )
     fitted_model, conductivity = _fitted_model(contact, parameters, model)
     final_residual = residual(parameters, problem)
@@ -104,7 +104,7 @@ def _normal_matrix(contact: str, parameters, problem):
     return jacobian.T @ jacobian
 
 
-def _inverse_normal_product(contact: str, parameters, problem):
+def _normal_equations_solver(contact: str, parameters, problem):
     """Function that multiplies a vector by the inverse of the normal matrix JᵀJ."""
     inverse = symmetric_inverse(_normal_matrix(contact, parameters, problem))
     return lambda vector: inverse @ vector

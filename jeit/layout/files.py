@@ -58,7 +58,7 @@ def read_layout(path: str | Path, *, outline: Domain | None = None) -> Layout:
     ```
     """
     path = Path(path)
-    reader = _for_suffix(path, _READERS)
+    reader = _function_for_suffix(path, _READERS)
     if not path.is_file():
         raise FileNotFoundError(f"path: there is no file {path}. Check the name and the working directory.")
     try:
@@ -93,7 +93,7 @@ def write_layout(layout: Layout | SurfaceLayout, path: str | Path) -> None:
     ```
     """
     path = Path(path)
-    writer = _for_suffix(path, _WRITERS)
+    writer = _function_for_suffix(path, _WRITERS)
     if isinstance(layout, SurfaceLayout) and writer is not write_csv:
         raise ValueError(f"path: drawings are flat, and '{layout.name}' is of a curved skin; give a name in .csv.")
     if not isinstance(layout, Layout | SurfaceLayout):
@@ -105,7 +105,7 @@ def write_layout(layout: Layout | SurfaceLayout, path: str | Path) -> None:
         raise ValueError(f"path: {path} cannot be written: {error.strerror}. Is there such a folder?") from None
 
 
-def _for_suffix(path: Path, table: dict):
+def _function_for_suffix(path: Path, table: dict):
     suffix = path.suffix.lower()
     if suffix not in table:
         raise ValueError(f"path: {path} ends with none of {', '.join(table)}, which give the format of a layout.")

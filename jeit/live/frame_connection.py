@@ -17,7 +17,7 @@ from contextlib import suppress
 from typing import Any
 
 from jeit.arguments.extras import optional
-from jeit.data.formats.lines import LineBuffer, LineReading
+from jeit.data.formats.lines import LineBuffer, LineParser
 from jeit.live.pictures import LiveFrame
 from jeit.live.sources import CONNECTED, ENDED, AbstractSource
 
@@ -130,7 +130,7 @@ class SerialPort(AbstractConnection):
         return []
 
 
-class Server(AbstractConnection):
+class TcpServer(AbstractConnection):
     """Connection to a TCP server that sends frames to all connected clients."""
 
     def __init__(self, host: str, port: int):
@@ -179,7 +179,7 @@ def connection_to(text: str) -> AbstractConnection:
     host = host.removeprefix("[").removesuffix("]")
     if not host or not (port.isascii() and port.isdigit() and len(port) < 6 and 0 < int(port) < 65536):
         raise ValueError(f"source '{text[:80]}': give tcp:HOST:PORT, such as tcp:192.168.4.1:5000.")
-    return Server(host, int(port))
+    return TcpServer(host, int(port))
 
 
 class LineSource(AbstractSource):
@@ -190,7 +190,7 @@ class LineSource(AbstractSource):
     `rate`: maximum frame rate, frames/s, at which lines that have all arrived already are delivered.
     """
 
-    def __init__(self, name: str, connection: AbstractConnection, reading: LineReading, rate: float | None = None):
+    def __init__(self, name: str, connection: AbstractConnection, reading: LineParser, rate: float | None = None):
         super().__init__(name)
         self.device, self.reading, self.rate = connection, reading, rate
         self._last_note, self._note_time = "", -float("inf")

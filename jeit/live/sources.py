@@ -251,10 +251,10 @@ def open_source(
         return open_simulated(text, rate)
     scheme = text.partition(":")[0]
     if text == "-" or scheme in ("serial", "tcp"):
-        from jeit.data.formats.lines import LineReading
+        from jeit.data.formats.lines import LineParser
         from jeit.live.frame_connection import LineSource, ReadAhead, connection_to
 
-        return ReadAhead(LineSource(text, connection_to(text), LineReading(description, reference), rate))
+        return ReadAhead(LineSource(text, connection_to(text), LineParser(description, reference), rate))
     path = Path(text)
     if text and path.is_dir():
         return WatchedFolder(path, description, reference, rate)

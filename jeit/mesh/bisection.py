@@ -128,7 +128,7 @@ def cut(mesh: Mesh, level: Callable[[Float[np.ndarray, "n s"]], Float[np.ndarray
         crossed_cells = np.flatnonzero(side.min(axis=1) * side.max(axis=1) < 0)
         if not len(crossed_cells):
             return split_mesh.mesh(mesh.tags)
-        crossed_cells = np.flatnonzero(_is_node_of(cells[crossed_cells], len(points))[cells].any(axis=1))
+        crossed_cells = np.flatnonzero(_is_node_used_by(cells[crossed_cells], len(points))[cells].any(axis=1))
         edges, edge_indices, rank = _edges(points, cells[crossed_cells])
         is_crossed = np.prod(np.sign(levels)[edges], axis=1) < 0
         split_edges = edges[is_crossed & _is_longest_around(edge_indices, np.where(is_crossed, rank, -1))]
@@ -216,14 +216,14 @@ def _move_nodes_onto(split_mesh: _SplitMesh, level) -> tuple[_SplitMesh, Float[n
         distance.ravel()[order],
         np.repeat(crossings, 2, axis=0)[order],
     )
-    is_moved = (nearest_distance < _MAX_MOVE) & ~_is_node_of(split_mesh.facets, len(points))
+    is_moved = (nearest_distance < _MAX_MOVE) & ~_is_node_used_by(split_mesh.facets, len(points))
     volumes_before = _volumes(points, cells)
     while True:
         moved_points = np.where(is_moved[:, None], target, points)
         is_crushed = _volumes(moved_points, cells) < _MIN_VOLUME_RATIO * volumes_before
         if not is_crushed.any():
             return replace(split_mesh, points=moved_points), np.where(is_moved, 0, levels)
-        is_moved &= ~_is_node_of(cells[is_crushed], len(points))
+        is_moved &= ~_is_node_used_by(cells[is_crushed], len(points))
 
 
 def _zero_on_edges(
@@ -286,7 +286,7 @@ def _is_longest_around(edge_indices, rank) -> Bool[np.ndarray, " e"]:
     )
 
 
-def _is_node_of(simplices, num_points: int) -> Bool[np.ndarray, " n"]:
+def _is_node_used_by(simplices, num_points: int) -> Bool[np.ndarray, " n"]:
     """Whether each node belongs to any of the simplices."""
     is_node = np.zeros(num_points, bool)
     is_node[simplices] = True
@@ -295,7 +295,7 @@ def _is_node_of(simplices, num_points: int) -> Bool[np.ndarray, " n"]:
 
 def _with_two_nodes(simplices, edges, num_points: int) -> Int[np.ndarray, " c"]:
     """Indices of the simplices with at least two nodes that belong to any of the edges."""
-    is_node = _is_node_of(edges, num_points).astype(np.int8)
+    is_node = _is_node_used_by(edges, num_points).astype(np.int8)
     return np.flatnonzero(sum(is_node[nodes] for nodes in simplices.T) > 1)  # quicker than sum(axis=1)
 
 

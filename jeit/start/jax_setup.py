@@ -145,7 +145,7 @@ def _processor() -> str:
 def _discard_oldest(folder: Path) -> None:
     """Delete the least recently used cached programs beyond the limits on number and size. Also delete empty files,
     which a full disk leaves behind, and which JAX cannot read."""
-    files = sorted(_file_usage(folder), reverse=True)
+    files = sorted(_last_uses_of_files(folder), reverse=True)
     total_bytes = 0
     for file_index, (_, num_bytes, path) in enumerate(files):
         total_bytes += num_bytes
@@ -153,7 +153,7 @@ def _discard_oldest(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def _file_usage(folder: Path) -> Iterator[tuple[float, int, Path]]:
+def _last_uses_of_files(folder: Path) -> Iterator[tuple[float, int, Path]]:
     """Time of last use, size in bytes, and path of each file in the cache folder."""
     for path in folder.glob("*/*"):
         with contextlib.suppress(FileNotFoundError):  # another process may delete the file

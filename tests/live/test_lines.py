@@ -7,7 +7,7 @@ import pytest
 from small_sensor import CHANNELS, description, measured, noisy
 
 from jeit.data import read
-from jeit.data.formats.lines import LineBuffer, LineReading
+from jeit.data.formats.lines import LineBuffer, LineParser
 
 
 def pieces(content, longest):
@@ -75,7 +75,7 @@ def test_a_line_has_the_volts_that_the_reader_finds_in_a_file(kind, tmp_path):
     frames = noisy(3, seed=1)
     (tmp_path / "sensor.csv").write_text("".join(write(one.tolist()) + "\n" for one in frames[:1]))
     expected = np.asarray(read(tmp_path / "sensor.csv", description=described, like=measured()).voltages)
-    reading = LineReading(described, measured())
+    reading = LineParser(described, measured())
     found = [frame_in(reading, write(one.tolist()).encode()) for one in frames]
     np.testing.assert_allclose(found[0], expected[0], rtol=1e-12)
     np.testing.assert_allclose(np.stack(found), frames, rtol=1e-9)
@@ -93,7 +93,7 @@ def test_openeit_lines_have_the_volts_of_its_reader(tmp_path):
         "contact_impedance = 1e-3\n"
     )
     expected = read(tmp_path / "openeit.txt", description=described)
-    reading = LineReading(described, expected)
+    reading = LineParser(described, expected)
     for _ in range(2):
         found = frame_in(reading, line.strip().encode())
         np.testing.assert_allclose(found[found == found], np.asarray(expected.voltages)[0][found == found], rtol=1e-9)
@@ -101,7 +101,7 @@ def test_openeit_lines_have_the_volts_of_its_reader(tmp_path):
 
 
 def test_a_disturbed_first_frame_does_not_fix_signs():
-    reading = LineReading(None, measured())
+    reading = LineParser(None, measured())
     first = np.random.default_rng(0).uniform(1e-3, 1e-2, CHANNELS)
     assert (frame_in(reading, ", ".join(map(repr, first.tolist())).encode()) < 0).any()  # taken for magnitudes
     frame = noisy(1)[0]
@@ -110,7 +110,7 @@ def test_a_disturbed_first_frame_does_not_fix_signs():
 
 def test_a_channel_that_one_frame_has_wrong_is_known_from_the_next():
     """In the first frame the reader masks one channel, and another is zero."""
-    reading, frames = LineReading(None, measured()), noisy(3)
+    reading, frames = LineParser(None, measured()), noisy(3)
     first = frames[0].copy()
     first[[2, 9]] = 0.0, 1e3
     for values in (first, *frames[1:]):
@@ -123,7 +123,7 @@ GARBAGE = [b"\xff\xfe\x00\x01", b"hello", b"1, 2, x", b"\x00" * 50, b",,,,", "½
 
 @pytest.mark.parametrize("line", GARBAGE)
 def test_garbage_is_text_or_numbers_of_another_number(line):
-    found = LineReading(None, measured())(line)
+    found = LineParser(None, measured())(line)
     assert found is not None
     assert len(found) <= 400 if isinstance(found, str) else len(found) != CHANNELS
 
@@ -153,7 +153,7 @@ def corrupted(content, random):
 @pytest.mark.parametrize("word", ["", "magnitudes : "])
 def test_corrupted_lines_are_frames_or_text_and_leave_the_others_correct(word):
     """Half of the lines are corrupted at random, from the first on."""
-    reading, buffer, random = LineReading(None, measured()), LineBuffer(5000), np.random.default_rng(0)
+    reading, buffer, random = LineParser(None, measured()), LineBuffer(5000), np.random.default_rng(0)
     frames, right = noisy(400), 0
     for number, values in enumerate(frames):
         line = (word + ", ".join(map(repr, (abs(values) if word else values).tolist()))).encode()
@@ -169,7 +169,7 @@ def test_corrupted_lines_are_frames_or_text_and_leave_the_others_correct(word):
 
 
 def test_gaps_and_non_numeric_words_become_nan_and_comments_notes():
-    reading = LineReading()
+    reading = LineParser()
     np.testing.assert_array_equal(reading(b"1,,nan,4"), [1, np.nan, np.nan, 4])
     assert reading(b"# ready, 16 electrodes") is None
     assert reading.note == "# ready, 16 electrodes"
@@ -177,13 +177,13 @@ def test_gaps_and_non_numeric_words_become_nan_and_comments_notes():
 
 def test_frames_of_two_lines_are_refused_with_advice(tmp_path):
     with pytest.raises(ValueError, match="complex_pairs makes a frame of two lines"):
-        LineReading(description(tmp_path / "d.toml", "complex_pairs = true\n"))
+        LineParser(description(tmp_path / "d.toml", "complex_pairs = true\n"))
 
 
 def test_numbers_without_a_reader_are_volts_with_a_note():
     frame = noisy(1)[0]
     sensor = measured()
-    reading = LineReading(None, sensor)
+    reading = LineParser(None, sensor)
     reading._read_volts = lambda row, word: (_ for _ in ()).throw(ValueError("no table"))
     np.testing.assert_array_equal(reading(", ".join(map(repr, frame.tolist())).encode()), frame)
     assert "no table" in reading.note

@@ -327,7 +327,7 @@ def test_latency_is_of_displayed_pictures():
         now = time.monotonic()
         for number, ago in ((1, 9.0), (2, 0.03)):
             viewer.note_sent(number, now - ago)
-        assert not viewer.ready_for(3)
+        assert not viewer.is_ready_for(3)
         viewer.note_drawn(2, hidden=False)
         viewer.note_sent(3, now - 60)
         viewer.note_drawn(3, hidden=True)

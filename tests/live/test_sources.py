@@ -11,9 +11,9 @@ import pytest
 from small_sensor import CHANNELS, measured, noisy
 
 from jeit.data import write_table
-from jeit.data.formats.lines import LineReading
+from jeit.data.formats.lines import LineParser
 from jeit.live import frame_connection, preparation
-from jeit.live.frame_connection import LineSource, ReadAhead, SerialPort, Server, StandardInput, connection_to
+from jeit.live.frame_connection import LineSource, ReadAhead, SerialPort, StandardInput, TcpServer, connection_to
 from jeit.live.preparation import first_frames
 from jeit.live.sources import AbstractSource, PlayedRecording, WatchedFolder, open_source
 
@@ -78,7 +78,7 @@ def _soon(monkeypatch):
 @posix
 def test_lines_of_a_pipe_with_garbage_between_them():
     read, write = os.pipe()
-    with Reading(LineSource("-", StandardInput(read), LineReading(None, measured()))) as reading:
+    with Reading(LineSource("-", StandardInput(read), LineParser(None, measured()))) as reading:
         content = line(FRAMES[0])
         os.write(write, content[:50])
         time.sleep(0.05)
@@ -124,7 +124,7 @@ def test_lines_that_have_all_arrived_are_the_reference_as_far_as_a_second_reads_
 @posix
 def test_frames_that_wait_for_the_program_keep_the_time_of_their_arrival():
     read, write = os.pipe()
-    source = ReadAhead(LineSource("-", StandardInput(read), LineReading()))
+    source = ReadAhead(LineSource("-", StandardInput(read), LineParser()))
     for values in FRAMES[:3]:
         os.write(write, line(values))
         time.sleep(0.1)
@@ -144,7 +144,7 @@ def test_a_source_is_closed_if_what_is_prepared_for_it_fails(monkeypatch):
     sources = []
 
     def opened(*_, **__):
-        sources.append(ReadAhead(LineSource("-", StandardInput(read), LineReading())))
+        sources.append(ReadAhead(LineSource("-", StandardInput(read), LineParser())))
         return sources[-1]
 
     monkeypatch.setattr(preparation, "open_source", opened)
@@ -163,7 +163,7 @@ def test_frames_beyond_those_that_can_wait_are_counted(monkeypatch):
     monkeypatch.setattr(frame_connection, "_MAX_WAITING_FRAMES", 4)
     read, write = os.pipe()
     os.write(write, b"".join(map(line, FRAMES)))
-    lines = LineSource("-", StandardInput(read), LineReading())
+    lines = LineSource("-", StandardInput(read), LineParser())
     source = ReadAhead(lines)
     while lines._num_frames < len(FRAMES):
         time.sleep(0.005)
@@ -183,7 +183,7 @@ def test_a_loss_at_the_end_is_reported_too(monkeypatch):
     read, write = os.pipe()
     os.write(write, b"".join(map(line, FRAMES)))
     os.close(write)
-    source = ReadAhead(LineSource("-", StandardInput(read), LineReading()))
+    source = ReadAhead(LineSource("-", StandardInput(read), LineParser()))
     while source.connection != "ended":
         time.sleep(0.005)
     assert [frame.number for frame in source] == [0, 1, 2, 3]
@@ -196,7 +196,7 @@ def test_available_lines_are_replayed_at_a_rate():
     read, write = os.pipe()
     os.write(write, b"".join(map(line, FRAMES)))
     os.close(write)
-    source = LineSource("-", StandardInput(read), LineReading(), rate=100)
+    source = LineSource("-", StandardInput(read), LineParser(), rate=100)
     seconds = [one.second for one in source]
     assert are_due(seconds, np.arange(12) / 100)
     os.close(read)
@@ -276,7 +276,7 @@ def test_a_source_ends_with_its_server_on_request():
 def test_a_missing_server_is_awaited_and_can_be_cancelled():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-    with Reading(LineSource("tcp", Server("127.0.0.1", port), LineReading())) as reading:
+    with Reading(LineSource("tcp", TcpServer("127.0.0.1", port), LineParser())) as reading:
         reading.wait(lambda: reading.source.connection.startswith("waiting"))
     assert sum("Not connected" in text for _, text in reading.source.messages) == 1
 
@@ -284,7 +284,7 @@ def test_a_missing_server_is_awaited_and_can_be_cancelled():
 def test_a_silent_device_is_reported(monkeypatch):
     monkeypatch.setattr(frame_connection, "_SILENCE_TIMEOUT", 0.05)
     listening = socket.create_server(("127.0.0.1", 0))
-    source = LineSource("tcp", Server("127.0.0.1", listening.getsockname()[1]), LineReading())
+    source = LineSource("tcp", TcpServer("127.0.0.1", listening.getsockname()[1]), LineParser())
     with Reading(source) as reading:
         peer, _ = listening.accept()
         reading.wait(lambda: source.connection == "waiting: the device sends nothing")
@@ -367,7 +367,7 @@ def test_a_text_that_names_no_source_is_refused_with_advice(text):
 
 def test_addresses_are_parsed():
     server = connection_to("tcp:[::1]:5000")
-    assert isinstance(server, Server)
+    assert isinstance(server, TcpServer)
     assert (server.host, server.port) == ("::1", 5000)
     with contextlib.suppress(ImportError):
         device = connection_to("serial:/dev/serial/by-id/usb-A@B@57600")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from small_sensor import CHANNELS, measured, noisy
 
-from jeit.data.formats.lines import LineReading
+from jeit.data.formats.lines import LineParser
 from jeit.data.formats.separated import WrappedLines
 
 LENGTH = CHANNELS // 4
@@ -16,7 +16,7 @@ def lines_of(frame, separator="s"):
 
 
 def read_lines(lines):
-    reading = LineReading(None, measured())
+    reading = LineParser(None, measured())
     return [found for line in lines if (found := reading(line.encode())) is not None]
 
 

@@ -120,7 +120,7 @@ def stream(
     from jeit.arguments import counted
     from jeit.cli.console import Steps, plain_console, say_written, with_unit
     from jeit.cli.streams import FrameCounter, Stopping
-    from jeit.data.formats.lines import LineReading, read_lines
+    from jeit.data.formats.lines import LineParser, read_lines
     from jeit.data.frame_checks import mask_spikes
     from jeit.imaging.stream_preparation import StreamSettings, frames_of, prepare_imager
     from jeit.inverse import stream as stream_images
@@ -172,7 +172,7 @@ def stream(
             imager, calibration = prepare_imager(reference_measurement, settings, measurement=measured, progress=step)
         if data == "-":
             frames, num_frames = (
-                read_lines(getattr(sys.stdin, "buffer", sys.stdin), LineReading(description, reference_measurement)),
+                read_lines(getattr(sys.stdin, "buffer", sys.stdin), LineParser(description, reference_measurement)),
                 None,
             )
         else:

@@ -122,13 +122,13 @@ def _keys(
     preamble = "as many numbers as a frame's are in" if fitting_shapes else "there are"
     usual_names = ", ".join(REFERENCE_NAMES + OBJECT_NAMES)
     raise ValueError(
-        f"{path.name}: none of {usual_names} is there; {preamble} {_list_shapes(fitting_shapes or shapes)}. "
+        f"{path.name}: none of {usual_names} is there; {preamble} {_shapes_text(fitting_shapes or shapes)}. "
         "Name the array of frames by key=, or by [data] keys in the description; --reference-key names that of the "
         "reference."
     )
 
 
-def _list_shapes(shapes: dict[str, tuple[int, ...]]) -> str:
+def _shapes_text(shapes: dict[str, tuple[int, ...]]) -> str:
     return (
         names_text([f"{name} ({' × '.join(map(str, shape))})" for name, shape in shapes.items()])
         if shapes

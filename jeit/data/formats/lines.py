@@ -82,7 +82,7 @@ def _split_at_words(line: bytes) -> list[bytes]:
     return [piece for piece in pieces if piece.strip()]
 
 
-class LineReading:
+class LineParser:
     """Converts lines of numbers to frames (channels,) in volts, as `jeit.data.read` converts a file of the same lines.
 
     `description`, `reference`: as `description` and `like` of `jeit.data.read`. The factor from number to volts of each
@@ -213,7 +213,7 @@ class LineReading:
         return np.where(usable, np.real(np.asarray(self.reference.voltages)).mean(axis=0), np.nan)
 
 
-def read_lines(lines: Iterable[str | bytes], reading: LineReading) -> Iterator[Float[np.ndarray, " M"] | str]:
+def read_lines(lines: Iterable[str | bytes], reading: LineParser) -> Iterator[Float[np.ndarray, " M"] | str]:
     """Yield the frames of lines of text as they arrive, in volts, and the text of lines that are not frames."""
     for line in lines:
         found = reading(line if isinstance(line, bytes) else line.encode()) if line.strip() else None

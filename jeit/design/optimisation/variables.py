@@ -180,19 +180,19 @@ class Variables(Module):
         _, radii, contact_impedance, thickness = self.initial
         if self.sizes is not None:
             radii, remaining_variables = (
-                self._values_of_images(self.sizes.values(remaining_variables[:num_generators])),
+                self._values_of_mirror_images(self.sizes.values(remaining_variables[:num_generators])),
                 remaining_variables[num_generators:],
             )
         if self.contacts is not None:
             contact_impedance, remaining_variables = (
-                self._values_of_images(self.contacts.values(remaining_variables[:num_generators])),
+                self._values_of_mirror_images(self.contacts.values(remaining_variables[:num_generators])),
                 remaining_variables[num_generators:],
             )
         if self.thickness is not None:
             thickness = self.thickness.values(remaining_variables)[0]
         return LayoutParameters(centres[self.order], radii, contact_impedance, thickness)
 
-    def _values_of_images(self, values: Float[Array, " G"]) -> Float[Array, " L"]:
+    def _values_of_mirror_images(self, values: Float[Array, " G"]) -> Float[Array, " L"]:
         """Repeat the values (G,) of the generators for their images: values (L,) of all electrodes."""
         return jnp.tile(values, len(self.images))[self.order]
 

@@ -215,7 +215,7 @@ async def _send_pictures(hub: Hub, viewer: Viewer, websocket: WebSocket) -> None
         if viewer.wants_state():
             await websocket.send_text(hub.state_message(viewer))
         newest = hub.newest()
-        if newest is not None and viewer.ready_for(newest[0].frame.number):
+        if newest is not None and viewer.is_ready_for(newest[0].frame.number):
             viewer.note_sent(newest[0].frame.number, newest[0].frame.arrived)
             await websocket.send_bytes(newest[1])
 

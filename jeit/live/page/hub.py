@@ -38,7 +38,7 @@ class Viewer:
         self._in_flight: deque[tuple[int, float]] = deque()
         self._drawn_latencies: deque[tuple[float, float]] = deque(maxlen=2000)
 
-    def ready_for(self, number: int) -> bool:
+    def is_ready_for(self, number: int) -> bool:
         """Whether the picture with the frame number `number` may be sent to the page now."""
         return self.following and number > self._last_sent and len(self._in_flight) < _MAX_IN_FLIGHT
 

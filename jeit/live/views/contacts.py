@@ -42,13 +42,13 @@ class StepwiseGenerator(Generic[Item, Output]):
 
     def __init__(self, generate: Callable[[Iterable[Item]], Iterator[Output]]):
         self._items: list[Item] = []
-        self._results = generate(self._take_items())
+        self._results = generate(self._queued_items())
 
     def __call__(self, item: Item) -> Output:
         self._items.append(item)
         return next(self._results)
 
-    def _take_items(self) -> Iterator[Item]:
+    def _queued_items(self) -> Iterator[Item]:
         while True:
             yield self._items.pop()
 

@@ -2,8 +2,8 @@
 estimators without pickle.
 
 A file is a ZIP archive. Equal content gives equal bytes: the objects, which skops numbers by their memory addresses,
-are renumbered in order of appearance, and the time of writing is not stored. A checksum, the seal, detects files that
-were changed after jeit wrote them. The seal is computed without a secret key, so it does not prove who wrote the file.
+are renumbered in order of appearance, and the time of writing is not stored. A checksum detects files that
+were changed after jeit wrote them. It is computed without a secret key, so it does not prove who wrote the file.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _SCHEMA_FILE = "schema.json"
 _OBJECT_NUMBER = re.compile(r'("__id__": |"file": ")(\d+)')
 
 
-def write_sealed(content: Any, file: BinaryIO) -> None:
+def write_with_checksum(content: Any, file: BinaryIO) -> None:
     """Write arrays and estimators, or lists and dictionaries of them, to a ZIP archive with a checksum."""
     from skops.io import dumps
 
@@ -53,18 +53,18 @@ def write_sealed(content: Any, file: BinaryIO) -> None:
     with zipfile.ZipFile(file, "w") as archive:
         for name, values in renamed_members.items():
             archive.writestr(zipfile.ZipInfo(name), values)
-        archive.comment = _seal(renamed_members)
+        archive.comment = _checksum(renamed_members)
 
 
-def check_seal(path: Path) -> None:
-    """Check the checksum (seal) of an archive. Raises `ValueError` if the archive was changed after it was written."""
+def verify_checksum(path: Path) -> None:
+    """Verify the checksum of an archive. Raises `ValueError` if the archive was changed after it was written."""
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
-        if archive.comment != _seal(members):
+        if archive.comment != _checksum(members):
             raise ValueError("it was changed since it was written, or an earlier jeit wrote it")
 
 
-def _seal(members: dict[str, bytes]) -> bytes:
+def _checksum(members: dict[str, bytes]) -> bytes:
     """Compute the checksum of the names and contents of the files in an archive."""
     digest = hashlib.sha256()
     for name in sorted(members):
@@ -161,7 +161,7 @@ def write_plain(path: str | Path, kind: str, version: int, fields_by_name: dict[
     if Path(path).is_dir():
         raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / example}.")
     with written_whole(path) as file:
-        write_sealed({"kind": kind, "version": version, "skin": _to_plain(fields_by_name)}, file)
+        write_with_checksum({"kind": kind, "version": version, "skin": _to_plain(fields_by_name)}, file)
 
 
 def read_plain(path: Path, kind: str, version: int, description: str, make: Callable[[dict[str, Any]], Any]) -> Any:
@@ -184,7 +184,7 @@ def read_plain(path: Path, kind: str, version: int, description: str, make: Call
             raise ValueError("it is of another kind")
         if content["version"] != version:
             raise ValueError(f"it is of version {describe(content['version'])}, and this jeit reads {version}")
-        check_seal(path)
+        verify_checksum(path)
         fields_by_name: Any = _from_plain(content["skin"])
         return make(fields_by_name)
     except Exception as error:  # any exception: the file may create objects of many packages
