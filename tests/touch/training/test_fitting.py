@@ -206,7 +206,7 @@ def test_every_epoch_uses_each_row_at_most_once():
 
 
 class Counting(eqx.Module):
-    """A line, an offset that is not trained, and a count of the batches."""
+    """A line, an offset that is not trained, and the number, sum and sum of squares of a random number per batch."""
 
     slope: jax.Array
     offset: jax.Array
@@ -214,25 +214,29 @@ class Counting(eqx.Module):
 
 
 def test_leaves_that_are_not_trained():
-    """They change only by what the loss assigns to them."""
+    """They change only by what the loss assigns to them. Every batch has a random key of its own."""
 
     def line(own, batch, key):
         inputs, targets = batch
         value = jnp.mean((own.slope * inputs[:, :1] + own.offset - targets) ** 2)
-        return value, eqx.tree_at(lambda one: one.seen, own, own.seen + 1.0)
+        drawn = jax.random.uniform(key)
+        return value, eqx.tree_at(lambda one: one.seen, own, own.seen + jnp.stack([jnp.ones(()), drawn, drawn**2]))
 
     def each(own, batch):
         return (own.slope * batch[0][:, 0] + own.offset - batch[1][:, 0]) ** 2
 
     inputs = np.linspace(-1, 1, 128)[:, None]
-    start = Counting(*(jnp.asarray(value) for value in (0.0, 0.5, 0.0)))
+    start = Counting(*(jnp.asarray(value) for value in (0.0, 0.5, np.zeros(3))))
     wanted = Counting(True, False, False)  # pyright: ignore[reportArgumentType]
     plan = TrainingPlan(rate=0.05, batch=32, epochs=100, patience=100)
     given = inputs, 2 * inputs + 0.5
     found = fit_network(start, TrainingObjective(line, each, wanted), given, given, plan, key=KEY)
     assert float(found.network.slope) == pytest.approx(2, abs=1e-2)
     assert float(found.network.offset) == 0.5
-    assert float(found.network.seen) == found.course.steps[found.course.best]
+    number, total, total_of_squares = np.asarray(found.network.seen)
+    assert number == found.course.steps[found.course.best]
+    assert total / number == pytest.approx(0.5, abs=0.1)
+    assert total_of_squares / number - (total / number) ** 2 == pytest.approx(1 / 12, rel=0.2)
 
 
 @pytest.mark.parametrize(
