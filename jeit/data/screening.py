@@ -95,7 +95,7 @@ def screen(
         np.broadcast_to(is_dead[:, None], values.shape), f"all zero: {int(is_dead.sum())} of {len(is_dead)} frames."
     )
     exclude(_find_saturated(values, usable, saturation), "saturated (stuck at an end of the instrument's range).")
-    is_dead, is_alive = _current_flow(values, usable, protocol)
+    is_dead, is_alive = _drives_without_and_with_current(values, usable, protocol)
     exclude(is_dead[:, np.asarray(protocol.drive_index)], "their drive's current did not flow.")
     driven, reads = (np.asarray(patterns) != 0 for patterns in (protocol.drive, protocol.channel_measurement))
     unconnected = (is_dead @ driven) & ~(is_alive @ driven)
@@ -185,7 +185,7 @@ def _is_minimum_repeated(rows: np.ndarray) -> Bool[np.ndarray, " F"]:
     return smallest.min(axis=1) == smallest.max(axis=1)
 
 
-def _current_flow(
+def _drives_without_and_with_current(
     values: np.ndarray, usable: np.ndarray, protocol: Protocol
 ) -> tuple[Bool[np.ndarray, "F S"], Bool[np.ndarray, "F S"]]:
     """Masks (frames, drives) of the drives without current, whose voltages are a thousand times smaller than the

@@ -220,7 +220,7 @@ def amplitude_spectrum(
     values: ArrayLike, times: ArrayLike, *, window: Window = "hann"
 ) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "K ..."]]:
     """Amplitude spectrum of values. Returns K frequencies in hertz, from one period in the measured time to half the
-    frame rate in steps of half the resolution, and the amplitudes (K, …) in the unit of the values. A single
+    frame rate in steps of half the resolution, and the amplitudes (K, …) in the unit of the values. A sinusoidal
     oscillation appears as a peak as high as its amplitude.
 
     The mean of the values over time is subtracted first. Frames with NaN are left out.

@@ -128,7 +128,7 @@ class FileNumbers:
         """Read the numbers in a file; `key`: name of the array of frames; `excluded`: an array without frames. Raises
         `ValueError` for a file that cannot be read, or if the array of frames is not determined."""
         if path.suffix.lower() in (".mat", ".npz", ".npy"):
-            table, axis = _array(path, key, excluded)
+            table, axis = _read_array(path, key, excluded)
             shape = " × ".join(map(str, table.shape))
             sizes = tuple(sorted({*table.shape, table.size}, reverse=True))
             return cls(
@@ -170,7 +170,7 @@ def spread_of(rows: np.ndarray) -> float:
     return float(np.linalg.norm(values - values.mean(axis=0))) / norm if norm else 0.0
 
 
-def _array(path: Path, key: str | None, excluded: str | None) -> tuple[np.ndarray, str]:
+def _read_array(path: Path, key: str | None, excluded: str | None) -> tuple[np.ndarray, str]:
     """The array of frames in a file, and whether its frames are usually its "rows" or its "columns"."""
     if path.suffix.lower() == ".npy":
         return np.atleast_2d(npy_array(path)), "rows"

@@ -1,4 +1,4 @@
-"""Reading of saved images, and drawing them from other views."""
+"""Read saved images, and draw them in other views."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse import RULES, Laplace, Noser, choose_hyperparameter, compare_rules, one_step
 from jeit.inverse.hyperparameter.choice import Choice
-from jeit.inverse.hyperparameter.rules import best_resolution, blur_radius, choose, discrepancy, spread_cells
+from jeit.inverse.hyperparameter.rules import best_resolution, blur_radius, choose, discrepancy, select_spread_cells
 from jeit.inverse.linearisation import Linearisation
 from jeit.inverse.spectrum import Spectrum
 from jeit.layout import ring
@@ -146,7 +146,7 @@ def test_noise_figure_does_not_depend_on_the_order_of_cells(model):
 def test_blur_radius_is_that_of_explicit_point_spreads(linear, model):
     """Against R J_t of the definition, and its half-amplitude area with simulated noise."""
     mesh, spectrum = model.mesh, linear.spectrum
-    targets, area = spread_cells(mesh, 6), np.asarray(measures(mesh))
+    targets, area = select_spread_cells(mesh, 6), np.asarray(measures(mesh))
     largest = float(jnp.sqrt(spectrum.eigenvalues.max()))
     candidates = largest * np.array([1e-3, 0.03, 1.0])
     radius = blur_radius(spectrum, mesh, targets, candidates, signal_to_noise=2.0)
@@ -166,7 +166,7 @@ def test_blur_radius_is_that_of_explicit_point_spreads(linear, model):
 
 def test_best_resolution_is_the_least_mean_blur(linear, model, data):
     choice = RULES["best-resolution"](linear.spectrum, data, model.mesh)
-    targets = spread_cells(model.mesh, 30)
+    targets = select_spread_cells(model.mesh, 30)
     expected = blur_radius(linear.spectrum, model.mesh, targets, np.asarray(choice.candidates)).mean(axis=1)
     np.testing.assert_allclose(choice.criterion, expected)
     assert choice.hyperparameter == choice.candidates[np.argmin(expected)]
@@ -179,7 +179,7 @@ def test_best_resolution_is_the_least_mean_blur(linear, model, data):
 
 @pytest.mark.parametrize("mesh", [disk(0.1, num_points=500), box(0.2, 0.1, 0.1, num_points=400)], ids=["disk", "box"])
 def test_targets_are_distributed_over_the_body(mesh):
-    targets = spread_cells(mesh, 30)
+    targets = select_spread_cells(mesh, 30)
     assert 20 <= targets.size <= 40
     place = np.asarray(centroids(mesh))
     spacing = (float(measures(mesh).sum()) / 30) ** (1 / mesh.dimension)

@@ -23,7 +23,7 @@ from jeit_solvers import (
     on_cores,
 )
 from jeit_solvers.sparse import choose, exact_fronts, exact_fronts_numpy
-from jeit_solvers.sparse.operator import LastMatrix
+from jeit_solvers.sparse.operator import LastMatrixCache
 
 TOLERANCE = 5e-15
 SPREAD = (sparse_problems.disk, sparse_problems.box)
@@ -217,7 +217,7 @@ def test_right_hand_sides_of_every_kind():
 
 def test_the_last_factor_is_reused_unless_it_is_large(monkeypatch):
     made = []
-    monkeypatch.setattr(exact_fronts_numpy, "_LAST_FACTOR", LastMatrix())
+    monkeypatch.setattr(exact_fronts_numpy, "_LAST_FACTOR", LastMatrixCache())
     plain = factorise_fronts
     monkeypatch.setattr(exact_fronts_numpy, "factorise_fronts", lambda *given: made.append(1) or plain(*given))
     given = find_fronts(Compiled.pattern, Compiled.coordinates), Compiled.values, Compiled.vectors

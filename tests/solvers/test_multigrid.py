@@ -22,7 +22,7 @@ def of_many_levels(monkeypatch):
     """Give small problems three levels, and groups of few columns."""
     monkeypatch.setattr(optional_packages, "_MAX_COARSEST_SIZE", 3)
     monkeypatch.setattr(optional_packages, "_MAX_COLUMNS", 2)
-    monkeypatch.setattr(optional_packages, "_LAST_HIERARCHY", optional_packages.LastMatrix())
+    monkeypatch.setattr(optional_packages, "_LAST_HIERARCHY", optional_packages.LastMatrixCache())
 
 
 def problem(case):

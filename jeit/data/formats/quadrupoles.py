@@ -119,8 +119,8 @@ def read(
     channels, frames, times, channel_notes = _arrange_frames(path, table, electrodes, values, like)
     drives, drive_index = np.unique(channels[:, :2], axis=0, return_inverse=True)
     protocol = from_channels(
-        amplitude * _pairs(drives, num_electrodes),
-        _pairs(channels[:, 2:], num_electrodes),
+        amplitude * _pair_patterns(drives, num_electrodes),
+        _pair_patterns(channels[:, 2:], num_electrodes),
         drive_index.ravel(),
         name=f"{len(drives)} drives, {len(channels)} channels, {num_electrodes} electrodes",
     )
@@ -403,7 +403,7 @@ def _frame_of_lines(
     )
 
 
-def _pairs(pairs: Int[np.ndarray, "n 2"], num_electrodes: int) -> Float[np.ndarray, "n L"]:
+def _pair_patterns(pairs: Int[np.ndarray, "n 2"], num_electrodes: int) -> Float[np.ndarray, "n L"]:
     """Patterns (pairs, electrodes) with +1 and -1 at the two electrodes of each pair."""
     identity = np.eye(num_electrodes)
     return identity[pairs[:, 0]] - identity[pairs[:, 1]]

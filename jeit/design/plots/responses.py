@@ -271,7 +271,7 @@ def _check_single(taxels: Taxels) -> None:
         )
 
 
-def _cell_sides(taxels: Taxels) -> tuple[np.ndarray, np.ndarray]:
+def _cell_side_lengths(taxels: Taxels) -> tuple[np.ndarray, np.ndarray]:
     """Widths and heights (n,) of the drawn cells, metres: the spacings of the grid, or the sides of squares of the
     given area if the positions form no grid."""
     spacings_by_axis = [np.diff(np.unique(axis.round(9))) for axis in np.asarray(taxels.places).T]
@@ -282,7 +282,7 @@ def _cell_sides(taxels: Taxels) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _draw_cells(ax: Axes, taxels: Taxels, values: np.ndarray, *, colour_map: str) -> PolyCollection:
-    half_sizes = np.stack(_cell_sides(taxels), axis=1)[:, None] / 2
+    half_sizes = np.stack(_cell_side_lengths(taxels), axis=1)[:, None] / 2
     corners = np.asarray(taxels.places)[:, None] + half_sizes * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     # Cell edges are drawn in the colour of the cell, which hides gaps between cells.
     cells = PolyCollection(list(corners), array=values, cmap=colormaps[colour_map], edgecolors="face", linewidth=0.4)
@@ -323,7 +323,7 @@ def _finish_axes(ax: Axes, taxels: Taxels, electrodes: ArrayLike | None, title: 
             raise ValueError(f"electrodes has shape {positions.shape}; give positions (L, 2) or (L, 3) in metres.")
         style = {"markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": DARK_GREY, "markeredgewidth": 0.8}
         ax.plot(*positions[:, :2].T, marker="o", linestyle="none", **style)
-    half_sizes = np.stack(_cell_sides(taxels), axis=1) / 2
+    half_sizes = np.stack(_cell_side_lengths(taxels), axis=1) / 2
     places = np.asarray(taxels.places)
     extent = extent_of(np.concatenate([places - half_sizes, places + half_sizes]))
     hide_axes(ax, extent, numbered=False)

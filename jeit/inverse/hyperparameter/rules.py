@@ -65,7 +65,9 @@ def best_resolution(
             f"{signal_to_noise} and {num_targets}."
         )
     candidates = spectrum.candidates()[::4]
-    radii = blur_radius(spectrum, mesh, spread_cells(mesh, num_targets), candidates, signal_to_noise=signal_to_noise)
+    radii = blur_radius(
+        spectrum, mesh, select_spread_cells(mesh, num_targets), candidates, signal_to_noise=signal_to_noise
+    )
     mean_radius = radii.mean(axis=1)
     return Choice.among(
         "best-resolution",
@@ -115,7 +117,7 @@ def blur_radius(
     return (expected_areas / cell_areas.sum()) ** (1 / mesh.dimension)
 
 
-def spread_cells(mesh: Mesh, num_cells: int) -> Int[np.ndarray, " T"]:
+def select_spread_cells(mesh: Mesh, num_cells: int) -> Int[np.ndarray, " T"]:
     """Indices (T,) of about `num_cells` cells spread evenly through the body: the cells nearest to the points of a
     regular lattice."""
     centres, cell_measures = np.asarray(centroids(mesh)), np.asarray(measures(mesh))

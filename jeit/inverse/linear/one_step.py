@@ -178,19 +178,19 @@ class LinearReconstruction:
                 f"difference has shape {shape}; this reconstruction takes ({self.num_measurements},) volts, or "
                 f"(frames, {self.num_measurements})."
             )
-        if not has_values(difference, self._product_arrays):
-            return jax.jit(_image_product)(self._product_arrays, difference)
+        if not has_values(difference, self._numpy_arrays):
+            return jax.jit(_image_product)(self._numpy_arrays, difference)
         voltages = np.asarray(difference)
         if voltages.dtype.kind not in "iufc":
             raise ValueError(f"difference is {voltages.dtype}; give numbers, in volts.")
         if not np.isfinite(voltages).all():
             raise ValueError("difference has NaN or infinite voltages; put zeros in masked channels.")
-        first, second, ratio, mixing, weights = self._product_arrays
+        first, second, ratio, mixing, weights = self._numpy_arrays
         combined = _combine_channels(voltages, first, second, ratio, mixing)
         return on_device(combined @ weights) if is_forked() else product_for_jax(combined, weights)
 
     @functools.cached_property
-    def _product_arrays(self) -> tuple[Any, ...]:
+    def _numpy_arrays(self) -> tuple[Any, ...]:
         """Arrays used by `image`, converted to NumPy only once, because a conversion takes as long as the product."""
         arrays = (self.first, self.second, self.ratio, self.mixing, self.weights)
         return on_host(arrays) if has_values(arrays) else arrays

@@ -227,7 +227,7 @@ class Inversion(Module):
     unknowns: tuple[AbstractUnknown, ...] = ()
 
     @property
-    def runs_at_once(self) -> bool:
+    def is_solvable_in_numpy(self) -> bool:
         """Whether the problem can be solved in NumPy: nothing is traced and there are no unknowns."""
         runs_uncompiled = self.model.at_once or namespace(self.model) is np
         return runs_uncompiled and not self.unknowns and has_values(self)

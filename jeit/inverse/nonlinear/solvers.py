@@ -117,7 +117,7 @@ class GaussNewton(AbstractSolver):
 
     def minimise(self, inversion, start, box):
         """Minimise by `jeit_solvers.Descent`."""
-        return _run_descent(self.descent(_MAX_STEPS, inversion.penalty.tolerance), inversion, start)
+        return _run_descent(self.descent(_MAX_STEPS, inversion.penalty.descent_tolerance), inversion, start)
 
     def for_frames(self, max_steps=None, rtol=None):
         """Copy of the solver in which the arguments replace settings that are None."""
@@ -153,7 +153,7 @@ class LevenbergMarquardt(AbstractSolver):
 
     def minimise(self, inversion, start, box):
         """Minimise by `jeit_solvers.Descent`."""
-        return _run_descent(self.descent(_MAX_STEPS, inversion.penalty.tolerance), inversion, start)
+        return _run_descent(self.descent(_MAX_STEPS, inversion.penalty.descent_tolerance), inversion, start)
 
     def for_frames(self, max_steps=None, rtol=None):
         """Copy of the solver in which the arguments replace settings that are None."""
@@ -359,7 +359,7 @@ def _descent_for(max_steps: int, rtol: float, damping: float = 0.0) -> Descent:
 
 
 def _run_descent(descent: Descent, inversion: Inversion, start) -> Solution:
-    if inversion.runs_at_once:
+    if inversion.is_solvable_in_numpy:
         start, problem = on_host((start, inversion))
         point, state = descent.at_once(expand, start, problem, descent.history)
         point = as_array(point)

@@ -45,7 +45,7 @@ class AbstractPenalty(Module):
         return False
 
     @property
-    def tolerance(self) -> float:
+    def descent_tolerance(self) -> float:
         """Default tolerance: relative change of the objective that ends a descent."""
         return 1e-6
 
@@ -189,7 +189,7 @@ class StandardNormal(AbstractNormal):
         return numbers
 
 
-class SparseNormal(AbstractNormal):
+class SparsePrecisionNormal(AbstractNormal):
     """Normal distribution with a sparse, factorised precision Q for the coefficients of cells or nodes, which come
     first; further unknowns are standard normal."""
 

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Int
 from jeit.inverse.hyperparameter.choice import EDGE_PRICE
 from jeit.inverse.prior.bases import DiagonalBasis, NodalBasis
 from jeit.inverse.prior.linear_algebra import factorise_matrix
-from jeit.inverse.prior.penalties import AbstractPenalty, SparseNormal
+from jeit.inverse.prior.penalties import AbstractPenalty, SparsePrecisionNormal
 from jeit.inverse.prior.priors import AbstractPrior, cell_factorisation, check_cells
 from jeit.mesh import Mesh, gradients, measures
 from jeit.mesh.mesh import interior_facets
@@ -94,7 +94,7 @@ class NodalTotalVariation(AbstractPenalty):
         return NodalBasis(energy.cells, size), energy
 
     @property
-    def tolerance(self) -> float:
+    def descent_tolerance(self) -> float:
         """Relative change of the objective that ends a descent. The tolerance is larger than for other penalties,
         because lagged diffusivity converges linearly and its last steps do not change the image visibly."""
         return 1e-4
@@ -131,7 +131,7 @@ class NodalTotalVariation(AbstractPenalty):
         `TotalVariationPenalty.normal`."""
         image, _ = self._split_coefficients(coefficients)
         values = self._matrix(self._elements(self.weight / self._smoothed_height(image)), self.pull)
-        return SparseNormal(self.pattern, self.plan, factorise(self.plan, values))
+        return SparsePrecisionNormal(self.pattern, self.plan, factorise(self.plan, values))
 
     def model(self, residual, jacobian, coefficients, data):
         """Objective at c and the function that computes a step, as in `TotalVariationPenalty.model`."""
@@ -310,7 +310,7 @@ class TotalVariationPenalty(AbstractPenalty):
     between_bounds: bool = eqx.field(static=True, default=False)
 
     @property
-    def tolerance(self) -> float:
+    def descent_tolerance(self) -> float:
         """Relative change of the objective that ends a descent. The tolerance is larger than for other penalties,
         because lagged diffusivity converges linearly and its last steps do not change the image visibly."""
         return 1e-4
@@ -354,7 +354,7 @@ class TotalVariationPenalty(AbstractPenalty):
         if self.between_bounds:
             return None
         image, _ = self._split_coefficients(coefficients)
-        return SparseNormal(self.pattern, self.plan, self._factor(self.weight / self._smoothed_height(image)))
+        return SparsePrecisionNormal(self.pattern, self.plan, self._factor(self.weight / self._smoothed_height(image)))
 
     def model(self, residual, jacobian, coefficients, data):
         """Objective at c and the function that computes a step in data space, by Gauss-Newton for the data and lagged

@@ -44,7 +44,8 @@ _FIT_LIMITS, _LOG_POSTERIOR_DROP = {2: (8, 1e-2), 3: (2, 5e-2)}, {2: 5.0, 3: 3.0
 # The data do not determine a limit of the contrast if the -log likelihood at that bound of the contrast exceeds its
 # minimum by less than this number.
 _OPEN_END_RISE = 1.0
-# Probabilities at the limits of an interval; numbers of contrasts and of normal deviates that sample the posterior.
+# Probabilities at the limits of a credible interval; number of values of the contrast, and number of standard normal
+# deviates for each of them, at which the posterior is evaluated.
 _INTERVAL_PROBABILITIES, _NUM_CONTRASTS, _NUM_NORMAL_DEVIATES = (0.16, 0.84), 240, 31
 # Probability that the circle about a centroid contains the true centroid.
 _CENTROID_PROBABILITY = 0.68

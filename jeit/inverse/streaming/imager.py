@@ -69,8 +69,8 @@ class LinearMap(Module):
     """Linear image σ = `level` (m,) + `matrix` (m, k) · `estimator` (k, M) · voltages (M,), S/m (2-D: S).
 
     k is the number of independent channels or of the prior's shapes, whichever is smaller. `matrix` multiplies k
-    weights. With a memory of earlier frames, `carry` (k, k) times the last image's weights (k,), relative to the
-    weights of an undisturbed frame, is added to the weights.
+    weights. If earlier frames are remembered, `carry` (k, k) times the deviation of the last image's weights (k,) from
+    the weights of an undisturbed frame is added to the weights.
     """
 
     matrix: Float[Array, "m k"]

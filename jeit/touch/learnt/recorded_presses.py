@@ -68,9 +68,9 @@ def reference_used(
     return np.where(np.isnan(reference), mean, reference)[:, used]
 
 
-# Maximum extent of the positions of presses: with a larger extent, positions must be in millimetres.
+# Maximum extent of the positions of presses. Positions with a larger extent are refused, as probably in millimetres.
 _MAX_EXTENT = 5.0  # m
-# Maximum force of a press: larger forces must be in grams or millinewtons.
+# Maximum force of a press. Larger forces are refused, as probably in grams or millinewtons.
 _MAX_FORCE = 2000.0  # N
 _MIN_PRESSES, _MIN_PRESSES_PER_CLASS = 10, 4
 # Label of a frame of the untouched skin.

@@ -122,15 +122,15 @@ class NetworkLearner:
         return NetworkListener.from_network(result.network, levels)
 
     @staticmethod
-    def stored_shapes(head: dict[str, Any], classes: int, rows: int) -> Any:
-        """Create arrays with the shapes of the arrays in a file with the header `head`."""
+    def stored_shapes(header: dict[str, Any], classes: int, rows: int) -> Any:
+        """Create arrays with the shapes of the arrays in a file with this `header`."""
         return ModalityNetwork.draw(jax.random.key(0), rows, 41, classes)
 
     @staticmethod
-    def from_stored(head: dict[str, Any], arrays: Any) -> NetworkListener:
+    def from_stored(header: dict[str, Any], arrays: Any) -> NetworkListener:
         """Restore a network from the header and arrays that `NetworkListener.to_stored` returned."""
         return NetworkListener.from_network(
-            arrays, Levels(**{name: np.array(value) for name, value in head["levels"].items()})
+            arrays, Levels(**{name: np.array(value) for name, value in header["levels"].items()})
         )
 
 
@@ -166,14 +166,14 @@ class TreesListener:
     def to_stored(self) -> tuple[dict[str, Any], Any]:
         """Return the header and the arrays to store in a classifier's file."""
         forest = self.forest
-        head = {"trees": forest.value.shape[0], "nodes": forest.value.shape[1], "depth": forest.depth}
+        header = {"trees": forest.value.shape[0], "nodes": forest.value.shape[1], "depth": forest.depth}
         arrays = [forest.feature, forest.left, forest.right, forest.threshold, forest.value, forest.start]
-        return head, [np.asarray(array, np.int32 if index < 3 else np.float32) for index, array in enumerate(arrays)]
+        return header, [np.asarray(array, np.int32 if index < 3 else np.float32) for index, array in enumerate(arrays)]
 
     @staticmethod
-    def stored_shapes(head: dict[str, Any], classes: int, rows: int) -> Any:
-        """Create arrays with the shapes of the arrays in a file with the header `head`."""
-        node_shape = (int(head["trees"]), int(head["nodes"]))
+    def stored_shapes(header: dict[str, Any], classes: int, rows: int) -> Any:
+        """Create arrays with the shapes of the arrays in a file with this `header`."""
+        node_shape = (int(header["trees"]), int(header["nodes"]))
         shapes = [(node_shape, np.int32)] * 3 + [
             (node_shape, np.float32),
             ((*node_shape, classes), np.float32),
@@ -182,14 +182,16 @@ class TreesListener:
         return [jax.numpy.zeros(shape, dtype) for shape, dtype in shapes]
 
     @classmethod
-    def from_stored(cls, head: dict[str, Any], arrays: Any) -> "TreesListener":
+    def from_stored(cls, header: dict[str, Any], arrays: Any) -> "TreesListener":
         """Restore boosted trees from the header and arrays that `to_stored` returned.
 
         Raises `ValueError` for trees with features or nodes that do not exist.
         """
         feature, left, right, threshold, value, start = (np.asarray(array) for array in arrays)
         num_nodes = value.shape[1]
-        has_valid_features = (feature >= 0).all() and (feature < num_features()).all() and 0 < int(head["depth"]) < 1000
+        has_valid_features = (
+            (feature >= 0).all() and (feature < num_features()).all() and 0 < int(header["depth"]) < 1000
+        )
         if not (has_valid_features and all(((child >= 0) & (child < num_nodes)).all() for child in (left, right))):
             raise ValueError("its trees refer to features or nodes that do not exist")
         return cls(
@@ -199,7 +201,7 @@ class TreesListener:
                 left,
                 right,
                 value.astype(float),
-                int(head["depth"]),
+                int(header["depth"]),
                 start.astype(float),
                 np.arange(len(start)),
             )
@@ -253,15 +255,15 @@ class LinearLearner:
             weights, offset = np.hstack([-weights, weights]) / 2, np.concatenate([-offset, offset]) / 2
         return LinearListener(self.features, mean, deviation, weights, offset)
 
-    def stored_shapes(self, head: dict[str, Any], classes: int, rows: int) -> Any:
-        """Create arrays with the shapes of the arrays in a file with the header `head`."""
+    def stored_shapes(self, header: dict[str, Any], classes: int, rows: int) -> Any:
+        """Create arrays with the shapes of the arrays in a file with this `header`."""
         num_inputs = self.features(_NO_WINDOWS).shape[1]
         return [
             jax.numpy.zeros(shape, np.float32)
             for shape in ((num_inputs,), (num_inputs,), (num_inputs, classes), (classes,))
         ]
 
-    def from_stored(self, head: dict[str, Any], arrays: Any) -> LinearListener:
+    def from_stored(self, header: dict[str, Any], arrays: Any) -> LinearListener:
         """Restore a discriminant from the header and arrays that `LinearListener.to_stored` returned."""
         return LinearListener(self.features, *(np.asarray(array, float) for array in arrays))
 

@@ -149,7 +149,7 @@ def fit_network(
     check_key(key)
     check_kind("objective", objective, TrainingObjective, "a TrainingObjective(loss, held_out)")
     plan = TrainingPlan() if plan is None else plan
-    rows = training if _are_rows(training) else ArrayRows(training)
+    rows = training if _is_row_source(training) else ArrayRows(training)
     validation_rows = ArrayRows(validation, "validation")
     held_out_arrays = jax.tree.map(jnp.asarray, validation_rows.arrays)
     seed = [int(word) for word in np.asarray(jax.random.key_data(key) if _is_typed_key(key) else key).ravel()]
@@ -294,7 +294,7 @@ def _describe_progress(state: State, plan: TrainingPlan, batches_per_epoch: int)
     )
 
 
-def _are_rows(value: Any) -> bool:
+def _is_row_source(value: Any) -> bool:
     """Whether an argument has the interface of `Rows`, training data in chunks."""
     return all(hasattr(value, name) for name in ("sizes", "fingerprint", "chunk"))
 

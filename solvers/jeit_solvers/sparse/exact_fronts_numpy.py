@@ -26,7 +26,7 @@ from jeit_solvers.cores import on_cores, one_thread_of_blas
 from jeit_solvers.dense import inverse_cholesky
 from jeit_solvers.engines import call_numpy, has_values, host
 from jeit_solvers.sparse.exact_fronts import Fronts
-from jeit_solvers.sparse.operator import LastMatrix
+from jeit_solvers.sparse.operator import LastMatrixCache
 
 # Minimum number of operations at which fronts are distributed over the cores. A product with k vectors counts as k
 # operations for each entry of the factor.
@@ -205,7 +205,7 @@ def _solve_in_numpy(fronts: Fronts, dtype: Any, values: Any, columns: Any) -> np
         return factor.solve(np.asarray(columns)).astype(dtype)
 
 
-_LAST_FACTOR = LastMatrix()
+_LAST_FACTOR = LastMatrixCache()
 
 
 def _eliminate_front(

@@ -199,11 +199,11 @@ class NumpySolver(MatrixSolver):
 
 
 def pattern_key(pattern: SparsityPattern) -> bytes:
-    """Key of a sparsity pattern for `LastMatrix`."""
+    """Key of a sparsity pattern for `LastMatrixCache`."""
     return hashlib.blake2b(np.ascontiguousarray(pattern.indices).tobytes(), digest_size=16).digest()
 
 
-class LastMatrix:
+class LastMatrixCache:
     """Cache of one result, such as a factor, for the matrix that was used last, because derivatives solve with the same
     matrix again."""
 

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.sparse import block_array, csr_array, csr_matrix, triu
 
 from jeit_solvers.cores import number_of_cores, on_cores
-from jeit_solvers.sparse.operator import LastMatrix, NumpySolver, pattern_key
+from jeit_solvers.sparse.operator import LastMatrixCache, NumpySolver, pattern_key
 from jeit_solvers.sparse.pattern import SparsityPattern
 
 # Maximum number of right-hand sides that are iterated together. With more right-hand sides the matrix is read less
@@ -231,7 +231,7 @@ def _column_norms(columns: Any) -> np.ndarray:
     return np.sqrt(squares + _column_products(columns.imag, columns.imag) if np.iscomplexobj(columns) else squares)
 
 
-_LAST_HIERARCHY = LastMatrix()
+_LAST_HIERARCHY = LastMatrixCache()
 
 
 # oneMKL's numbers of matrix types: real symmetric positive definite, and real symmetric indefinite.
@@ -314,4 +314,4 @@ class _PardisoFactor:
             return self.solver.solve(self.upper, np.asfortranarray(columns, np.float64))
 
 
-_LAST_PARDISO_FACTOR = LastMatrix()
+_LAST_PARDISO_FACTOR = LastMatrixCache()

@@ -154,7 +154,7 @@ def _pressures_of_equal_indenters(samples: Samples, support: AbstractSupport, pr
     """Compute pressures (b, c, s) of b presses with the same indenter at the s samples of the `cells` (b, c)."""
     points = samples.points[cells]
     sample_shape = points.shape[:-1]
-    local_points, fall, area_ratios = samples.to_indenter_frames(
+    local_points, fall, area_ratios = samples.to_indenter_coordinates(
         presses, cells, points.reshape(len(cells), -1, points.shape[-1])
     )
     sample_areas = np.broadcast_to((area_ratios * samples.area[cells] * is_cell)[..., None], sample_shape).reshape(
@@ -180,7 +180,7 @@ def _pressures_on_finer_lattice(samples: Samples, support: AbstractSupport, pres
     """
     points = samples.lattice_points(cells, _FINE_LATTICE)
     num_fine_samples, num_samples = points.shape[1], samples.points.shape[1]
-    local_points, fall, area_ratios = samples.to_indenter_frames(
+    local_points, fall, area_ratios = samples.to_indenter_coordinates(
         [press], cells[None], points.reshape(1, -1, points.shape[-1])
     )
     sample_areas = np.repeat(

@@ -135,7 +135,7 @@ class Samples(NamedTuple):
         the press."""
         return 1.0 if self.curved is None else _MAX_CHORD_RATIO
 
-    def to_indenter_frames(
+    def to_indenter_coordinates(
         self, presses: Sequence[Press], cells: Int[np.ndarray, "b c"], points: Float[np.ndarray, "b q d"]
     ):
         """Transform points (b, q, d) to the frames of b indenters.
