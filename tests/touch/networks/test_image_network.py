@@ -53,7 +53,7 @@ def test_a_used_network_is_pickled_and_copied(learnt, change):
 
 
 def test_training_explains_depth(learnt):
-    """Two hundred touches in three epochs explain part of the depth. An untrained network explains nothing."""
+    """A hundred touches in five epochs explain part of the depth. An untrained network explains nothing."""
     _, found = learnt
     assert found.standing.explained > 0.3
     assert found.standing.place["mean"] < 0.02
