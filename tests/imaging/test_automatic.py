@@ -219,7 +219,7 @@ def test_exchanged_files_and_lengths_in_another_unit_are_doubted():
     assert any("are the two exchanged?" in doubt for doubt in exchanged.doubts)
 
     def enlarged(measurement):
-        electrodes = BoundaryElectrodes(ring(100 * RADIUS, 16), 0.005, 0.05)
+        electrodes = BoundaryElectrodes(ring(100 * RADIUS, 16), 0.009, 0.05)
         return dataclasses.replace(measurement, electrodes=electrodes, domain=Disk(100 * RADIUS))
 
     large = [enlarged(measurement) for measurement in (frame(1.05, seed=1), frame())]
