@@ -42,7 +42,6 @@ from jeit.touch.simulate.contact.samples import Samples
 from jeit_solvers.engines import as_array, on_host
 from jeit_solvers.module import Module
 
-
 # Minimum number of normal numbers drawn at once.
 _MIN_DRAWS = 2**12
 
