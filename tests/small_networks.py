@@ -24,7 +24,7 @@ layout = "grid-4x4"
 [mesh]
 cell_mm = 8
 """
-PRESET = NetworkPreset(100, 30, TrainingPlan(rate=2e-3, batch=25, epochs=10, patience=10, decay=0.9, seconds=0.0))
+PRESET = NetworkPreset(100, 30, TrainingPlan(rate=2e-3, batch=25, epochs=5, patience=5, decay=0.9, seconds=0.0))
 SHAPE = (24, 24)
 
 

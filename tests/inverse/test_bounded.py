@@ -127,6 +127,7 @@ def test_lower_bound_of_zero(link, model, frame):
     """Zero is outside of the logarithm's range and is no bound there."""
     result = between(model, frame, ProjectedGradient(), Noser(), (0.0, 1.5), link)
     assert (np.asarray(result.conductivity) > 0).all()
+    assert result.costs[-1] < result.costs[0]
 
 
 @pytest.mark.slow

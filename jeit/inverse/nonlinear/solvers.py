@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 from jeit.arguments import check_kind, check_name, counted
 from jeit.inverse.nonlinear.problem import Inversion, as_solution, check_steps, check_tolerance
 from jeit_solvers import BoundedMinimum, Descent, Status, ended, ended_number, lbfgsb, projected_gradient
-from jeit_solvers.engines import as_array, has_values, on_host, undifferentiated
+from jeit_solvers.engines import as_array, evaluate_in_numpy, has_values, on_host, undifferentiated
 from jeit_solvers.module import Module
 
 _Setting = TypeVar("_Setting")
@@ -252,7 +252,7 @@ class LeastSquares(AbstractSolver):
             status_number = ended_number(solution.result)
             return _traced_solution(inversion, start, solution.value, solution.stats["num_steps"], status_number)
         solution = _least_squares(inversion, start, self.solver, self.max_steps, {})
-        costs = jnp.stack([_cost_at(inversion, start), _cost_at(inversion, solution.value)])
+        costs = _costs_at(inversion, start, solution.value)
         status, iterations = ended(solution.result), int(solution.stats["num_steps"])
         if status == Status.STEP_LIMIT and _is_within_rounding(inversion, solution.value):
             return Solution(solution.value, iterations, costs, Status.CONVERGED, _ROUNDED_REASON)
@@ -382,7 +382,7 @@ def _traced_solution(inversion: Inversion, start, coefficients, iterations, stat
     """Result of a solver inside jax.jit, jax.grad or jax.vmap: `coefficients` with the derivatives of the exact
     minimum."""
     coefficients = as_solution(coefficients, inversion, box)
-    costs = jnp.stack([_cost_at(inversion, start), _cost_at(inversion, coefficients)])
+    costs = _costs_at(inversion, start, coefficients)
     return Solution(coefficients, iterations, costs, status, _TRACED_REASON)
 
 
@@ -397,7 +397,7 @@ def _minimise_in_box(minimise, inversion: Inversion, start, box, max_steps: int,
         status = jnp.where(minimum.converged, Status.CONVERGED.number, Status.STEP_LIMIT.number)
         return _traced_solution(inversion, start, minimum.x, minimum.steps, status, box)
     minimum = minimise_between(inversion, start, lower, upper, minimise, int(max_steps), float(tolerance))
-    costs = jnp.stack([_cost_at(inversion, start), _cost_at(inversion, minimum.x)])
+    costs = _costs_at(inversion, start, minimum.x)
     if minimum.converged:
         reason = "No step between the bounds would change the image much."
         return Solution(minimum.x, int(minimum.steps), costs, Status.CONVERGED, reason)
@@ -445,6 +445,13 @@ def _is_within_rounding(inversion: Inversion, coefficients):
     return abs(slope + 0.5 * curvature) <= _ROUNDING_FACTOR * jnp.finfo(cost.dtype).eps * cost
 
 
+def _costs_at(inversion: Inversion, *points: Float[Array, " n"]) -> Float[Array, " p"]:
+    """Objective at some points; without compilation where the model runs in NumPy."""
+    if inversion.runs_at_once and has_values(points):
+        return as_array(np.array([evaluate_in_numpy(Inversion.cost, inversion, point) for point in points]))
+    return jnp.stack([_compiled_cost(inversion, point) for point in points])
+
+
 @eqx.filter_jit
-def _cost_at(inversion: Inversion, coefficients):
+def _compiled_cost(inversion: Inversion, coefficients):
     return inversion.cost(coefficients)

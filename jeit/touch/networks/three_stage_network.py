@@ -29,7 +29,7 @@ class Dense(Module):
     def __init__(self, inputs: int, outputs: int, *, key: Array):
         """Create a dense layer with random weights after He et al. 2015, as in all layers here, and a bias of zero."""
         self.weight = _draw_weights(key, (inputs, outputs), inputs)
-        self.bias = jnp.zeros(outputs, jnp.float32)
+        self.bias = jnp.asarray(np.zeros(outputs, np.float32))
 
     def __call__(self, values: Float[Array, "b i"]) -> Float[Array, "b o"]:
         """Apply the layer to a batch of inputs (rows, inputs)."""
@@ -46,7 +46,7 @@ class Convolution(Module):
     def __init__(self, inputs: int, outputs: int, stride: int = 1, *, key: Array):
         """Create a convolutional layer from images with `inputs` channels to images with `outputs` channels."""
         self.weight = _draw_weights(key, (3, 3, inputs, outputs), 9 * inputs)
-        self.bias = jnp.zeros(outputs, jnp.float32)
+        self.bias = jnp.asarray(np.zeros(outputs, np.float32))
         self.stride = stride
 
     def __call__(self, image: Float[Array, "b r c i"]) -> Float[Array, "b p q o"]:
@@ -124,14 +124,19 @@ def channels_to_pixels(image: Float[Array, "b r c 4"]) -> Float[Array, "b s d"]:
     return jnp.moveaxis(pixel_blocks, 3, 2).reshape(num_images, 2 * rows, 2 * columns)
 
 
+# Minimum number of random numbers drawn for the weights of a layer.
+_MIN_DRAWS = 8192
+
+
 def _draw_weights(key: Array, shape: tuple[int, ...], inputs: int) -> Array:
     """Draw random initial weights of a layer; each output depends on a number `inputs` of values (He et al. 2015).
 
-    The number of draws is rounded up to a power of two, so that JAX compiles fewer programs for layers of different
-    sizes; the first draws are the same for any number.
+    The number of draws is rounded up to a power of two, and to one number for all convolutions, so that JAX compiles
+    fewer programs for layers of different sizes; the first draws are the same for any number.
     """
     num_weights = math.prod(shape)
-    draws = jax.random.normal(key, (1 << max(num_weights - 1, 0).bit_length(),), jnp.float32)
+    num_draws = max(1 << max(num_weights - 1, 0).bit_length(), _MIN_DRAWS)
+    draws = jax.random.normal(key, (num_draws,), jnp.float32)
     draws = np.asarray(draws) if has_values(draws) else draws
     return jnp.asarray(draws[:num_weights].reshape(shape) * np.float32(np.sqrt(2 / inputs)))
 

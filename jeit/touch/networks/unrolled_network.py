@@ -85,9 +85,9 @@ class Unrolled(Module):
         skin."""
         rows, columns = shape[0] // 2, shape[1] // 2
         num_images = len(_NOISE_MULTIPLES) + 1
-        self.operator = jnp.zeros((num_channels, shape[0] * shape[1]), jnp.float32)
-        self.imagers = jnp.zeros((num_channels, rows * columns, num_images), jnp.float32)
-        self.constant_images = jnp.zeros((rows, columns, 2), jnp.float32)
+        self.operator = jnp.asarray(np.zeros((num_channels, shape[0] * shape[1]), np.float32))
+        self.imagers = jnp.asarray(np.zeros((num_channels, rows * columns, num_images), np.float32))
+        self.constant_images = jnp.asarray(np.zeros((rows, columns, 2), np.float32))
         keys = jax.random.split(key, num_steps)
         self.steps = tuple(
             Refinement(num_images + 2 + (4 if step_index else 0), key=step_key)

@@ -21,7 +21,7 @@ CUT = Cut([(-0.005, 0.014), (0.02, 0.024)])
 MATERIAL = material("velostat")
 SHEET = MATERIAL.conductivity * MATERIAL.thickness
 DAMAGED, PRESSED = 12.0, (10.0, 13.0)
-SECONDS = np.arange(0, 26, 0.25)
+SECONDS = np.arange(0, 26, 0.5)
 
 
 def disk_model(num_points: int, refine=None) -> ForwardModel:
@@ -31,7 +31,7 @@ def disk_model(num_points: int, refine=None) -> ForwardModel:
 
 @pytest.fixture(scope="module")
 def skin() -> PressedSkin:
-    return PressedSkin(jax.random.key(0), disk_model(800, CUT.refine(1.5e-3)), MATERIAL)
+    return PressedSkin(jax.random.key(0), disk_model(500, CUT.refine(2e-3)), MATERIAL)
 
 
 @pytest.fixture(scope="module")

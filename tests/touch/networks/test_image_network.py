@@ -44,7 +44,7 @@ def voltages(skin, touches, resting):
 def test_a_used_network_is_pickled_and_copied(learnt, change):
     """Its compiled programs are left out."""
     network = learnt[1].network
-    frames = 0.01 * np.random.default_rng(0).normal(size=(3, network.made_for["channels"]))
+    frames = 0.01 * np.random.default_rng(0).normal(size=(2, network.made_for["channels"]))
     expected = network.share(frames)
     other = change(network)
     np.testing.assert_array_equal(other.share(frames), expected)
@@ -53,7 +53,7 @@ def test_a_used_network_is_pickled_and_copied(learnt, change):
 
 
 def test_training_explains_depth(learnt):
-    """Two hundred touches in three epochs explain part of the depth. An untrained network explains nothing."""
+    """A hundred touches in five epochs explain part of the depth. An untrained network explains nothing."""
     _, found = learnt
     assert found.standing.explained > 0.3
     assert found.standing.place["mean"] < 0.02

@@ -36,8 +36,9 @@ def rows(number: int, seed: int = 0):
     return inputs, np.stack([inputs[:, 0] * inputs[:, 1]], axis=1)
 
 
-def network(seed: int = 0):
-    return eqx.nn.MLP(2, 1, 16, 2, jnp.tanh, dtype=jnp.float32, key=jax.random.key(seed))
+@eqx.filter_jit
+def network():
+    return eqx.nn.MLP(2, 1, 16, 2, jnp.tanh, dtype=jnp.float32, key=jax.random.key(0))
 
 
 OBJECTIVE = TrainingObjective(loss, held_out)

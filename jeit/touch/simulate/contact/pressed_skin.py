@@ -42,12 +42,17 @@ from jeit.touch.simulate.contact.samples import Samples
 from jeit_solvers.engines import as_array, on_host
 from jeit_solvers.module import Module
 
+# Minimum number of normal numbers drawn at once.
+_MIN_DRAWS = 2**12
+
 
 def standard_normal(key: Array, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
-    """Draw standard normal numbers with `jax.random.normal`. The number of draws is rounded up to a power of two, so
-    that JAX compiles fewer programs for recordings of different lengths."""
+    """Draw standard normal numbers with `jax.random.normal`. The number of draws is rounded up to a power of two,
+    and to one number for gains, drift and short recordings, so that JAX compiles fewer programs. The first draws are
+    the same for any number."""
     num_draws = math.prod(shape)
-    return np.asarray(jax.random.normal(key, (1 << max(num_draws - 1, 0).bit_length(),)))[:num_draws].reshape(shape)
+    num_drawn = max(1 << max(num_draws - 1, 0).bit_length(), _MIN_DRAWS)
+    return np.asarray(jax.random.normal(key, (num_drawn,)))[:num_draws].reshape(shape)
 
 
 def split_keys(key: Array, number: int) -> list[Array]:
