@@ -447,7 +447,7 @@ def _is_within_rounding(inversion: Inversion, coefficients):
 
 def _costs_at(inversion: Inversion, *points: Float[Array, " n"]) -> Float[Array, " p"]:
     """Objective at some points; without compilation where the model runs in NumPy."""
-    if inversion.runs_at_once and has_values(points):
+    if inversion.is_solvable_in_numpy and has_values(points):
         return as_array(np.array([evaluate_in_numpy(Inversion.cost, inversion, point) for point in points]))
     return jnp.stack([_compiled_cost(inversion, point) for point in points])
 
