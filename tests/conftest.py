@@ -55,7 +55,12 @@ def pytest_configure(config):
 
 
 def pytest_collection_finish():
-    """Exclude what has been imported from garbage collection: it stays until the end."""
+    """Exclude what has been imported from garbage collection: it stays until the end.
+
+    Hypothesis would parse every module of jeit for numbers and words to try, for three seconds in each worker.
+    """
+    if "hypothesis.internal.conjecture.providers" in sys.modules:
+        sys.modules["hypothesis.internal.conjecture.providers"].is_local_module_file = lambda path: False
     gc.freeze()
 
 

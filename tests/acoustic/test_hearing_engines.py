@@ -1,6 +1,6 @@
 """Two engines with one formula: the NumPy engine locates the same touches as the compiled program.
 
-For one source they are compared in `test_localiser_gradients`, which needs that program anyway.
+For one source, the quick tests compare them in `test_localiser_gradients`, without the search for minima.
 """
 
 import jax

@@ -8,7 +8,10 @@ import pytest
 from microphone_arrays import array, assert_same, inside, noisy, quick_likelihood, received_power
 
 from jeit.acoustic import Localiser
+from jeit.acoustic.localisation import localiser
+from jeit.acoustic.localisation.consistency import find_minima
 from jeit.acoustic.localisation.localiser import METHODS
+from jeit_solvers.engines import namespace, on_device
 
 
 @pytest.fixture(scope="module")
@@ -75,15 +78,42 @@ def test_forward_mode_can_be_reversed(method, moving):
     assert [part.shape for part in gradient] == [part.shape for part in point]
 
 
-@pytest.mark.parametrize(
-    ("method", "reversed_too"),
-    [("likelihood", False)] + [pytest.param(one, True, marks=pytest.mark.slow) for one in METHODS],
-)
+@quick_likelihood
+def test_forward_mode_is_traced(method, moving):
+    """`test_gradients` compiles it."""
+    point, direction, located = moving
+    position, slope = jax.eval_shape(lambda *x: jax.jvp(lambda *x: located(method, *x)[0], x, direction), *point)
+    assert position.shape == slope.shape == (28, 2)
+
+
+@quick_likelihood
+def test_gradients_of_known_minima(method, moving, monkeypatch):
+    """As `test_gradients`, but the compiled program gets the minima that NumPy found. It does not differentiate the
+    search for them, which takes long to compile."""
+    known = []
+
+    def find(*arguments):
+        if namespace(arguments) is jnp:
+            return on_device(known[0])  # of the point itself
+        known.append(find_minima(*arguments))
+        return known[-1]
+
+    monkeypatch.setattr(localiser, "find_minima", find)
+    monkeypatch.setattr(localiser, "_call_compiled", lambda function, *args: function(*args))  # for no later test
+    check_gradients(method, moving, reversed_too=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("method", "reversed_too"), [("likelihood", False), *((one, True) for one in METHODS)])
 def test_gradients(method, reversed_too, moving):
     """The compiled result is that of NumPy, and its forward mode agrees with central differences for each input.
 
     So does reverse mode, which takes longer to compile.
     """
+    check_gradients(method, moving, reversed_too)
+
+
+def check_gradients(method, moving, reversed_too):
     point, direction, located = moving
     _, found = located(method, *point)
     # A frame that needs more iterations is reported as not converged, and its derivatives are as inaccurate as its

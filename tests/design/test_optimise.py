@@ -20,6 +20,7 @@ from jeit.design import (
     touches_away_from_the_edge,
 )
 from jeit.design.optimisation.design_space import Constraints, minimise_from_starts
+from jeit.design.optimisation.optimise import _largest_violation, _make_feasible, _parameters_of_starts, _random_starts
 from jeit.design.optimisation.variables import LayoutParameters, Variables, balanced_score
 from jeit.design.skin.sheet_touches import sheet_touches
 from jeit.electrodes import PointElectrodes
@@ -39,6 +40,7 @@ START = Layout(
 MODEL = ForwardModel(MESH, START.sheet_discs(1e-4), two_terminal(NUMBER))
 TOUCHES = sheet_touches(MESH, Bell(deviation=12e-3), PLACES, thickness=0.01)
 KEEP_OUT = Disk(0.015, (0.02, 0.02))
+LIMITS = {"minimum_spacing": SPACING, "keep_out": (KEEP_OUT,)}
 SETTING = {"prior": TouchPrior.create(PLACES, correlation=0.02), "noise": 1e-4}
 
 
@@ -51,8 +53,7 @@ def optimise(layout=START, *, model=MODEL, steps=100, starts=1, key=None, callba
 
 
 def optimise_from_three(steps=14, **options):
-    limits = {"minimum_spacing": SPACING, "keep_out": (KEEP_OUT,)}
-    return optimise(starts=3, key=jax.random.key(1), steps=steps, **limits, **options)
+    return optimise(starts=3, key=jax.random.key(1), steps=steps, **LIMITS, **options)
 
 
 @pytest.fixture(scope="module")
@@ -64,15 +65,19 @@ def distances(centres):
     return np.linalg.norm(centres[:, None] - centres, axis=-1)[np.triu_indices(len(centres), 1)]
 
 
-def test_the_optimised_layout_is_much_better(found):
-    assert found.value > found.start_value + 2
-    before = layout_scores(MODEL, 2e-3, TOUCHES, **SETTING)
-    np.testing.assert_allclose(found.start_value, balanced_score(before), rtol=1e-9)
-    np.testing.assert_allclose(found.value, balanced_score(found.scores), rtol=1e-9)
-    assert float(found.scores.soft_worst) > 2 * float(before.soft_worst)
-    assert float(found.scores.mean_variance) < 0.7 * float(before.mean_variance)
-    assert found.status in ("converged", "step limit")
-    assert "satisfied by 3" in found.reason
+def test_random_starts_are_moved_until_they_satisfy_the_constraints():
+    skin, space = Skin(START, MODEL, thickness=0.01, conductivity=0.2), DesignSpace(**LIMITS)
+    constraints = space.constraints(skin)
+    variables = space.variables(skin, constraints, TOUCHES.depth)
+    drawn = np.stack([variables.start, *_random_starts(variables, constraints, 2, jax.random.key(1))])
+    assert (shortfall(constraints, variables, drawn)[1:] > 1e-3).all()
+    assert (shortfall(constraints, variables, _make_feasible(variables, constraints, jnp.asarray(drawn))) == 0).all()
+
+
+def shortfall(constraints, variables, all_variables):
+    parameters = _parameters_of_starts(variables, jnp.asarray(all_variables))
+    layouts = zip(parameters.centres, parameters.radii, strict=True)
+    return np.maximum([_largest_violation(constraints, *layout) for layout in layouts], 0)
 
 
 def test_the_minimised_costs_have_their_gradients(monkeypatch):
@@ -93,6 +98,17 @@ def test_the_minimised_costs_have_their_gradients(monkeypatch):
     step = 1e-6
     above, below = (np.asarray(cost(variables + sign * step * direction)[0]) for sign in (1, -1))
     np.testing.assert_allclose(slope, (above - below) / (2 * step), rtol=1e-4)
+
+
+def test_the_optimised_layout_is_much_better(found):
+    assert found.value > found.start_value + 2
+    before = layout_scores(MODEL, 2e-3, TOUCHES, **SETTING)
+    np.testing.assert_allclose(found.start_value, balanced_score(before), rtol=1e-9)
+    np.testing.assert_allclose(found.value, balanced_score(found.scores), rtol=1e-9)
+    assert float(found.scores.soft_worst) > 2 * float(before.soft_worst)
+    assert float(found.scores.mean_variance) < 0.7 * float(before.mean_variance)
+    assert found.status in ("converged", "step limit")
+    assert "satisfied by 3" in found.reason
 
 
 def test_all_starting_points_end_within_all_constraints(found):

@@ -4,9 +4,10 @@ import os
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from studies import changed, in_another_process, linear_changes
+from studies import EVERY_SCORE, SWEEP, changed, in_another_process, linear_changes
 
 from jeit.design import (
     Bell,
@@ -37,10 +38,18 @@ pytest.importorskip("zarr")
 MESH, GRID = rectangle(0.1, 0.08, cell_size=8e-3), touch_grid(Rectangle(0.1, 0.08), 6, 5)
 
 
+@pytest.fixture(scope="module")
+def full_study(tmp_path_factory):
+    """The sweep with every score."""
+    path = tmp_path_factory.mktemp("full") / "study.toml"
+    path.write_text(EVERY_SCORE, "utf-8")
+    return read_study(path)
+
+
 @pytest.mark.slow
-def test_results_equal_those_of_one_map_at_a_time(study, whole_store):
+def test_results_equal_those_of_one_map_at_a_time(full_study, store_path):
     """For the nearest pairs of each layout."""
-    data = open_results(study, whole_store)
+    study, data = full_study, run_study(full_study, store_path)
     prior = TouchPrior.create(GRID.places, correlation=20e-3)
     for number, point in enumerate(study.points):
         model = model_of(point)
@@ -126,8 +135,10 @@ def test_conducting_touches_of_a_sheet(results, exact):
         np.testing.assert_allclose(values, np.linalg.norm(found, axis=1), rtol=1e-8)
 
 
-def test_the_error_at_a_place_that_is_not_determined_is_infinite_and_counted(study, store_path, monkeypatch):
+def test_the_error_at_a_place_that_is_not_determined_is_infinite_and_counted(tmp_path, store_path, monkeypatch):
     """Two voltages, measured repeatedly, for a place and an amplitude."""
+    (tmp_path / "study.toml").write_text(SWEEP.replace('"blind_spot"', '"localisation_error"'), "utf-8")
+    study = read_study(tmp_path / "study.toml")
     measured = Point.measurement_protocol
 
     def two(point, current):
@@ -143,21 +154,22 @@ def test_the_error_at_a_place_that_is_not_determined_is_infinite_and_counted(stu
     assert (data.localisation_lost == 1).all()
 
 
-def compiled(study, *scores) -> str:
-    """The program for two points of a study, with its own scores or others."""
+def lowered(study, *scores):
+    """The program for two points of a study, with its own scores or others, before it is compiled."""
     shared, skin = batch._shared_data(study, study.points[0].shape), batch._point_data(study.points[0], study.current)
     options = {"num_taxels": study.num_taxels, "threshold": study.threshold, "num_devices": 1}
-    lowered = batch._solve_batch.lower(shared, batch._stack_trees([skin] * 2), scores=scores or study.scores, **options)
-    return lowered.compile().as_text() or ""
+    return batch._solve_batch.lower(shared, batch._stack_trees([skin] * 2), scores=scores or study.scores, **options)
 
 
-def test_a_batch_calls_no_library(study):
-    assert "lapack" not in compiled(study)
+def test_a_batch_calls_no_library(full_study):
+    assert "lapack" in jax.jit(jnp.linalg.cholesky).lower(np.eye(2)).as_text()
+    assert "lapack" not in lowered(full_study).as_text()
 
 
 @pytest.mark.slow
-def test_a_batch_factorises_once(study):
-    maps, both = compiled(study, "taxels"), compiled(study, "taxels", "information")
+def test_a_batch_factorises_once(full_study):
+    wanted = ("taxels",), ("taxels", "information")
+    maps, both = (lowered(full_study, *scores).compile().as_text() or "" for scores in wanted)
     assert maps.count(" while(") < both.count(" while(") < 2 * maps.count(" while(")
 
 
@@ -170,10 +182,11 @@ run_study(read_study(sys.argv[1]), sys.argv[2])
 
 
 @pytest.mark.slow
-def test_two_devices_give_the_same_results(study, study_file, whole_store, store_path):
+def test_two_devices_give_the_same_results(full_study, tmp_path, store_path):
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
-    ended = in_another_process(TWO_DEVICES, study_file, store_path, XLA_FLAGS=flags, JAX_PLATFORMS="cpu")
+    (tmp_path / "study.toml").write_text(EVERY_SCORE, "utf-8")
+    ended = in_another_process(TWO_DEVICES, tmp_path / "study.toml", store_path, XLA_FLAGS=flags, JAX_PLATFORMS="cpu")
     assert ended.returncode == 0, ended.stderr
-    here, there = open_results(study, whole_store), open_results(study, store_path)
+    here, there = run_study(full_study, tmp_path / "here.zarr"), open_results(full_study, store_path)
     for name in here.data_vars:
         np.testing.assert_allclose(there[name], here[name], rtol=1e-9, err_msg=name)

@@ -25,13 +25,15 @@ from jeit.design.scores import Scores
 from jeit.design.skin.skin import Skin, check_skin
 from jeit.layout import Layout, SurfaceLayout
 from jeit.mesh import Domain
-from jeit_solvers.engines import on_host
+from jeit_solvers.engines import as_array, on_host
 from jeit_solvers.module import Module
 
 # Stages of the optimisation: weight w of the penalty, and fraction of all steps after which the stage ends.
 _PENALTY_STAGES = ((1e2, 0.5), (1e3, 0.8), (1e4, 1.0))
 # Safety margin of the constraints, metres, so that a layout rounded to whole nanometres still satisfies them.
 _CONSTRAINT_MARGIN = 2e-7
+# Weight of the penalty if it is minimised alone: large, so that the minimisation stops only where the penalty is zero.
+_FEASIBILITY_WEIGHT = 1e6
 # Maximum distance by which the outline may extend beyond the mesh, relative to the size of the skin.
 _MAX_OVERHANG = 0.01
 # Minimum relative improvement of the score for a layout to count as better than the given layout.
@@ -169,7 +171,9 @@ class _LayoutSearch(Module):
     def cost(self, variables, penalty_weight):
         """Penalised cost (S,) and score (S,) of the layout of each start, and the gradient (S, v) of the cost with
         respect to the v variables."""
-        return _penalised_cost(variables, jnp.asarray(penalty_weight), self)
+        scores, score_gradients = on_host(_scores_and_gradients(variables, self))
+        penalties, gradients = _penalties(variables, self.variables, self.constraints, penalty_weight, 0.0)
+        return penalties - scores, scores, gradients - score_gradients
 
     def run(
         self, initial_variables: Float[Array, "S v"], steps: int, callback
@@ -256,11 +260,6 @@ def _random_starts(variables: Variables, constraints: Constraints, num_layouts: 
     return layouts_variables
 
 
-def _penalty(variables: Variables, constraints: Constraints, variable_values, margin=0.0) -> Float[Array, ""]:
-    violations = constraints.violations(*variables.parameters(variable_values)[:2]) + margin
-    return jnp.sum((jnp.maximum(violations, 0) / variables.pitch) ** 2)
-
-
 _violations_by_name = eqx.filter_jit(Constraints.violations_by_name)
 
 
@@ -275,39 +274,42 @@ def _make_feasible(variables: Variables, constraints: Constraints, start_variabl
     succeeds."""
 
     def cost(start_variables):
-        penalties, gradients = on_host(_penalty_and_gradient(start_variables, variables, constraints))
+        penalties, gradients = _penalties(
+            start_variables, variables, constraints, _FEASIBILITY_WEIGHT, _CONSTRAINT_MARGIN
+        )
         return penalties, -penalties, gradients
 
     return minimise_from_starts(cost, start_variables, 500, Record(), tolerance=0.0)[0]
 
 
-@eqx.filter_jit
-def _penalty_and_gradient(all_variables, variables: Variables, constraints: Constraints):
-    """Penalty (S,) for violated constraints of the layouts of S starts, and its gradient (S, v) with respect to the v
-    variables. Penalty and gradient are scaled by a large factor, so that the minimisation stops only where the penalty
-    is zero."""
-    return jax.vmap(
-        jax.value_and_grad(
-            lambda start_variables: 1e6 * _penalty(variables, constraints, start_variables, _CONSTRAINT_MARGIN)
-        )
-    )(all_variables)
+def _penalties(all_variables, variables: Variables, constraints: Constraints, weight: float, margin: float):
+    """Penalty (S,) for violated constraints of the layouts of S starts, times `weight`, and its gradient (S, v) with
+    respect to the v variables. `margin`: safety margin of the constraints, metres."""
+    return on_host(_penalty_and_gradient(all_variables, variables, constraints, as_array(weight), as_array(margin)))
 
 
 @eqx.filter_jit
-def _penalised_cost(all_variables, penalty_weight, search: _LayoutSearch):
-    variables, constraints, objective = search.variables, search.constraints, search.objective
+def _penalty_and_gradient(all_variables, variables: Variables, constraints: Constraints, weight, margin):
+    def penalty(start_variables):
+        violations = constraints.violations(*variables.parameters(start_variables)[:2]) + margin
+        return weight * jnp.sum((jnp.maximum(violations, 0) / variables.pitch) ** 2)
 
-    def cost_and_score(start_variables):
-        parameters = variables.parameters(start_variables)
+    return jax.vmap(jax.value_and_grad(penalty))(all_variables)
+
+
+@eqx.filter_jit
+def _scores_and_gradients(all_variables, search: _LayoutSearch):
+    """Score (S,) of the layouts of S starts, and its gradient (S, v) with respect to the v variables."""
+
+    def score(start_variables):
+        parameters = search.variables.parameters(start_variables)
         # The score is undefined for an electrode outside the skin, so the electrode is moved to the nearest point of
         # the skin.
-        clipped_parameters = parameters._replace(centres=constraints.outline.nearest(parameters.centres))
-        score = objective.score(objective.scores_of_varied(search.skin, clipped_parameters))
-        return penalty_weight * _penalty(variables, constraints, start_variables) - score, score
+        clipped_parameters = parameters._replace(centres=search.constraints.outline.nearest(parameters.centres))
+        return search.objective.score(search.objective.scores_of_varied(search.skin, clipped_parameters))
 
     # Starts are evaluated one after the other, since the Jacobian of a single layout fills the processor's cache.
-    (cost, score), gradient = jax.lax.map(jax.value_and_grad(cost_and_score, has_aux=True), all_variables)
-    return cost, score, gradient
+    return jax.lax.map(jax.value_and_grad(score), all_variables)
 
 
 @eqx.filter_jit

@@ -19,7 +19,7 @@ from jeit.design.skin.skin import Skin, check_skin
 from jeit.design.skin.touch_shapes import AbstractIndentation
 from jeit.electrodes import SheetDiscs
 from jeit.mesh import Domain
-from jeit_solvers.engines import as_array
+from jeit_solvers.engines import as_array, namespace, values_at_once
 from jeit_solvers.module import Module
 
 Symmetry = Literal["mirror-x", "mirror-y", "rotate-2", "rotate-4"]
@@ -200,6 +200,11 @@ class Variables(Module):
 _compiled_parameters = eqx.filter_jit(Variables.parameters)
 
 
+@values_at_once
+def _scaled(conductance, thickness, initial_thickness):
+    return conductance * (thickness / initial_thickness)
+
+
 def _is_in_first_sector(offsets: np.ndarray, symmetry: str | None) -> np.ndarray:
     x, y = offsets.T
     if symmetry == "mirror-x":
@@ -225,10 +230,12 @@ def _check_symmetric_counts(num_first: int, num_sectors: int, num_electrodes: in
     )
 
 
+@values_at_once
 def balanced_score(scores: Scores) -> Float[Array, ""]:
     """Default score of an `Objective`: log of the smooth minimum of the sensitivity minus log of the mean variance, so
     that a change by one per cent has the same effect for both quantities."""
-    return jnp.log(scores.soft_worst) - jnp.log(scores.mean_variance)
+    xp = namespace(scores)
+    return xp.log(scores.soft_worst) - xp.log(scores.mean_variance)
 
 
 class Objective(Module):
@@ -287,7 +294,7 @@ class Objective(Module):
         """Compute the scores of a skin with its electrodes and thickness replaced by those of `varied`. The scores are
         differentiable with respect to `varied`."""
         model = skin.model.with_electrodes(SheetDiscs(varied.centres, varied.radii, varied.contact_impedance))
-        conductance = skin.model_conductivity * (varied.thickness / skin.thickness)
+        conductance = _scaled(skin.model_conductivity, varied.thickness, skin.thickness)
         touches = self.touches.at_thickness(varied.thickness)
         options = {"prior": self.prior, "noise": self.noise, "temperature": self.temperature}
         return layout_scores(model, conductance, touches, **options)

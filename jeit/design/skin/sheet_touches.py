@@ -13,7 +13,7 @@ from jeit.design.skin.touch_shapes import AbstractIndentation
 from jeit.design.skin.touched_cells import TouchedCells, touched_cells
 from jeit.mesh import Mesh, centroids
 from jeit.mesh.geodesic import Geodesics, Triangles
-from jeit_solvers.engines import gather, host, namespace, on_host, sum_into
+from jeit_solvers.engines import gather, host, namespace, on_host, sum_into, values_at_once
 from jeit_solvers.module import Module
 
 
@@ -35,6 +35,7 @@ class SheetTouches(Module):
     thickness: Float[Array, ""]
     depth: float
 
+    @values_at_once
     def at_thickness(self, thickness) -> "SheetTouches":
         """Return the same touches for a sheet that represents a layer of a different `thickness`, metres. Conductivity
         changes are proportional to depth / thickness."""
@@ -42,7 +43,7 @@ class SheetTouches(Module):
         touched = eqx.tree_at(
             lambda cells_to_change: cells_to_change.change, self.touched, self.touched.change * depth_ratio
         )
-        return SheetTouches(touched, self.slope * depth_ratio, jnp.asarray(thickness), self.depth)
+        return SheetTouches(touched, self.slope * depth_ratio, thickness, self.depth)
 
     def weights(self, conductivity: Float[Array, " m"]) -> tuple[Float[Array, "n m"], Float[Array, "2 n m"]]:
         """Compute the change (n, m) of the conductivity of every cell due to every touch, siemens, and the derivatives

@@ -27,7 +27,7 @@ from jeit.mesh import Domain, Mesh, Rectangle, layer, shell
 from jeit.mesh.generate.unstructured import MOST_POINTS
 from jeit.mesh.geodesic import Triangles
 from jeit.protocol import Protocol
-from jeit_solvers.engines import host, on_host
+from jeit_solvers.engines import host, on_host, values_at_once
 from jeit_solvers.module import Module
 
 # Number of nodes of a plane mesh times (cell size)² / area: 1.155 for equilateral cells, and slightly more due to the
@@ -301,6 +301,7 @@ def longer_side(outline: Domain | Triangles) -> float:
     return float(max(high_x - low_x, high_y - low_y))
 
 
+@values_at_once
 def model_conductivity(conductivity, thickness, num_layers: int):
     """Conductivity for a forward model: for a layer the `conductivity` of the material, S/m; for a sheet this
     conductivity times the thickness, in siemens."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
@@ -74,8 +73,9 @@ class Disk(Domain):
 
     def contains(self, points: ArrayLike) -> Bool[Array, "..."]:
         """Whether each of `points` (…, 2), in metres, lies in the disk or on its edge."""
-        offset = jnp.asarray(points) - jnp.asarray(self.centre)
-        return jnp.sum(offset**2, axis=-1) <= self.radius**2 * (1 + 1e-12)
+        xp = numerics(self, points)
+        offset = xp.asarray(points) - xp.asarray(self.centre)
+        return as_array((offset**2).sum(axis=-1) <= self.radius**2 * (1 + 1e-12))
 
     def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
         """Distance (p,) of `points` (p, 2) from the circle, metres, negative outside: R minus the distance from the
