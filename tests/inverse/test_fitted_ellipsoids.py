@@ -77,9 +77,7 @@ def test_a_column_is_distinguished_from_a_ball(coarse, bath, one_mesh, column):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("ratios", "alike"), [((4.0, 4.0), True), ((2.0, 10.0), False)])
-def test_two_balls_are_of_one_material_unless_the_data_contradict(
-    coarse, bath, two_balls, ratios, alike, monkeypatch
-):
+def test_two_balls_are_of_one_material_unless_the_data_contradict(coarse, bath, two_balls, ratios, alike, monkeypatch):
     """Large ratios are hard to estimate; a common one is estimated more precisely. On two finer meshes, of which one
     would not suffice."""
     monkeypatch.setattr(search, "_MAX_REFINEMENTS", 2)
