@@ -20,7 +20,7 @@ from benchmarks.harness.timing import say
 from benchmarks.problems.cut_tanks import without
 from jeit.data import read
 from jeit.image.rasters import challenge_score
-from jeit.imaging import ImagingSettings, image_difference
+from jeit.imaging import ImagedDifference, ImagingSettings, image_difference
 
 LEVELS, TARGETS = range(1, 8), range(1, 5)
 METHOD, OTHER = "auto", "total-variation"
@@ -61,21 +61,29 @@ def scores(
     folder: Path, method: str, num_points: int = 2000, levels=LEVELS, targets=TARGETS, report=print
 ) -> np.ndarray:
     """The challenge's scores (levels, targets) of the segmentations by `method`."""
-    reference = read(folder / "ref.mat")
     table = np.zeros((len(levels), len(targets)))
     settings = ImagingSettings(method=method, segment=True, num_points=num_points)
     for row, level in enumerate(levels):
-        gone = list(range(2 * (level - 1)))
         for column, target in enumerate(targets):
-            frame = read(folder / f"data{target}.mat")
             start = time.perf_counter()
-            found = image_difference(without(frame, gone), without(reference, gone), settings)
+            found = imaged(folder, target, level, settings)
             seconds = time.perf_counter() - start
-            assert found.labels is not None
-            truth = scipy.io.loadmat(folder / f"true{target}.mat")["truth"]
-            table[row, column] = challenge_score(found.labels, truth)
+            table[row, column] = score(found, folder, target)
             report(f"{method}, level {level}, target {target}: {table[row, column]:.3f}  ({seconds:.1f} s)")
     return table
+
+
+def imaged(folder: Path, target: int, level: int, settings: ImagingSettings) -> ImagedDifference:
+    """The image of a target at a level."""
+    gone = list(range(2 * (level - 1)))
+    frame, reference = (without(read(folder / name), gone) for name in (f"data{target}.mat", "ref.mat"))
+    return image_difference(frame, reference, settings)
+
+
+def score(found: ImagedDifference, folder: Path, target: int) -> float:
+    """The challenge's score of the labels of an image of a target."""
+    assert found.labels is not None
+    return challenge_score(found.labels, scipy.io.loadmat(folder / f"true{target}.mat")["truth"])
 
 
 CASE = Case(

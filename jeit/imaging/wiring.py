@@ -291,20 +291,19 @@ def _comparison(
     voltages, mask = np.real(np.asarray(measurement.filled())[0]), np.asarray(measurement.mask)[0]
     voltages = voltages if signs else np.abs(voltages)
 
+    stacked = np.stack([np.asarray(impedance) for impedance in impedances])
+
     def misfit_of(wiring: Wiring) -> Wiring:
         electrode_places, order = np.array(wiring.places), orders[wiring.order]
         measured, used = voltages[order], mask[order]
-        norm, best_wiring = np.linalg.norm(measured), wiring
-        for impedance in impedances:
-            expected = np.where(
-                used, select_channels(protocol, impedance[np.ix_(electrode_places, electrode_places)]), 0
-            )
-            expected = expected if signs else np.abs(expected)
-            scale = expected @ measured / (expected @ expected)
-            misfit = float(np.linalg.norm(measured - scale * expected) / norm)
-            if misfit < best_wiring.misfit or best_wiring is wiring:
-                best_wiring = replace(wiring, misfit=misfit, reversed_signs=bool(scale < 0))
-        return best_wiring
+        placed = stacked[:, electrode_places[:, None], electrode_places]
+        expected = np.where(used, [select_channels(protocol, impedance) for impedance in placed], 0)
+        expected = expected if signs else np.abs(expected)
+        scales = expected @ measured / np.sum(expected**2, axis=1)
+        residual_norms = np.linalg.norm(measured - scales[:, None] * expected, axis=1)
+        best = int(np.argmin(residual_norms))
+        misfit = float(residual_norms[best] / np.linalg.norm(measured))
+        return replace(wiring, misfit=misfit, reversed_signs=bool(scales[best] < 0))
 
     return misfit_of
 

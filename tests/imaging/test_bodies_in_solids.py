@@ -66,7 +66,7 @@ def test_a_ball_is_fitted_beside_a_smooth_field(monkeypatch):
     frame, reference = measured(model, BATH * np.where(held, TIMES, 1.0), 1), measured(model, BATH, 2)
     asked, fitted = {}, method.reconstruct_shapes
     monkeypatch.setattr(method, "reconstruct_shapes", lambda *a, **k: asked.update(k) or fitted(*a, **k))
-    result = image_difference(frame, reference, ImagingSettings(num_points=2500))
+    result = image_difference(frame, reference, ImagingSettings(num_points=1600))
     assert asked["smooth"] is not None
     assert asked["least_rise"] == 1
     assert result.shapes is not None
@@ -204,7 +204,7 @@ def test_bodies_of_a_sound_linear_image_are_distinguished_in_a_cylinder():
     middle, radius = np.array([-0.018, 0.008, 0.044]), 0.012
     held = np.linalg.norm(np.asarray(centroids(model.mesh)) - middle, axis=1) < radius
     frame = measured(model, BATH * np.where(held, 0.2, 1.0), 1, tank)
-    result = image_difference(frame, measured(model, BATH, 2, tank), ImagingSettings(num_points=2500))
+    result = image_difference(frame, measured(model, BATH, 2, tank), ImagingSettings(num_points=1600))
     assert "which a linear image of a solid blurs" in result.why
     body = result.shapes.bodies[0]
     assert np.linalg.norm(body.centroid - middle) < 0.004

@@ -62,7 +62,7 @@ def two_balls():
 
 
 @pytest.mark.slow
-def test_a_column_is_distinguished_from_a_ball(coarse, bath, column):
+def test_a_column_is_distinguished_from_a_ball(coarse, bath, one_mesh, column):
     noise = 0.03 * np.sqrt(np.mean(column**2))
     start = [(1, BALL + 0.005, 0.03)]
     found = reconstruct_shapes(coarse, bath + column, BATH, start=start, noise=noise)
@@ -77,8 +77,10 @@ def test_a_column_is_distinguished_from_a_ball(coarse, bath, column):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("ratios", "alike"), [((4.0, 4.0), True), ((2.0, 10.0), False)])
-def test_two_balls_are_of_one_material_unless_the_data_contradict(coarse, bath, two_balls, ratios, alike):
-    """Large ratios are hard to estimate; a common one is estimated more precisely."""
+def test_two_balls_are_of_one_material_unless_the_data_contradict(coarse, bath, two_balls, ratios, alike, monkeypatch):
+    """Large ratios are hard to estimate; a common one is estimated more precisely. On two finer meshes, of which one
+    would not suffice."""
+    monkeypatch.setattr(search, "_MAX_REFINEMENTS", 2)
     balls, fine, rest = two_balls
     mesh = fine.mesh
     factor = np.ones(mesh.num_cells)
