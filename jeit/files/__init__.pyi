@@ -11,7 +11,7 @@ from .limits import (
     read_text,
     read_toml,
 )
-from .npz_file import check_archive, npy_array, npz_arrays, require_arrays
+from .npz_file import check_archive, npy_array, npz_arrays, npz_shapes, require_arrays
 
 __all__ = [
     "MOST_ELECTRODES",
@@ -23,6 +23,7 @@ __all__ = [
     "error_text",
     "npy_array",
     "npz_arrays",
+    "npz_shapes",
     "parsed_toml",
     "read_as",
     "read_json",

@@ -3,12 +3,14 @@ data than the headers declare."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import struct
 import sys
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -46,6 +48,34 @@ def npz_arrays(
     Raises `ValueError` for files that are not NPZ files (with the text `otherwise`), damaged files, arrays of objects,
     and arrays that exceed the memory limit (`check_memory`). Raises `OSError` if the file does not exist.
     """
+    with _opened(path, otherwise) as archive:
+        members = _members(archive)
+        requested = {name: info for name, info in members.items() if read_all or name in keys}
+        headers = {name: _member_header(archive, name, info) for name, info in requested.items()}
+        check_memory(path.name, sum(header.memory for header in headers.values()))
+        arrays = {}
+        for name, info in requested.items():
+            with archive.open(info) as member:
+                arrays[name] = _read_array(member)
+    return {"": np.array([*members], dtype=str), **arrays}
+
+
+def npz_shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """Shapes of the arrays of numbers in an NPZ file, read from their headers; arrays of text or objects are omitted.
+    Raises the errors of `npz_arrays`."""
+    shapes = {}
+    with _opened(path) as archive:
+        for name, info in _members(archive).items():
+            with contextlib.suppress(ValueError):  # of an array of objects, or of a file of another kind
+                header = _member_header(archive, name, info)
+                if header.dtype.kind in "biufc":
+                    shapes[name] = header.shape
+    return shapes
+
+
+@contextlib.contextmanager
+def _opened(path: Path, otherwise: str = "not an NPZ file") -> Iterator[zipfile.ZipFile]:
+    """Open an NPZ file, and convert the errors of reading it. Arguments and errors as in `npz_arrays`."""
     with path.open("rb") as file:
         mark = file.read(4)
         if mark == _NPY_MARK:
@@ -57,19 +87,15 @@ def npz_arrays(
         file.seek(0)
         try:
             with zipfile.ZipFile(file) as archive:
-                members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-                requested = {name: info for name, info in members.items() if read_all or name in keys}
-                headers = {name: _member_header(archive, name, info) for name, info in requested.items()}
-                check_memory(path.name, sum(header.memory for header in headers.values()))
-                arrays = {}
-                for name, info in requested.items():
-                    with archive.open(info) as member:
-                        arrays[name] = _read_array(member)
+                yield archive
         except TooLarge:
             raise
         except (*FAULTS, OSError) as error:  # the archive may place a member before the start of the file
             raise _unreadable_error("NPZ file of plain arrays", error) from None
-    return {"": np.array([*members], dtype=str), **arrays}
+
+
+def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    return {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
 
 
 def npy_array(path: Path) -> np.ndarray:

@@ -18,7 +18,7 @@ from jeit.data.formats.boards import OpenEit
 from jeit.data.formats.table import measurement_in
 from jeit.data.formats.text import Frames, frames_in_table, frames_in_text, read_text
 from jeit.data.quality import reciprocity_error
-from jeit.files import matlab, npy_array, npz_arrays
+from jeit.files import matlab, npy_array, npz_arrays, npz_shapes
 from jeit.imaging.wiring import Wiring
 from jeit.protocol import Protocol
 
@@ -177,15 +177,14 @@ def _read_array(path: Path, key: str | None, excluded: str | None) -> tuple[np.n
     if path.suffix.lower() == ".mat":
         sizes, axis = matlab.shapes(path), "columns"
     else:
-        arrays = npz_arrays(path, *([key] if key else ["voltages"]))
-        sizes, axis = {item: np.shape(arrays[item]) if item in arrays else () for item in np.ravel(arrays[""])}, "rows"
-    name = key
+        sizes, axis = npz_shapes(path), "rows"
+    name = "voltages" if key is None and "voltages" in sizes else key  # of a file that jeit wrote
     if name is None:
         tables = [item for item, shape in sizes.items() if item != excluded and int(np.prod(shape)) > 3]
-        if len(tables) != 1:
-            names = (
-                names_text([f"{item} ({' × '.join(map(str, sizes[item]))})" for item in tables]) if tables else "none"
-            )
+        if not tables:
+            raise ValueError(f"{path.name} holds no array of numbers{f' besides {excluded!r}' if excluded else ''}.")
+        if len(tables) > 1:
+            names = names_text([f"{item} ({' × '.join(map(str, sizes[item]))})" for item in tables])
             raise ValueError(f"{path.name}: arrays of numbers are {names}. Name that of the frames by key=.")
         name = tables[0]
     if name not in sizes:

@@ -141,7 +141,7 @@ BAD_FILES = {
     "transposed": (table("\n".join(FRAME.split(",")), GOOD + 'frames_in = "rows"\n'), "transposed"),
     "all zero": (table(",".join(["0"] * 40)), "every usable voltage is zero"),
     "all missing": (table(",".join(["nan"] * 40)), "every usable voltage is zero, NaN or missing"),
-    "no voltages in npz": (numpy_file(u=np.ones(40)), "no array 'voltages'"),
+    "no voltages in npz": (numpy_file(u=np.ones(40), v=np.ones(40)), "no array 'voltages'"),
     "pickled npz": (numpy_file(voltages=np.array([{}] * 40, dtype=object)), "objects"),
     "damaged npz": (lambda folder: table()(folder) and raw("a.npz", b"PK\x03\x04xx")(folder), "not a readable NPZ"),
     "damaged mat": (raw("a.mat", b"MATLAB 5.0" + b"\0" * 200), "not a readable .mat"),

@@ -1,11 +1,14 @@
 """Quality checks: masked channels, estimated noise, and refused frames."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
 
 from jeit import data, protocol
 from jeit.data.frame_checks import assess, mask_spikes
+from jeit.data.inferred_properties import channel_gains
 from jeit.data.quality import channel_reciprocity_error, expected_signs, rounding_deviation
 from jeit.inverse import relative_noise
 from jeit.report.hyperparameter_rules import report_measurement
@@ -320,3 +323,16 @@ def test_no_spike_is_found_where_channels_are_independent(tank, setup):
     touched[3] *= 1.1
     touched = data.screen(touched, chosen, **setup(8))
     assert mask_spikes(touched, empty) is touched
+
+
+def test_gains_of_measurements_follow_from_reciprocity(tank, setup):
+    chosen = protocol.adjacent(16)
+    gains = np.exp(0.1 * np.random.default_rng(0).normal(size=16))
+    uneven = np.asarray(tank(chosen)) * gains[np.asarray(chosen.measurement_index)]
+    measurement = data.screen(uneven, chosen, **setup(16))
+    found, error = channel_gains(measurement)
+    np.testing.assert_allclose(found / gains, np.mean(found / gains), rtol=1e-3)
+    assert error is not None
+    assert error < 1e-3 < data.reciprocity_error(measurement)
+    few = measurement.mask & (np.asarray(chosen.drive_index) < 3)
+    assert channel_gains(replace(measurement, mask=few)) == (None, None)

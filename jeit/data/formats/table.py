@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,13 +25,14 @@ from jeit.data.formats.text import (
 from jeit.data.inferred_properties import fitting_protocol, unmeasured_driven_channels, with_signs
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
-from jeit.files import npy_array, npz_arrays
+from jeit.files import npy_array, npz_arrays, npz_shapes
 from jeit.protocol import Protocol
 
 DESCRIPTION = "table (.csv, .txt, .npy, .npz) with a TOML description beside it"
 SUFFIXES = (".csv", ".txt", ".dat", ".npy", ".npz")
 # Arrays that `write_table` stores in addition to the voltages and the protocol.
 _TEXT_ARRAYS = ("mask", "protocol_name", "frame_names", "notes", "times")
+_STORED_ARRAYS = (*PROTOCOL_ARRAYS, *_TEXT_ARRAYS)
 
 AXES = ("electrodes", "patterns", "frames")
 """Names of the axes of an array of voltages, in their default order; a description can state a different order."""
@@ -277,13 +279,23 @@ def component_notes(values: np.ndarray, layout: TableLayout) -> tuple[str, ...]:
 
 def _from_numpy(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Read from an NPZ file, by name, the arrays `keys` and the arrays that `write_table` stores; or from an NPY file
-    its array, as "voltages"."""
+    its array, as "voltages". Without `keys`, an array of another name is read as "voltages" if it is the only one."""
     try:
         if path.suffix.lower() == ".npy":
             return {"voltages": npy_array(path)}
-        return npz_arrays(path, *(keys or ("voltages",)), *PROTOCOL_ARRAYS, *_TEXT_ARRAYS)
+        names = keys or (_name_of_voltages(path),)
+        arrays = npz_arrays(path, *names, *_STORED_ARRAYS)
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from None
+    return arrays if keys or names[0] not in arrays else {**arrays, "voltages": arrays[names[0]]}
+
+
+def _name_of_voltages(path: Path) -> str:
+    """Name of the array of voltages in an NPZ file: "voltages", unless another array is the only one of more than three
+    numbers."""
+    shapes = npz_shapes(path)
+    names = [name for name, shape in shapes.items() if name not in _STORED_ARRAYS and math.prod(shape) > 3]
+    return names[0] if "voltages" not in shapes and len(names) == 1 else "voltages"
 
 
 def _voltages(arrays: dict[str, np.ndarray], layout: TableLayout, path: Path) -> np.ndarray:

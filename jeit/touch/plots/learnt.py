@@ -10,7 +10,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 
-from jeit.arguments import check_kind, real_array
+from jeit.arguments import check_kind, counted, real_array
 from jeit.plot.axes import (
     DARK_GREY,
     LIGHT_GREY,
@@ -107,7 +107,8 @@ def plot_answers(touches: Touches, *, title: str | None = None, ax: Axes | None 
         ax.axvline(unlike_frame, color=SERIES_COLOURS[1], linewidth=0.6, alpha=0.5, zorder=0)
     ax.set_xlabel("Frame", color=DARK_GREY)
     num_unlike = int(touches.unlike.sum())
-    ax.set_title((f"red: {num_unlike} frames unlike any learnt from" if num_unlike else "") if title is None else title)
+    unlike_text = f"red: {counted(num_unlike, 'frame')} unlike any learnt from" if num_unlike else ""
+    ax.set_title(unlike_text if title is None else title)
     soften_axes(ax)
     return ax
 

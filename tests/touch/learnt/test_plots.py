@@ -1,0 +1,55 @@
+"""Pictures of what a learnt skin predicts, and of its errors on held-out presses, from predictions that are made up."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from jeit.touch.learnt.learn_from_presses import Standing
+from jeit.touch.learnt.recorded_presses import Touches
+from jeit.touch.plots.learnt import plot_answers, plot_key_errors, plot_places
+
+
+def touches(**fields) -> Touches:
+    names = ("position", "position_std", "force", "force_std", "label", "probability", "touched", "key_probability")
+    unlike, others = fields.pop("unlike", np.zeros(4, bool)), {"novelty": np.zeros(4), "alive": np.ones((4, 1), bool)}
+    return Touches(**{name: fields.get(name) for name in names}, unlike=unlike, **others)
+
+
+def test_places_are_drawn_with_their_deviations_and_frames_without_a_touch_are_left_out():
+    position = np.array([[0.01, 0.02], [np.nan, np.nan], [0.03, 0.01], [0.02, 0.02]])
+    ax = plot_places(touches(position=position, position_std=np.full((4, 2), 1e-3)))
+    ellipses, points = ax.collections[:2]
+    np.testing.assert_allclose(np.asarray(points.get_offsets()), position[[0, 2, 3]])
+    assert len(np.asarray(ellipses.get_offsets())) == 3
+    assert ax.get_title().startswith("3 touches")
+    nothing = np.full((4, 2), np.nan)
+    empty = plot_places(touches(position=nothing, position_std=nothing))
+    unlike = plot_places(touches(position=nothing, position_std=nothing, unlike=np.ones(4, bool)))
+    assert (empty.get_title(), unlike.get_title()) == ("No touch", "All frames unlike any learnt from")
+    with pytest.raises(ValueError, match="did not learn any"):
+        plot_places(touches())
+    plt.close("all")
+
+
+def test_keys_labels_and_forces_are_drawn_over_the_frames():
+    keys = plot_answers(touches(touched=np.eye(4, 3, dtype=bool)))
+    assert (keys.get_ylabel(), len(keys.get_yticks())) == ("Key", 3)
+    labels = plot_answers(touches(label=np.array(["tap", "", "stroke", "tap"])))
+    assert [text.get_text() for text in labels.get_yticklabels()] == ["stroke", "tap"]
+    np.testing.assert_array_equal(labels.lines[0].get_xydata(), [[0, 1], [2, 0], [3, 1]])
+    force = np.array([0.0, 1.0, 2.0, 1.0])
+    unlike = np.array([False, False, True, False])
+    forces = plot_answers(touches(force=force, force_std=np.full(4, 0.1), unlike=unlike))
+    assert forces.get_ylabel() == "Force (N)"
+    np.testing.assert_array_equal(forces.lines[0].get_ydata(), force)
+    assert forces.get_title() == "red: 1 frame unlike any learnt from"
+    plt.close("all")
+
+
+def test_errors_of_keys_are_shares_of_presses():
+    right = np.array([[True, False], [True, True], [False, True], [False, False]])
+    held_out = right ^ np.array([[True, False], [False, False], [False, False], [False, False]])
+    ax = plot_key_errors(Standing("som", [("som", 0.1)], held_out, right, None))
+    assert [bar.get_height() for bar in ax.patches] == [25.0, 0.0]  # pyright: ignore
+    assert ax.get_title() == "Keys: 87.5 % right, whole patterns 75.0 %"
+    plt.close(ax.figure)
