@@ -13,6 +13,7 @@ import scipy.io
 
 from jeit import data
 from jeit.cli import main
+from jeit.cli.commands.describe import _body_tables
 from jeit.data.description import TableLayout, parse_description
 from jeit.data.formats.text import frames_in_table
 from jeit.imaging.describe import Findings, _with_misfit, find_description
@@ -315,6 +316,14 @@ def test_for_a_file_with_its_protocol_the_body_is_described(tmp_path):
         find_description(path, DISK, RING, known={"number": 16})
 
 
+def test_plates_of_a_solid_are_on_half_its_height():
+    geometry, electrodes = _body_tables("cylinder:0.1,0.2", 0.01, None)
+    assert geometry == {"shape": "cylinder", "radius": 0.1, "height": 0.2}
+    assert electrodes == {"kind": "patch", "layout": "ring", "width": 0.01, "height": 0.2, "levels": 0.1}
+    _, low = _body_tables("box:0.3,0.2,0.1", 0.01, 0.02)
+    assert (low["layout"], low["height"], low["levels"]) == ("perimeter", 0.02, 0.05)
+
+
 def test_command(tmp_path, capsys, monkeypatch):
     voltages, _ = simulated(KINDS[1], conductivity=1.7e-3)  # imaged in one step
     empty, rod = saved(tmp_path, -voltages, "\t")
@@ -325,6 +334,14 @@ def test_command(tmp_path, capsys, monkeypatch):
     assert missing in capsys.readouterr().err
     assert main([*given, "--shape", "disk:0.1,3", "--width", "0.012"]) == 1
     assert "--shape: give one of disk:RADIUS" in capsys.readouterr().err
+    for options, message in (
+        (("disk:big", "--width", "0.012"), "--shape: give one of disk:RADIUS"),
+        (("disk:0.1", "--width", "0.012", "--height", "0.1"), "--height: a disk is a sheet; leave it out"),
+        (("disk:0.1", "--width", "0.012", "--order", "back"), "--order"),
+        (("disk:0.1", "--width", "0.2", "--electrodes", "8", "--protocol", "adjacent"), "--width: electrodes 1 and"),
+    ):
+        assert main([*given, "--shape", *options]) == 1
+        assert capsys.readouterr().err.startswith(f"jeit: {message}")
     assert main([*given, "--shape", "disk:0.1", "--width", "0", "--electrodes", "8"]) == 1
     assert capsys.readouterr().err.startswith("jeit: --width is 0, and must be from")
     assert main([*given, "--shape", "disk:0.1", "--width", "0.012", "--electrodes", "8", "--protocol", "adjacent"]) == 0

@@ -179,6 +179,9 @@ def test_svg_is_to_scale_with_the_y_axis_upwards(tmp_path):
         ("-100.0,50.0", "-100.0", "9 numbers, not pairs"),
         ("<text", "<text/><text", "there are 6; give one for each of the 3"),
         ("</svg>", "", "not an SVG drawing"),
+        ("<circle ", '<circle transform="scale(1e20) scale(1e20)" ', "transform of .* is too large for a drawing"),
+        ('cx="-80.0"', 'cx="1e99"', "cx of .* too large for a drawing"),
+        ("<circle ", "<blob ", "stands where a circle should"),
         ("http://www.w3.org/2000/svg", "http://www.w3.org/1999/xhtml", "not an SVG drawing"),
     ],
 )
