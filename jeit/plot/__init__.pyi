@@ -1,4 +1,4 @@
-from .axes import ColourScale
+from .colours import ColourScale
 from .imaging.image import plot_admittivity, plot_image, plot_mesh
 from .imaging.judgement import plot_choice, plot_figures_of_merit
 from .imaging.series import plot_frames

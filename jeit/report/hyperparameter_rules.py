@@ -145,7 +145,7 @@ def _draw_outcome(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
     """Draw the image of one rule with its own colour scale; inclusions are marked unless there are more than
     `_MAX_MARKED`."""
     from jeit.plot import ColourScale, plot_image
-    from jeit.plot.axes import DARK_GREY
+    from jeit.plot.colours import DARK_GREY
     from jeit.plot.imaging.judgement import COLOURS
 
     num_inclusions = len(outcome.inclusions)
@@ -159,7 +159,7 @@ def _draw_outcome(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
 
 def _draw_scale(ax, largest: float, unit: str) -> None:
     """Draw a small colour bar below an image, with labels at its ends and at zero."""
-    from jeit.plot.axes import DARK_GREY, LIGHT_GREY, with_si_prefix
+    from jeit.plot.colours import DARK_GREY, LIGHT_GREY, with_si_prefix
 
     factor, unit = with_si_prefix(largest, unit)
     limit = factor * largest

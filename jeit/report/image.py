@@ -114,7 +114,7 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     """
     from matplotlib.figure import Figure
 
-    from jeit.plot.axes import CHANGE_SCALE, FACTOR_SCALE
+    from jeit.plot.colours import CHANGE_SCALE, FACTOR_SCALE
     from jeit.plot.imaging.electrodes import draw_labels, draw_outlines
     from jeit.plot.imaging.image import plot_image
 

@@ -57,7 +57,8 @@ def _draw_mesh(mesh: Any) -> Figure:
 def _draw_layout(layout: Any) -> Figure:
     from matplotlib.patches import Circle
 
-    from jeit.plot.axes import DARK_GREY, LIGHT_GREY, draw_scale_bar, hide_axes
+    from jeit.plot.axes import draw_scale_bar, hide_axes
+    from jeit.plot.colours import DARK_GREY, LIGHT_GREY
 
     figure = Figure(figsize=(5.0, 4.6), layout="constrained")
     ax = figure.subplots()
@@ -77,7 +78,7 @@ def _draw_layout(layout: Any) -> Figure:
 
 
 def _draw_measurement(measurement: Any) -> Figure:
-    from jeit.plot.axes import with_si_prefix
+    from jeit.plot.colours import with_si_prefix
 
     figure = Figure(figsize=(7.0, 3.2), layout="constrained")
     ax = figure.subplots()

@@ -305,7 +305,7 @@ def write_views(
 def drawn_values(image: SavedImage) -> tuple[np.ndarray, "ColourScale"]:
     """Values per cell to draw, and their colour scale: `departure` for iterative images, the real part of the change
     for complex images, otherwise the change of conductivity."""
-    from jeit.plot.axes import CHANGE_SCALE, FACTOR_SCALE, ColourScale
+    from jeit.plot.colours import CHANGE_SCALE, FACTOR_SCALE, ColourScale
 
     if image.departure is not None:
         return image.departure, FACTOR_SCALE

@@ -70,7 +70,7 @@ def write_film(
     from matplotlib.animation import FFMpegWriter, PillowWriter
     from matplotlib.figure import Figure
 
-    from jeit.plot.axes import LIGHT_GREY, ColourScale
+    from jeit.plot.colours import LIGHT_GREY, ColourScale
     from jeit.plot.imaging.image import slice_text
     from jeit.plot.imaging.series import FramePicture, fit_scale, select_frames
 

@@ -22,7 +22,8 @@ from jeit.inverse.shapes import Quantities, Star
 from jeit.layout import perimeter, ring
 from jeit.mesh import Disk, Polygon, Rectangle, Solid, centroids, disk, layer, rectangle
 from jeit.plot import ColourScale, plot_image, plot_mesh
-from jeit.plot.axes import FACTOR_SCALE, extent_of, hide_axes
+from jeit.plot.axes import extent_of, hide_axes
+from jeit.plot.colours import FACTOR_SCALE
 from jeit.plot.imaging.electrodes import draw_electrodes, draw_inclusions, draw_outlines
 from jeit.plot.imaging.image import plot_raster, plot_sensitivity
 from jeit.plot.imaging.judgement import plot_voltages

@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike
 
 from jeit.acoustic.plots.surface_view import ESTIMATE_COLOUR, AnySurface, draw_legend, draw_surface, view_of
 from jeit.arguments import check_kind, check_name
-from jeit.plot.axes import DARK_GREY, SERIES_COLOURS, SERIES_MARKERS, axes_or_new, draw_horizontal_grid, soften_axes
+from jeit.plot.axes import axes_or_new, draw_horizontal_grid, soften_axes
+from jeit.plot.colours import DARK_GREY, SERIES_COLOURS, SERIES_MARKERS
 
 _STATISTICS = {
     "median": lambda errors: np.nanmedian(errors, axis=1),

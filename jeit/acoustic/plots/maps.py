@@ -27,7 +27,8 @@ from jeit.acoustic.plots.surface_view import (
     view_of,
 )
 from jeit.arguments import check_kind, check_name
-from jeit.plot.axes import DARK_GREY, LIGHT_GREY, SEQUENTIAL, axes_or_new, draw_colour_bar, soften_axes
+from jeit.plot.axes import axes_or_new, soften_axes
+from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SEQUENTIAL, draw_colour_bar
 from jeit_solvers.engines import on_host
 
 # Dynamic range in decibels of the circles that show the received intensities: the circle of a microphone this far below

@@ -16,7 +16,8 @@ from scipy.special import chdtri
 from jeit.acoustic import Calibration, MicrophoneArray
 from jeit.acoustic.surface import AbstractSurface, bounding_box, make_surface
 from jeit.mesh import Domain
-from jeit.plot.axes import DARK_GREY, LIGHT_GREY, draw_scale_bar, extent_of, hide_axes
+from jeit.plot.axes import draw_scale_bar, extent_of, hide_axes
+from jeit.plot.colours import DARK_GREY, LIGHT_GREY
 from jeit_solvers.engines import host, on_host, slopes
 
 MICROPHONE_COLOUR, ESTIMATE_COLOUR = "#1f6fb4", "#c8102e"

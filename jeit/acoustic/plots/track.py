@@ -17,7 +17,8 @@ from jeit.acoustic.localisation.locations import Locations, LocationStatus
 from jeit.acoustic.plots.surface_view import View, draw_ellipse, draw_legend, draw_surface, outline_of, view_of
 from jeit.acoustic.touch_tracks import Touch, Track
 from jeit.arguments import check_kind
-from jeit.plot.axes import DARK_GREY, LIGHT_GREY, axes_or_new, draw_colour_bar
+from jeit.plot.axes import axes_or_new
+from jeit.plot.colours import DARK_GREY, LIGHT_GREY, draw_colour_bar
 
 _OVERLAY_COLOURS = LinearSegmentedColormap.from_list("glow", ["#ffffff", "#bccddf", "#6a8aae"])
 _TIME_COLOURS = LinearSegmentedColormap.from_list("time", ["#0d0887", "#7e03a8", "#cc4778", "#f89540", "#fbd724"])

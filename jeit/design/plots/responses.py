@@ -15,18 +15,8 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind, check_name
 from jeit.design.sensitivity import SensitivityMap
 from jeit.design.taxels import Taxels
-from jeit.plot.axes import (
-    DARK_GREY,
-    LIGHT_GREY,
-    SEQUENTIAL,
-    axes_or_new,
-    draw_colour_bar,
-    draw_legend_above,
-    draw_scale_bar,
-    extent_of,
-    hide_axes,
-    soften_axes,
-)
+from jeit.plot.axes import axes_or_new, draw_legend_above, draw_scale_bar, extent_of, hide_axes, soften_axes
+from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SEQUENTIAL, draw_colour_bar
 
 _COLOURS = (DARK_GREY, "#c8102e", "#1f6fb4", "#2a9d6f")
 _TAXEL_COLOURS = (*_COLOURS, "#8a5cb8", "#d98a1c")

@@ -14,7 +14,8 @@ from jeit.arguments import check_kind
 from jeit.design.optimisation.optimise import Optimisation
 from jeit.layout.surface_layout import flat_layout
 from jeit.mesh import Domain
-from jeit.plot.axes import DARK_GREY, LIGHT_GREY, axes_or_new, draw_scale_bar, hide_axes
+from jeit.plot.axes import axes_or_new, draw_scale_bar, hide_axes
+from jeit.plot.colours import DARK_GREY, LIGHT_GREY
 from jeit.plot.imaging.electrodes import METAL
 
 _KEEP_OUT_STYLE = {"facecolor": "none", "edgecolor": LIGHT_GREY, "hatch": "////", "linewidth": 0.5, "zorder": 1}

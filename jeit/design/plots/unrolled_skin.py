@@ -16,18 +16,8 @@ from jeit.arguments import check_kind
 from jeit.electrodes import FaceDiscs, SurfaceDiscs
 from jeit.layout import SurfaceLayout
 from jeit.mesh.geodesic import Unrolled
-from jeit.plot.axes import (
-    CHANGE_SCALE,
-    DARK_GREY,
-    LIGHT_GREY,
-    SERIES_COLOURS,
-    ColourScale,
-    axes_or_new,
-    check_scale,
-    draw_scale_bar,
-    extent_of,
-    hide_axes,
-)
+from jeit.plot.axes import axes_or_new, draw_scale_bar, extent_of, hide_axes
+from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, LIGHT_GREY, SERIES_COLOURS, ColourScale, check_scale
 
 # The plot states the distortion of lengths if its mean exceeds this relative value.
 _MIN_STATED_DISTORTION = 0.005

@@ -67,7 +67,8 @@ def draw_layout_comparison(result: LayoutComparison):
     from jeit.design.plots import plot_sensitivity_histograms, plot_sensitivity_map, plot_taxel_areas, plot_taxels
     from jeit.design.plots.travel import outline_path
     from jeit.layout.surface_layout import flat_layout
-    from jeit.plot.axes import DARK_GREY, draw_scale_bar, hide_axes
+    from jeit.plot.axes import draw_scale_bar, hide_axes
+    from jeit.plot.colours import DARK_GREY
 
     figure = Figure(figsize=(14.4, 8.8), layout="constrained")
     figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.12)

@@ -19,7 +19,8 @@ from jeit.image import Inclusion
 from jeit.image.rasters import CONDUCTIVE, RESISTIVE
 from jeit.inverse.shapes import Star
 from jeit.mesh import Mesh
-from jeit.plot.axes import DARK_GREY, axes_or_new
+from jeit.plot.axes import axes_or_new
+from jeit.plot.colours import DARK_GREY
 
 _STYLES = ((-1, RESISTIVE, "dashed", "resistive"), (1, CONDUCTIVE, "solid", "conductive"))
 

@@ -19,17 +19,8 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import Inclusion, Raster
 from jeit.mesh import Mesh, check_flat, measures
-from jeit.plot.axes import (
-    CHANGE_SCALE,
-    DARK_GREY,
-    LIGHT_GREY,
-    ColourScale,
-    axes_or_new,
-    check_scale,
-    draw_scale_bar,
-    extent_of,
-    hide_axes,
-)
+from jeit.plot.axes import axes_or_new, draw_scale_bar, extent_of, hide_axes
+from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, LIGHT_GREY, ColourScale, check_scale
 from jeit.plot.imaging.electrodes import draw_electrodes, draw_inclusions
 
 

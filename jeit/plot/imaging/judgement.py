@@ -14,16 +14,8 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind
 from jeit.image.rasters import FiguresOfMerit
 from jeit.inverse.hyperparameter.choice import Choice
-from jeit.plot.axes import (
-    DARK_GREY,
-    LIGHT_GREY,
-    SERIES_COLOURS,
-    SERIES_MARKERS,
-    axes_or_new,
-    draw_horizontal_grid,
-    soften_axes,
-    with_si_prefix,
-)
+from jeit.plot.axes import axes_or_new, draw_horizontal_grid, soften_axes
+from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SERIES_COLOURS, SERIES_MARKERS, with_si_prefix
 from jeit.protocol import Protocol
 
 # Colour of each rule for λ; other rules, and values of λ specified as numbers, are drawn in the colour `DARK_GREY`.

@@ -18,17 +18,8 @@ from matplotlib.figure import Figure
 from jeit.electrodes import AbstractElectrodes
 from jeit.image import ImageSeries, Oscillation, Raster, amplitude_spectrum
 from jeit.mesh import Mesh
-from jeit.plot.axes import (
-    CHANGE_SCALE,
-    DARK_GREY,
-    LIGHT_GREY,
-    ColourScale,
-    FittedScale,
-    check_scale,
-    draw_scale_bar,
-    hide_axes,
-    with_si_prefix,
-)
+from jeit.plot.axes import draw_scale_bar, hide_axes
+from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, LIGHT_GREY, ColourScale, FittedScale, check_scale, with_si_prefix
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import check_body, draw_outline, draw_slice_outline, slice_text
 from jeit_solvers.engines import as_array

@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgba
 
 from jeit.electrodes.electrode_shapes import ElectrodeShapes, ProjectionSurface, surface_triangles
 from jeit.mesh import Mesh
-from jeit.plot.axes import LIGHT_GREY
+from jeit.plot.colours import LIGHT_GREY
 from jeit.plot.imaging.electrodes import METAL, group_coincident
 from jeit.plot.solid.scene import BODY, Scene, draw_number
 

@@ -17,7 +17,7 @@ from jeit.arguments.extras import how_to_install, optional
 from jeit.electrodes import AbstractElectrodes, ElectrodeShapes, shapes_of
 from jeit.image import Inclusion
 from jeit.mesh import Mesh
-from jeit.plot.axes import CHANGE_SCALE, DARK_GREY, ColourScale
+from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, ColourScale
 from jeit.plot.imaging.electrodes import METAL
 from jeit.plot.solid.isosurfaces import DEFAULT_LEVELS, OUTER_OPACITY, check_drawn, level_surfaces
 from jeit.plot.solid.scene import BODY

@@ -17,7 +17,8 @@ from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane, TriangleSurface, cut_by_plane, isosurface_of, node_values
 from jeit.image.plane import check_solid, crossed_edges
 from jeit.mesh import Mesh
-from jeit.plot.axes import CHANGE_SCALE, DARK_GREY, ColourScale, FittedScale, axes_or_new, check_scale
+from jeit.plot.axes import axes_or_new
+from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, ColourScale, FittedScale, check_scale
 from jeit.plot.solid.body import add_electrodes, add_hull, number_electrodes
 from jeit.plot.solid.scene import CORNER_VIEW, Camera, Scene, hide_axes_in_space, mark_sign
 from jeit.plot.solid.surfaces import colours_of, mappable

@@ -16,7 +16,8 @@ from matplotlib.colors import to_rgba
 from matplotlib.patheffects import withStroke
 
 from jeit.arguments import describe, is_number
-from jeit.plot.axes import DARK_GREY, draw_scale_bar
+from jeit.plot.axes import draw_scale_bar
+from jeit.plot.colours import DARK_GREY
 
 # Direction towards the light, above and to the left of the viewer: components to the right and up on the page, and
 # towards the viewer.

@@ -18,7 +18,8 @@ from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane, cut_by_plane
 from jeit.image.plane import AXES, crossed_edges
 from jeit.mesh import Mesh, centroids
-from jeit.plot.axes import CHANGE_SCALE, DARK_GREY, ColourScale, FittedScale, axes_or_new, draw_scale_bar
+from jeit.plot.axes import axes_or_new, draw_scale_bar
+from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, ColourScale, FittedScale
 from jeit.plot.imaging.electrodes import METAL
 from jeit.plot.solid.body import size_of
 from jeit.plot.solid.isosurfaces import DEFAULT_LEVELS, check_drawn, draw_body_in_plane, draw_in_space

@@ -18,7 +18,8 @@ from jeit.electrodes.electrode_shapes import ElectrodeShapes, ProjectionSurface,
 from jeit.layout import SurfaceLayout
 from jeit.mesh import measures
 from jeit.mesh.geodesic import Triangles
-from jeit.plot.axes import CHANGE_SCALE, DARK_GREY, SERIES_COLOURS, ColourScale, FittedScale, axes_or_new, check_scale
+from jeit.plot.axes import axes_or_new
+from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, SERIES_COLOURS, ColourScale, FittedScale, check_scale
 from jeit.plot.imaging.electrodes import METAL
 from jeit.plot.solid.body import add_electrodes, number_electrodes, size_of
 from jeit.plot.solid.scene import BODY, CORNER_VIEW, Camera, Scene, hide_axes_in_space

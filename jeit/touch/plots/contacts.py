@@ -13,16 +13,8 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind
 from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Mesh
-from jeit.plot.axes import (
-    CHANGE_SCALE,
-    DARK_GREY,
-    ColourScale,
-    axes_or_new,
-    draw_colour_bar,
-    draw_scale_bar,
-    hide_axes,
-    with_si_prefix,
-)
+from jeit.plot.axes import axes_or_new, draw_scale_bar, hide_axes
+from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, ColourScale, draw_colour_bar, with_si_prefix
 from jeit.plot.imaging.image import plot_image
 from jeit.touch.contacts import Contact, RasterStages
 

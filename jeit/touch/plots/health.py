@@ -8,18 +8,8 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind
-from jeit.plot.axes import (
-    CHANGE_SCALE,
-    DARK_GREY,
-    LIGHT_GREY,
-    SERIES_COLOURS,
-    ColourScale,
-    axes_or_new,
-    draw_scale_bar,
-    extent_of,
-    hide_axes,
-    soften_axes,
-)
+from jeit.plot.axes import axes_or_new, draw_scale_bar, extent_of, hide_axes, soften_axes
+from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, LIGHT_GREY, SERIES_COLOURS, ColourScale
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import draw_outline, plot_image
 from jeit.touch.health import EventKind, EventStatus, HealthEvent, SkinHealth

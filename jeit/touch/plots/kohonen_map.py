@@ -10,16 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 from jeit.arguments import check_kind, real_array
-from jeit.plot.axes import (
-    DARK_GREY,
-    LIGHT_GREY,
-    SEQUENTIAL,
-    axes_or_new,
-    draw_colour_bar,
-    draw_scale_bar,
-    extent_of,
-    hide_axes,
-)
+from jeit.plot.axes import axes_or_new, draw_scale_bar, extent_of, hide_axes
+from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SEQUENTIAL, draw_colour_bar
 from jeit.touch.kohonen import MapTouch
 
 # Area of a neuron's marker, points², in a map of the reference size.

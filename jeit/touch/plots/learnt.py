@@ -11,19 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 
 from jeit.arguments import check_kind, counted, real_array
-from jeit.plot.axes import (
-    DARK_GREY,
-    LIGHT_GREY,
-    SEQUENTIAL,
-    SERIES_COLOURS,
-    axes_or_new,
-    draw_colour_bar,
-    draw_legend_above,
-    draw_scale_bar,
-    extent_of,
-    hide_axes,
-    soften_axes,
-)
+from jeit.plot.axes import axes_or_new, draw_legend_above, draw_scale_bar, extent_of, hide_axes, soften_axes
+from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SEQUENTIAL, SERIES_COLOURS, draw_colour_bar
 from jeit.touch import Standing, Touches
 from jeit.touch.training import TrainingResult
 

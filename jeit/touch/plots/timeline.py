@@ -12,18 +12,8 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind
 from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Mesh
-from jeit.plot.axes import (
-    DARK_GREY,
-    LIGHT_GREY,
-    SERIES_COLOURS,
-    axes_or_new,
-    draw_colour_bar,
-    draw_scale_bar,
-    extent_of,
-    hide_axes,
-    soften_axes,
-    with_si_prefix,
-)
+from jeit.plot.axes import axes_or_new, draw_scale_bar, extent_of, hide_axes, soften_axes
+from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SERIES_COLOURS, draw_colour_bar, with_si_prefix
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import draw_outline
 from jeit.touch.gestures.touch_watch import NamedTouch

@@ -1,0 +1,172 @@
+"""Colours of plots: the palette, scales from values to colours with their units, and colour bars."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.ticker import MaxNLocator
+
+from jeit.arguments import check_kind, describe, is_number
+from jeit_solvers.module import Module
+
+DARK_GREY = "#26292e"
+LIGHT_GREY = "#8b9098"
+# Colour map of changes: red is more conductive, blue more resistive, and white no change.
+DIVERGING = "RdBu_r"
+SEQUENTIAL = "viridis"
+# Colours of curves in one plot, at most six.
+SERIES_COLOURS = ("#1f6fb4", "#d1495b", "#2a9d6f", "#8a5cb8", "#d98a1c", "#5b6470")
+SERIES_MARKERS = ("o", "s", "^", "D", "v", "P")
+_PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
+# Minimum distance between the ticks of a colour bar of factors, as a share of its limit.
+_MIN_TICK_SPACING = 0.2
+
+
+def draw_colour_bar(
+    ax: Axes,
+    mappable: ScalarMappable,
+    label: str,
+    *,
+    show_sign: bool = False,
+    as_factors: bool = False,
+    position: Axes | None = None,
+) -> None:
+    """Draw a slim colour bar at the right of `ax`, or on the axes `position`; `show_sign`: whether tick labels have a
+    sign, for differences; `as_factors`: whether the values are log₁₀ of factors, which the tick labels state."""
+    placement: dict[str, Any] = (
+        {"ax": ax, "shrink": 0.72, "aspect": 28, "pad": 0.02} if position is None else {"cax": position}
+    )
+    bar = ax.figure.colorbar(mappable, ticks=MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]), **placement)
+    if as_factors:
+        ticks = _factor_ticks(mappable.get_clim()[1] or 0.0)
+        bar.set_ticks(list(ticks), labels=list(ticks.values()))
+    elif show_sign:
+        bar.ax.yaxis.set_major_formatter(
+            lambda value, _: "0" if abs(value) < 1e-12 else f"{value:+g}".replace("-", "−")
+        )
+    bar.set_label(label, color=DARK_GREY)
+    bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+    bar.ax.tick_params(length=2, color=LIGHT_GREY, labelcolor=DARK_GREY)
+
+
+def _factor_ticks(limit: float) -> dict[float, str]:
+    """Ticks of a colour bar from -`limit` to `limit`, log₁₀ of factors, and their labels, such as "×2" and "÷2"."""
+    factors = [1 + step * 10.0**decade for decade in (-4, -3, -2, -1) for step in (1, 2, 5)]
+    factors += [step * 10.0**decade for decade in range(10) for step in (2, 5, 10)]
+    ticks, spacing = {0.0: "1"}, _MIN_TICK_SPACING * limit
+    for factor in sorted(factors, reverse=True):
+        tick = math.log10(factor)
+        if spacing <= tick <= limit * (1 + 1e-9) and all(abs(tick - other) >= spacing for other in ticks):
+            ticks |= {tick: f"×{factor:g}", -tick: f"÷{factor:g}"}
+    return ticks
+
+
+def with_si_prefix(largest: float, unit: str) -> tuple[float, str]:
+    """Choose the SI prefix for values up to `largest`; return the factor to multiply values with, and the unit with its
+    prefix, such as (1e3, "mS")."""
+    if not unit or unit == "%" or not (math.isfinite(largest) and largest > 0):
+        return 1.0, unit
+    exponent = 3 * math.floor(math.log10(largest) / 3 + 1e-9)
+    exponent = min(max(exponent, -12), 9)
+    return 10.0**-exponent, _PREFIXES[exponent] + unit
+
+
+class ColourScale(Module):
+    """Map from values to colours.
+
+    **Fields**
+
+    - `difference`: whether values are changes, drawn with a diverging colour map centred at zero. Other values are
+      drawn with a perceptually uniform sequential colour map from the minimum to the maximum.
+    - `quantity`: label of the colour bar; default: conductivity or its change.
+    - `unit`: unit of the values, "" for none; default: the unit of conductivity ("S" for a sheet, "S/m" for a body).
+      The colour bar adds an SI prefix.
+    - `limit`: value at the end of the colour bar, in `unit`; default: the maximum magnitude.
+    - `colour_map`: name of a matplotlib colour map that replaces the default colour maps.
+    - `bar`: whether to draw the colour bar.
+    - `logarithmic`: whether the values are log₁₀ of factors; the colour bar then states the factors.
+
+    Raises `ValueError` for a limit that is negative or not finite.
+
+    **Example:**
+
+    ```python
+    plot_image(mesh, 1 + image, scale=ColourScale(difference=False, colour_map="magma"))
+    ```
+    """
+
+    difference: bool = True
+    quantity: str | None = None
+    unit: str | None = None
+    limit: float | None = None
+    colour_map: str | None = None
+    bar: bool = True
+    logarithmic: bool = False
+
+    def __check_init__(self):
+        if self.limit is not None and not (is_number(self.limit) and self.limit >= 0):
+            raise ValueError(f"limit must be finite and positive, in the values' unit; it is {describe(self.limit)}.")
+
+    def of(self, values: np.ndarray, unit: str) -> "FittedScale":
+        """Fit the scale to `values` of any shape; `unit`: unit of the values, used if this scale has no unit.
+
+        Raises `ValueError` for values that are not finite.
+        """
+        unit = unit if self.unit is None else self.unit
+        largest = float(np.abs(values).max()) if self.limit is None else float(self.limit)
+        if not np.isfinite(largest):
+            raise ValueError("values must be finite to be drawn.")
+        factor, with_prefix = with_si_prefix(largest, unit)
+        upper_limit = factor * largest or 1.0
+        if self.difference:
+            lower_limit = -upper_limit
+        else:
+            lower_limit = factor * float(values.min())
+            if lower_limit >= upper_limit:  # a constant image
+                lower_limit, upper_limit = (
+                    lower_limit - 0.05 * abs(lower_limit) - 1e-12,
+                    upper_limit + 0.05 * abs(upper_limit) + 1e-12,
+                )
+        conductivity_name = "sheet conductivity" if unit == "S" else "conductivity"
+        quantity = self.quantity or (
+            f"Change of {conductivity_name}" if self.difference else conductivity_name.capitalize()
+        )
+        label = f"{quantity} ({with_prefix})" if with_prefix else quantity
+        colour_map = self.colour_map or (DIVERGING if self.difference else SEQUENTIAL)
+        return FittedScale(factor, label, {"cmap": colour_map, "vmin": lower_limit, "vmax": upper_limit}, self)
+
+
+class FittedScale(Module):
+    """A colour scale fitted to values. **Fields**: `factor`: conversion of values to the unit of the colour bar;
+    `label`: label of the colour bar; `keywords`: arguments of matplotlib functions; `scale`: the original scale."""
+
+    factor: float
+    label: str
+    keywords: dict
+    scale: ColourScale
+
+    def draw_bar(self, ax: Axes, mappable: ScalarMappable, position: Axes | None = None) -> None:
+        """Draw the colour bar of `mappable` beside `ax`, or on the axes `position`, unless the scale has no colour
+        bar."""
+        if self.scale.bar:
+            draw_colour_bar(
+                ax,
+                mappable,
+                self.label,
+                show_sign=self.scale.difference,
+                as_factors=self.scale.logarithmic,
+                position=position,
+            )
+
+
+def check_scale(scale: ColourScale) -> None:
+    """Raise `ValueError` if `scale` is not a `ColourScale`."""
+    check_kind("scale", scale, ColourScale, "a ColourScale, such as ColourScale(colour_map='viridis')")
+
+
+CHANGE_SCALE = ColourScale()
+FACTOR_SCALE = ColourScale(quantity="Conductivity over background", unit="", logarithmic=True)
