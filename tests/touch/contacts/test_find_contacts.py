@@ -291,6 +291,10 @@ def test_frames_that_do_not_determine_noise(skin):
         ImageNoise.of_frames(skin.reconstruction, skin.before[:3])
     with pytest.raises(ValueError, match="all the same"):
         ImageNoise.of_frames(skin.reconstruction, np.tile(skin.before[0], (20, 1)))
+    with pytest.raises(ValueError, match="images are all the same"):
+        ImageNoise.of_images(np.ones((12, 3)))
+    with pytest.raises(ValueError, match="10 images or more"):
+        ImageNoise.of_images(np.eye(3))
     with pytest.raises(ValueError, match="frames must be voltages"):
         ImageNoise.of_frames(skin.reconstruction, skin.before.astype(str))
     with pytest.raises(ValueError, match="frames must be voltages"):
