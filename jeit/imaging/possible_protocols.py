@@ -178,7 +178,7 @@ def _read_array(path: Path, key: str | None, excluded: str | None) -> tuple[np.n
         sizes, axis = matlab.shapes(path), "columns"
     else:
         sizes, axis = npz_shapes(path), "rows"
-    name = "voltages" if key is None and "voltages" in sizes else key  # of a file that jeit wrote
+    name = "voltages" if key is None and excluded != "voltages" and "voltages" in sizes else key  # as jeit writes
     if name is None:
         tables = [item for item, shape in sizes.items() if item != excluded and int(np.prod(shape)) > 3]
         if not tables:

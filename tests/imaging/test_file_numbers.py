@@ -28,6 +28,9 @@ def test_of_several_arrays_one_is_named_or_left_over(tmp_path):
     np.savez(tmp_path / "a.npz", **arrays)
     np.testing.assert_array_equal(table(FileNumbers.read(tmp_path / "a.npz", "rod")), 2 * FRAMES)
     np.testing.assert_array_equal(table(FileNumbers.read(tmp_path / "a.npz", None, "rod")), FRAMES)
+    np.savez(tmp_path / "b.npz", voltages=FRAMES, rod=2 * FRAMES)
+    np.testing.assert_array_equal(table(FileNumbers.read(tmp_path / "b.npz", None)), FRAMES)
+    np.testing.assert_array_equal(table(FileNumbers.read(tmp_path / "b.npz", None, "voltages")), 2 * FRAMES)
     with pytest.raises(ValueError, match=r"are empty \(3 × 40\), rod \(3 × 40\)\. Name that of the frames"):
         FileNumbers.read(tmp_path / "a.npz", None)
     with pytest.raises(ValueError, match=r"has no array 'rods'.*'rod'"):
