@@ -195,7 +195,7 @@ class LocalChange:
 
         The last result is kept: a fit computes the voltages after a change, and then their derivatives."""
         if self._last_solved is None or not np.array_equal(self._last_solved[0], change):
-            self._last_solved = change, self._solve_new_change(change)
+            self._last_solved = change.copy(), self._solve_new_change(change)
         return self._last_solved[1]
 
     def _solve_new_change(self, change: np.ndarray):

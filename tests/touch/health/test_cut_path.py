@@ -89,6 +89,10 @@ def test_the_update_is_the_exact_solve(model, kind, tensor):
     impedance, (slope,) = local.derivatives(given(change), [given(way)])
     np.testing.assert_allclose(impedance, exact, atol=1e-9 * np.abs(exact).max())
     np.testing.assert_allclose(local.impedance(given(change)), impedance)
+    modified = given(0.5 * change)  # the last solution is kept for an equal change, not for the same array
+    local.impedance(modified)
+    modified *= 2
+    np.testing.assert_allclose(local.impedance(modified), impedance)
     step = 1e-5
     ends = [np.asarray(model.transfer_impedance(whole(change + sign * step * way))) for sign in (1, -1)]
     central = (ends[0] - ends[1]) / (2 * step)
