@@ -6,7 +6,7 @@
 - `dense`: small dense systems in batches;
 - `optimise`: descent along quadratic models, many small problems at once, problems with bounds, derivatives of a
   minimum, and `Status`;
-- `kmeans`: clustering; `over_cores`, `on_cores` and `in_turn`: distribution of work.
+- `kmeans`: clustering; `over_cores`, `on_cores`, `results_on_cores` and `in_turn`: distribution of work.
 """
 
 from __future__ import annotations

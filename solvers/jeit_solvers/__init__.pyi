@@ -1,5 +1,5 @@
 from .clustering import KMeans, kmeans
-from .cores import number_of_cores, on_cores, one_thread_of_blas, over_cores
+from .cores import check_not_abandoned, number_of_cores, on_cores, one_thread_of_blas, over_cores, results_on_cores
 from .dense import (
     QuadraticModel,
     lower_cholesky,
@@ -74,6 +74,7 @@ __all__ = [
     "Strips",
     "analyse",
     "as_minimum",
+    "check_not_abandoned",
     "choose_solver",
     "definite_small",
     "ended",
@@ -99,6 +100,7 @@ __all__ = [
     "over_cores",
     "projected_gradient",
     "quadratic_form",
+    "results_on_cores",
     "ridge_model",
     "ridge_step",
     "scipy_lbfgsb",

@@ -8,6 +8,7 @@ of BLAS would compete with these threads.
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import functools
 import importlib
@@ -15,7 +16,7 @@ import itertools
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
 import jax
@@ -27,8 +28,7 @@ from jaxtyping import Array, Int
 # Maximum number of threads that work in NumPy at once: each thread needs its own memory, and all share the memory
 # bandwidth.
 _MAX_THREADS = 4
-# Prefix of the names of the threads of `on_cores`. A call from a thread with this prefix comes from inside a part.
-_THREAD_NAME = "jeit-core"
+_thread = threading.local()
 
 
 def number_of_cores() -> int:
@@ -85,9 +85,11 @@ def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
     """Apply `function` to each part, in NumPy, in parallel on several cores; the function must store its results
     itself.
 
-    The parts are processed in the calling thread if there is only one part, if the call comes from inside another part,
-    or while another thread uses the cores. The reason is that parts may wait for compiled programs, which call NumPy
-    from other threads. Floating-point warnings are suppressed, because NaN is reported elsewhere.
+    The calling thread processes the parts in turn, and further threads help as long as cores are free. A part may call
+    `on_cores` itself: its own parts are shared as soon as another core has no work left. No part waits for a core, so
+    parts may also wait for compiled programs that call NumPy from other threads. If a part raises an error, or the user
+    interrupts, the other parts end at their next call of `check_not_abandoned`. Floating-point warnings are suppressed,
+    because NaN is reported elsewhere.
 
     **Arguments:**
 
@@ -101,21 +103,88 @@ def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
     on_cores(lambda part: squares.__setitem__(part, part**2), range(4))
     ```
     """
+    remaining, errors, helpers = collections.deque(parts), [], []
+    # A part is abandoned with the call that it belongs to, and with the calls around that.
+    abandoned = threading.Event()
+    abandoned_calls = (*getattr(_thread, "abandoned_calls", ()), abandoned)
+    free_cores, pool = _free_cores(os.getpid()), _thread_pool(os.getpid())
 
-    def apply_quietly(part: Any) -> None:
-        with np.errstate(all="ignore"):  # every thread has its own error state
-            function(part)
+    def process_parts() -> None:
+        calls_around, _thread.abandoned_calls = getattr(_thread, "abandoned_calls", ()), abandoned_calls
+        try:
+            with np.errstate(all="ignore"):  # every thread has its own error state
+                while remaining and not abandoned.is_set():
+                    if len(remaining) > 1 and free_cores.take():
+                        helpers.append(pool.submit(help_out))
+                    try:
+                        part = remaining.popleft()
+                    except IndexError:  # another thread has taken the last part
+                        break
+                    function(part)
+        except BaseException as error:
+            abandoned.set()
+            errors.append(error)
+        finally:
+            _thread.abandoned_calls = calls_around
 
-    is_nested = threading.current_thread().name.startswith(_THREAD_NAME)
-    if len(parts) <= 1 or is_nested or not _pool_lock(os.getpid()).acquire(blocking=False):
-        for part in parts:
-            apply_quietly(part)
-        return
-    try:
-        with one_thread_of_blas():
-            list(_thread_pool(os.getpid()).map(apply_quietly, parts))
-    finally:
-        _pool_lock(os.getpid()).release()
+    def help_out() -> None:
+        try:
+            process_parts()
+        finally:
+            free_cores.give_back()
+
+    with one_thread_of_blas() if len(parts) > 1 else contextlib.nullcontext():
+        process_parts()
+        free_cores.give_back()  # that of this thread, while it waits
+        try:
+            while not errors and (unfinished := [helper for helper in helpers if not helper.done()]):
+                wait(unfinished)
+        except BaseException:  # the user has interrupted
+            abandoned.set()
+            raise
+        finally:
+            free_cores.take_back()
+    if errors:
+        raise errors[0]
+
+
+def results_on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> list[Any]:
+    """Return the results of `function` for each part, computed in parallel by `on_cores`.
+
+    **Arguments:**
+
+    - `function`: function of a part.
+    - `parts`: arguments, one for each call of `function`.
+
+    **Example:**
+
+    ```python
+    results_on_cores(lambda part: part**2, range(4))
+    ```
+    """
+    results: list[Any] = [None] * len(parts)
+
+    def store(index: int) -> None:
+        results[index] = function(parts[index])
+
+    on_cores(store, range(len(parts)))
+    return results
+
+
+def check_not_abandoned() -> None:
+    """End a part of `on_cores` by an error, if another part has raised an error or the user has interrupted. Parts that
+    take more than a second call this function from time to time.
+
+    Raises `RuntimeError` if the part is no longer needed.
+
+    **Example:**
+
+    ```python
+    check_not_abandoned()
+    ```
+    """
+    if any(call.is_set() for call in getattr(_thread, "abandoned_calls", ())):
+        raise RuntimeError("abandoned, because another part of the computation has ended with an error.")
 
 
 def parts_for_cores(number: int) -> list[slice]:
@@ -124,17 +193,44 @@ def parts_for_cores(number: int) -> list[slice]:
     return [slice(start, stop) for start, stop in itertools.pairwise(ends)]
 
 
+class _FreeCores:
+    """Number of cores without work, one of which is used by the thread that calls `on_cores` first."""
+
+    def __init__(self, number: int):
+        self._number, self._lock = number, threading.Lock()
+
+    def take(self) -> bool:
+        """Take a core if one is free."""
+        with self._lock:
+            if self._number <= 0:
+                return False
+            self._number -= 1
+            return True
+
+    def give_back(self) -> None:
+        """Return a core."""
+        with self._lock:
+            self._number += 1
+
+    def take_back(self) -> None:
+        """Take a core that was given back for a while. If another thread uses it, two threads share a core until one
+        of them ends."""
+        with self._lock:
+            self._number -= 1
+
+
+@functools.cache
+def _free_cores(process: int) -> _FreeCores:
+    """The free cores of a process."""
+    return _FreeCores(min(number_of_cores(), _MAX_THREADS) - 1)
+
+
 @functools.cache
 def _thread_pool(process: int) -> ThreadPoolExecutor:
-    """Thread pool of a process (a forked process needs a new pool). The pool is reused, because memory that new threads
-    allocate and free, about a hundred megabytes, is not returned to the system."""
-    return ThreadPoolExecutor(min(number_of_cores(), _MAX_THREADS), _THREAD_NAME)
-
-
-@functools.cache
-def _pool_lock(process: int) -> threading.Lock:
-    """Lock of the thread pool of a process."""
-    return threading.Lock()
+    """Threads of a process that help the calling threads (a forked process needs new ones). They are reused, because
+    memory that new threads allocate and free, about a hundred megabytes, is not returned to the system. Threads that
+    wait for each other use no core, so that there are more threads than cores."""
+    return ThreadPoolExecutor(8 * _MAX_THREADS, "jeit-core")
 
 
 @functools.cache

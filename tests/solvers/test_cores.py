@@ -1,6 +1,8 @@
 """Work of NumPy shared between cores: results do not depend on the threads, and the BLAS settings are restored."""
 
+import functools
 import threading
+import time
 import warnings
 
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 import sparse_problems
 import threadpoolctl
 
-from jeit_solvers import analyse, factorise, on_cores
+from jeit_solvers import analyse, check_not_abandoned, cores, factorise, on_cores, results_on_cores
 from jeit_solvers.cores import blas, one_thread_of_blas, parts_for_cores
 from jeit_solvers.engines import on_host
 from jeit_solvers.sparse import padded_fronts_jax
@@ -82,6 +84,55 @@ def test_an_error_in_a_part_is_raised_and_the_blas_threads_are_restored():
             on_cores(part, range(4))
         assert 2 in before
         assert threads_of_blas() == before
+
+
+def test_a_free_core_helps_with_the_parts_of_a_part(monkeypatch):
+    """The second part of the outer call ends at once; a thread then takes a part of the inner call of the first."""
+    monkeypatch.setattr(cores, "_free_cores", functools.cache(lambda process: cores._FreeCores(1)))
+    threads, is_free = set(), threading.Event()
+
+    def inner(number):
+        threads.add(threading.get_ident())
+        if number == 0:
+            return is_free.wait(10)  # set by the other thread only
+        is_free.set()
+        return None
+
+    def outer(number):
+        if number == 0:
+            time.sleep(0.02)
+            on_cores(inner, range(2))
+
+    on_cores(outer, range(2))
+    assert is_free.is_set()
+    assert len(threads) == 2
+    assert results_on_cores(lambda number: number**2, range(5)) == [0, 1, 4, 9, 16]
+
+
+def test_other_parts_end_when_one_raises_an_error(monkeypatch):
+    monkeypatch.setattr(cores, "_free_cores", functools.cache(lambda process: cores._FreeCores(1)))
+    failed, ended = threading.Event(), threading.Event()
+
+    def endless():
+        for _ in range(1000):
+            check_not_abandoned()
+            time.sleep(0.01)
+
+    def part(number):
+        if number == 0:
+            on_cores(lambda _: failed.set() or time.sleep(0.05), range(1))
+            raise ValueError("the first")
+        failed.wait(10)
+        try:
+            on_cores(lambda _: endless(), range(2))
+        finally:
+            ended.set()
+
+    check_not_abandoned()
+    with pytest.raises(ValueError, match="the first"):
+        on_cores(part, range(2))
+    assert ended.wait(5)
+    check_not_abandoned()
 
 
 @pytest.mark.parametrize("number", [1, 2])
