@@ -15,19 +15,19 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-import scipy.sparse
 from jaxtyping import Float, Int
 
 from jeit.electrodes.electrodes import AbstractElectrodes, AbstractMovableElectrodes
 from jeit.forward.model import ForwardModel, channel_voltages, evaluate, fields_and_impedance_of, select_channels
-from jeit.forward.system import field_gradients, stiffness
+from jeit.forward.system import cached_geometry, stiffness
 from jeit.forward.transfer import ElectrodeImpedance
 from jeit.mesh import Mesh
 from jeit.protocol import Protocol
+from jeit_solvers import SparsityPattern
 from jeit_solvers.engines import as_array, on_host
 
 # Number of cells processed at a time, so that their products of gradients stay in the cache.
-_CELLS_AT_ONCE = 256
+_CELLS_AT_ONCE = 64
 
 
 class ConductivityChange(NamedTuple):
@@ -40,12 +40,13 @@ class ConductivityChange(NamedTuple):
 
 
 class SolvedFields(NamedTuple):
-    """Solution of a forward model, in NumPy. **Fields**: `mesh`, `protocol`: mesh and protocol of the model; `fields`:
-    potentials F (n, L) as defined in `ForwardModel.fields`, in ohms; `impedance`: impedance of the electrodes in
-    ohms."""
+    """Solution of a forward model, in NumPy. **Fields**: `mesh`, `protocol`, `pattern`: mesh, protocol and sparsity
+    pattern of the model; `fields`: potentials F (n, L) as defined in `ForwardModel.fields`, in ohms; `impedance`:
+    impedance of the electrodes in ohms."""
 
     mesh: Mesh
     protocol: Protocol
+    pattern: SparsityPattern
     fields: Float[np.ndarray, "n L"]
     impedance: ElectrodeImpedance
 
@@ -64,37 +65,50 @@ class SolvedFields(NamedTuple):
         """Integrals ∫ dσ ∇F_k · ∇F_l for pairs of electrodes k, l and every coefficient of a change dσ. They are
         computed from the stiffness matrix if all cells change, otherwise from the gradients in the cells that
         change."""
-        fields: Any = self.fields
         if cells is None:
             return np.stack([self._energy_everywhere(cell_change) for cell_change in slope.T])
-        return _field_energies(field_gradients(self.mesh, fields, cells), slope)
+        return _field_energies(self.mesh, self.fields, cells, slope)
 
     def _energy_everywhere(self, change: Float[np.ndarray, " m"]) -> Float[np.ndarray, "L L"]:
-        cells, size = np.asarray(self.mesh.cells), self.mesh.num_points
-        rows, columns = np.tril_indices(cells.shape[1])
-        values: Any = np.array(stiffness(self.mesh, change))  # pyright: ignore[reportArgumentType]
-        values[rows == columns] /= 2
-        entry_indices = (cells[:, rows].T.ravel(), cells[:, columns].T.ravel())
-        lower = scipy.sparse.coo_array((values.ravel(), entry_indices), shape=(size, size)).tocsr()
-        lower_part = self.fields.T @ (lower @ self.fields)
-        return lower_part + lower_part.T
+        no_contacts = (None,) * (self.pattern.num_groups - 1)
+        values: Any = self.pattern.assemble(stiffness(self.mesh, change), *no_contacts)  # pyright: ignore
+        return self.pattern.quadratic_form(values, self.fields)
 
 
 def solved_fields(model: ForwardModel, conductivity: Float[np.ndarray, " m"]) -> SolvedFields:
     """Compute the fields of a model for a `conductivity` per cell, in S/m (2-D: S), which is not checked."""
     fields, impedance = evaluate(model, fields_and_impedance_of, conductivity)
-    return SolvedFields(*on_host((model.mesh, model.protocol, fields, impedance)))
+    return SolvedFields(*on_host((model.mesh, model.protocol, model.system.pattern, fields, impedance)))
 
 
-def _field_energies(gradient, slope) -> Float[np.ndarray, "q L L"]:
-    """Integrals ∫ dσ ∇F_k · ∇F_l as matrices (q, L, L) over pairs of L electrodes, one for each of q coefficients."""
-    num_fields = gradient.shape[-1]
-    energy = np.zeros((slope.shape[1], num_fields**2), np.result_type(gradient, slope))
-    for start in range(0, len(slope), _CELLS_AT_ONCE):
-        cell_range = slice(start, start + _CELLS_AT_ONCE)
-        local = np.ascontiguousarray(np.moveaxis(gradient[:, cell_range], 0, -1))
-        energy += slope[cell_range].T @ (local @ local.transpose(0, 2, 1)).reshape(len(local), -1)
-    return energy.reshape(-1, num_fields, num_fields)
+def _field_energies(mesh: Mesh, fields, cells, slope) -> Float[np.ndarray, "q L L"]:
+    """Integrals ∫ dσ ∇F_k · ∇F_l over some cells as matrices (q, L, L) over pairs of L electrodes, one for each of q
+    coefficients.
+
+    Cells that change with one coefficient only, such as those inside a body whose contrast changes, take a third of the
+    work of the others.
+    """
+    nodes = np.asarray(mesh.cells)[cells]
+    gradient, measure = (np.asarray(values)[cells] for values in cached_geometry(mesh))
+    weighted_gradient = np.ascontiguousarray(gradient.transpose(0, 2, 1)) * np.sqrt(measure)[:, None, None]
+    num_fields, is_nonzero = fields.shape[1], slope != 0
+    num_nonzero = is_nonzero.sum(axis=1)
+    energy = np.zeros((slope.shape[1], num_fields**2), np.result_type(fields, slope))
+    for part in _parts(np.flatnonzero(num_nonzero > 1)):
+        local = weighted_gradient[part] @ fields[nodes[part]]
+        energy += slope[part].T @ (local.transpose(0, 2, 1) @ local).reshape(len(part), -1)
+    energy = energy.reshape(-1, num_fields, num_fields)
+    for coefficient, is_alone in enumerate((is_nonzero & (num_nonzero == 1)[:, None]).T):
+        for part in _parts(np.flatnonzero(is_alone)):
+            local = weighted_gradient[part] @ fields[nodes[part]]
+            weighted = slope[part, coefficient, None, None] * local
+            energy[coefficient] += local.reshape(-1, num_fields).T @ weighted.reshape(-1, num_fields)
+    return energy
+
+
+def _parts(indices: Int[np.ndarray, " k"]) -> list[Int[np.ndarray, " p"]]:
+    """Divide `indices` into parts of `_CELLS_AT_ONCE`."""
+    return [indices[start : start + _CELLS_AT_ONCE] for start in range(0, len(indices), _CELLS_AT_ONCE)]
 
 
 # Contact impedance in ohm·m² of an electrode that carries no current, compared with an electrode of unit contact

@@ -100,7 +100,7 @@ def _check_values(conductivity: Any, normal: Any) -> None:
         )
 
 
-def _cached_geometry(mesh: Mesh) -> tuple[Inexact[Array, "m k s"], Inexact[Array, " m"]]:
+def cached_geometry(mesh: Mesh) -> tuple[Inexact[Array, "m k s"], Inexact[Array, " m"]]:
     """Gradients (m, d + 1, s) of the basis functions in m cells of dimension d in s-dimensional space, and measures
     (m,) of the cells. In NumPy, the results for the last mesh are cached."""
     return _last_geometry(mesh) if namespace(mesh) is np else _gradients_and_measures(mesh)
@@ -113,32 +113,50 @@ def _gradients_and_measures(mesh: Mesh):
 _last_geometry = Recent(_gradients_and_measures, 1)
 
 
-def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Array, "p m"]:
-    """Element stiffness matrices ∫ ∇φ_i·σ∇φ_j of the basis functions φ, for a conductivity σ per cell in S/m (2-D: S).
-    Returns lower triangles (p, m) in siemens, with p = (d+1)(d+2)/2 entries for each of m cells."""
-    xp = namespace(mesh, conductivity)
-    gradient, measure = _cached_geometry(mesh)
-    flux = gradient if conductivity.ndim == 1 else xp.einsum("mij,mkj->mki", conductivity, gradient)
-    weight = measure * (conductivity if conductivity.ndim == 1 else 1)
-    rows, columns = np.tril_indices(mesh.dimension + 1)
+def _unit_stiffness(mesh: Mesh) -> Inexact[Array, "p m"]:
+    """Element stiffness matrices for unit conductivity, as defined in `stiffness`."""
+    gradient, measure = cached_geometry(mesh)
+    return _scaled_stiffness(gradient, gradient, measure)
+
+
+def _scaled_stiffness(gradient, flux, weight) -> Inexact[Array, "p m"]:
+    """Lower triangles (p, m) of the products of gradients and fluxes (m, k, s), multiplied by the weights (m,)."""
+    xp, axes = namespace(gradient, flux, weight), range(gradient.shape[2])
+    rows, columns = np.tril_indices(gradient.shape[1])
     return xp.stack(
         [
-            weight * sum(gradient[:, row, axis] * flux[:, column, axis] for axis in range(mesh.space_dimension))
+            weight * sum(gradient[:, row, axis] * flux[:, column, axis] for axis in axes)
             for row, column in zip(rows, columns, strict=True)
         ]
     )
 
 
-def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"], cells: Any = slice(None)) -> Inexact[Array, "d m p"]:
+_last_unit_stiffness = Recent(_unit_stiffness, 1)
+
+
+def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Array, "p m"]:
+    """Element stiffness matrices ∫ ∇φ_i·σ∇φ_j of the basis functions φ, for a conductivity σ per cell in S/m (2-D: S).
+    Returns lower triangles (p, m) in siemens, with p = (d+1)(d+2)/2 entries for each of m cells."""
+    if conductivity.ndim == 1 and namespace(mesh, conductivity) is np:
+        return conductivity * _last_unit_stiffness(mesh)
+    gradient, measure = cached_geometry(mesh)
+    if conductivity.ndim == 1:
+        return _scaled_stiffness(gradient, gradient, measure * conductivity)
+    return _scaled_stiffness(
+        gradient, namespace(mesh, conductivity).einsum("mij,mkj->mki", conductivity, gradient), measure
+    )
+
+
+def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> Inexact[Array, "d m p"]:
     """Gradients (d, m, p) of p nodal fields in each of m cells along d axes, multiplied by the square root of the
-    cell's measure. `cells`: indices of the cells; by default all cells.
+    cell's measure.
 
     With this weight the product of the gradients of two fields u, w is the integral ∫_e ∇u·∇w over the cell e.
     """
     xp = namespace(mesh, fields)
-    gradient, measure = (values[cells] for values in _cached_geometry(mesh))
+    gradient, measure = cached_geometry(mesh)
     weighted = gradient * xp.sqrt(measure)[:, None, None]
-    corners = [gather(fields, nodes) for nodes in mesh.cells[cells].T]
+    corners = [gather(fields, nodes) for nodes in mesh.cells.T]
     return xp.stack(
         [
             functools.reduce(operator.add, [weighted[:, k, axis, None] * corner for k, corner in enumerate(corners)])

@@ -58,6 +58,11 @@ class SparsityPattern(Module):
         return self._slots.read(self.indices)[1]
 
     @property
+    def num_groups(self) -> int:
+        """Number of groups of elements, each of which `assemble` takes as an argument."""
+        return len(self._assembly)
+
+    @property
     def _slots(self) -> Slot:
         return self.layout.content[0]
 
@@ -228,6 +233,17 @@ class SparsityPattern(Module):
         """The matrix as a dense array (n, n)."""
         dense = jnp.zeros((self.size, self.size), values.dtype)
         return dense.at[self.rows, self.columns].set(values).at[self.columns, self.rows].set(values)
+
+    def quadratic_form(
+        self, values: Inexact[np.ndarray, " nnz"], vectors: Inexact[np.ndarray, "n k"]
+    ) -> Inexact[np.ndarray, "k k"]:
+        """The product xᵀ A x for several vectors (n, k), in NumPy."""
+        below = slice(self.size, None)
+        row_ends = np.searchsorted(np.asarray(self.rows)[below], np.arange(self.size + 1))  # rows are in order
+        columns = np.asarray(self.columns)[below]
+        below_diagonal = csr_array((values[below], columns, row_ends), shape=(self.size, self.size))
+        half = vectors.T @ (below_diagonal @ vectors + values[: self.size, None] / 2 * vectors)
+        return half + half.T
 
     def to_scipy(self, values: Any) -> csr_array:
         """The matrix as a SciPy sparse array (n, n), both triangles."""
