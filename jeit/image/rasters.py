@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Inexact, Int
-from scipy.spatial import KDTree
 
 from jeit.arguments import object_html, object_text, picture
 from jeit.mesh import Mesh, check_flat
@@ -64,11 +63,9 @@ class Raster(Module):
         rows, columns = shape
         x = x_min + (np.arange(columns) + 0.5) * (x_max - x_min) / columns
         y = y_max - (np.arange(rows) + 0.5) * (y_max - y_min) / rows
-        grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         if mesh.dimension == 3:
-            z = (low[2] + high[2]) / 2 if height is None else float(height)
-            grid = np.column_stack([grid, np.full(len(grid), z)])
-        cell = find_cells(points, cells, grid).reshape(shape)
+            height = (low[2] + high[2]) / 2 if height is None else float(height)
+        cell = _cells_of_pixels(points, cells, x, y, height if mesh.dimension == 3 else None)
         return cls(as_array(cell, np.int32), (x_min, x_max, y_min, y_max))
 
     @property
@@ -96,44 +93,39 @@ def _sample(cell, image):
     return xp.where(cell >= 0, image[..., xp.maximum(cell, 0)], xp.nan)
 
 
-def find_cells(points: np.ndarray, cells: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Index of the cell that contains each of the `positions` (q, d), -1 for positions outside all cells.
+def _cells_of_pixels(points, cells, x, y, height: float | None) -> Int[np.ndarray, "rows columns"]:
+    """Index of the cell that contains each pixel centre (`x` ascending, `y` descending and, in a solid, `height`,
+    metres), or -1 outside all cells. Of several cells that meet at a pixel, the cell with the nearest centroid is
+    taken.
 
-    For each position the cells with the nearest centroids are tested first, then more distant cells if none of these
-    contains the position. Only cells whose bounding box overlaps that of the positions are tested; if the positions lie
-    in a slice, these are the cells that the slice cuts.
+    Every cell is tested at the pixels in the rectangle around it.
     """
     corners = points[cells]
-    tolerance = 1e-9 * np.ptp(points, axis=0).max()
-    lower_corner, upper_corner = positions.min(axis=0) - tolerance, positions.max(axis=0) + tolerance
-    candidates = np.flatnonzero(
-        ((corners.max(axis=1) >= lower_corner) & (corners.min(axis=1) <= upper_corner)).all(axis=1)
-    )
-    if not len(candidates):
-        return np.full(len(positions), -1)
-    corners = corners[candidates]
-    inverse = np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2))
-    tree = KDTree(corners.mean(axis=1))
-    max_reach = np.linalg.norm(corners - corners.mean(axis=1)[:, None], axis=-1).max()
-    cell_of_position = np.full(len(positions), -1)
-    remaining = np.flatnonzero(tree.query(positions)[0] <= max_reach)
-    num_tried, num_nearest = 0, 8
-    while remaining.size and num_tried < len(candidates):
-        num_nearest = min(num_nearest, len(candidates))
-        nearest = tree.query(positions[remaining], k=num_nearest)
-        distance, candidate_index = np.asarray(nearest[0])[:, num_tried:], np.asarray(nearest[1])[:, num_tried:]
-        barycentric = np.einsum(
-            "qkij,qkj->qki", inverse[candidate_index], positions[remaining][:, None] - corners[candidate_index, 0]
-        )
-        is_inside = np.minimum(barycentric.min(axis=-1), 1 - barycentric.sum(axis=-1)) > -1e-9
-        is_found = is_inside.any(axis=1)
-        cell_of_position[remaining[is_found]] = candidates[
-            candidate_index[is_found, is_inside[is_found].argmax(axis=1)]
-        ]
-        # A cell cannot contain a position that is farther from the cell's centroid than the cell's farthest corner.
-        remaining = remaining[~is_found & (distance[:, -1] <= max_reach)]
-        num_tried, num_nearest = num_nearest, 4 * num_nearest
-    return cell_of_position
+    low, high, tolerance = corners.min(axis=1), corners.max(axis=1), 1e-9 * np.ptp(points, axis=0).max()
+    # First pixel, and number of pixels, in the rectangle around every cell, along rows and columns.
+    first_row = np.searchsorted(-y, -high[:, 1] - tolerance)
+    first_column = np.searchsorted(x, low[:, 0] - tolerance)
+    num_rows = np.searchsorted(-y, -low[:, 1] + tolerance, side="right") - first_row
+    num_columns = np.searchsorted(x, high[:, 0] + tolerance, side="right") - first_column
+    num_pixels = num_rows * num_columns
+    if height is not None:
+        num_pixels[(low[:, 2] > height + tolerance) | (high[:, 2] < height - tolerance)] = 0
+    tested = np.flatnonzero(num_pixels)
+    inverse, centroid = np.zeros((len(cells), *corners[0, 1:].shape)), corners.mean(axis=1)
+    inverse[tested] = np.linalg.inv(np.swapaxes(corners[tested, 1:] - corners[tested, :1], 1, 2))
+    cell = np.repeat(np.arange(len(cells)), num_pixels)
+    pixel = np.arange(len(cell)) - np.repeat(np.cumsum(num_pixels) - num_pixels, num_pixels)
+    row, column = np.divmod(pixel, num_columns[cell])
+    row, column = row + first_row[cell], column + first_column[cell]
+    position = [x[column], y[row]] if height is None else [x[column], y[row], np.full(len(cell), height)]
+    offset = [coordinate - corners[cell, 0, axis] for axis, coordinate in enumerate(position)]
+    barycentric = [sum(inverse[cell, i, j] * offset[j] for j in range(len(offset))) for i in range(len(offset))]
+    is_inside = np.minimum(np.minimum.reduce(barycentric), 1 - sum(barycentric)) > -1e-9
+    distance = np.sum([(coordinate - centroid[cell, axis]) ** 2 for axis, coordinate in enumerate(position)], axis=0)
+    order = np.argsort(-distance[is_inside], kind="stable")  # the nearest cell of a pixel is assigned last
+    cell_of_pixel = np.full((len(y), len(x)), -1)
+    cell_of_pixel[row[is_inside][order], column[is_inside][order]] = cell[is_inside][order]
+    return cell_of_pixel
 
 
 # Pixels above this fraction of the image's maximum belong to the target.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jeit.image import Raster
-from jeit.mesh import box, centroids, disk, measures, rectangle
+from jeit.mesh import box, centroids, cylinder, disk, measures, rectangle
 
 
 def test_row_zero_is_at_the_top_and_column_zero_at_the_left():
@@ -42,6 +42,23 @@ def test_every_pixel_lies_in_its_cell():
         np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2),
         (raster.pixel_centres().reshape(-1, 2)[inside] - corners[:, 0])[..., None],
     )[..., 0]
+    assert local.min() > -1e-8
+    assert local.sum(axis=1).max() < 1 + 1e-8
+
+
+def test_every_pixel_of_a_slice_lies_in_its_cell():
+    """And every pixel within the mesh has a cell, also in an extent that the mesh fills in part."""
+    mesh = cylinder(0.1, 0.05, cell_size=0.03)
+    raster = Raster.create(mesh, shape=(30, 40), extent=(-0.2, 0.1, 0.0, 0.2), height=0.02)
+    cell, pixel = np.asarray(raster.cell).ravel(), raster.pixel_centres().reshape(-1, 2)
+    distance, inside = np.hypot(*pixel.T), cell >= 0
+    assert inside[distance < 0.09].all()
+    assert not inside[distance > 0.1].any()
+    corners = np.asarray(mesh.points)[np.asarray(mesh.cells)[cell[inside]]]
+    places = np.column_stack([pixel[inside], np.full(inside.sum(), 0.02)])
+    local = np.linalg.solve(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2), (places - corners[:, 0])[..., None])[
+        ..., 0
+    ]
     assert local.min() > -1e-8
     assert local.sum(axis=1).max() < 1 + 1e-8
 
