@@ -35,7 +35,7 @@ from jeit.inverse.channels import IndependentChannels, relative_noise
 from jeit.inverse.nonlinear.problem import check_frame
 from jeit.mesh import Mesh
 from jeit_solvers import Descent, QuadraticModel, ridge_model
-from jeit_solvers.engines import as_array, on_host
+from jeit_solvers.engines import Recent, as_array, on_host
 
 # Prior standard deviations: of the logarithm of each contact impedance, of the common part of these logarithms, and of
 # the logarithm of the conductivity about the value that best fits the described model.
@@ -223,6 +223,8 @@ class _PlacementProblem:
 
     def __init__(self, model: ForwardModel, measured: np.ndarray, used: np.ndarray, deviation: float):
         self.described_model, self.mesh, self.protocol = model, on_host(model.mesh), on_host(model.protocol)
+        # A fit ends at a point that it has already computed.
+        self.at, self.jacobian = Recent(self._model_at), Recent(self._jacobian)
         self.used = used
         self.measured = measured
         self.num_independent = len(IndependentChannels.create(self.protocol).index)
@@ -243,7 +245,7 @@ class _PlacementProblem:
             contact_covariance
         )
 
-    def at(self, coefficients: Float[np.ndarray, " p"]) -> _LinearisedModel | None:
+    def _model_at(self, coefficients: Float[np.ndarray, " p"]) -> _LinearisedModel | None:
         """Compute the model with the parameters that follow from the `coefficients`; None if electrodes would overlap
         or leave the body."""
         num_electrodes, num_directions = self.directions.shape[:2]
@@ -276,7 +278,7 @@ class _PlacementProblem:
         identity: Any = np.eye(len(residual))
 
         def step(damping):
-            rows = self._jacobian(point) / scale
+            rows = self.jacobian(point) / scale
             return ridge_model(residual, rows, coefficients, identity, identity)[1](damping)  # pyright: ignore
 
         return cost, step
@@ -288,7 +290,7 @@ class _PlacementProblem:
         Dependent channels count once: the number of degrees of freedom of the residual is the number of independent
         channels minus the effective number of parameters of the fit.
         """
-        residual, rows = self._residual(point), self._jacobian(point)
+        residual, rows = self._residual(point), self.jacobian(point)
         num_independent = min(self.num_independent, len(residual))
         independent_share = num_independent / len(residual)
         # Computed from eigenvalues, the covariance stays positive definite where rounding makes the Hessian's inverse

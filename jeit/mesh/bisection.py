@@ -49,12 +49,18 @@ def bisect(mesh: Mesh, size: Callable[[Float[np.ndarray, "m k s"]], Float[np.nda
     bisect(mesh, near).num_cells
     ```
     """
-    return bisect_with_parents(mesh, size)[0]
+    refined = bisect_with_parents(mesh, size, MOST_POINTS)
+    if refined is None:
+        raise ValueError(f"size asks for more than {MOST_POINTS:,} nodes; give longer edges. Are they in metres?")
+    return refined[0]
 
 
-def bisect_with_parents(mesh: Mesh, size: Callable[..., Float[np.ndarray, " m"]]) -> tuple[Mesh, Int[np.ndarray, " m"]]:
+def bisect_with_parents(
+    mesh: Mesh, size: Callable[..., Float[np.ndarray, " m"]], max_points: int
+) -> tuple[Mesh, Int[np.ndarray, " m"]] | None:
     """Refine a mesh as `bisect` does. Also returns, for each cell of the new mesh, the index of the cell of the
-    original mesh that contains it. Raises `ValueError` as `bisect` does."""
+    original mesh that contains it. Returns None if `size` requires more than `max_points` nodes. Raises `ValueError` as
+    `bisect` does."""
     split_mesh = _SplitMesh.from_mesh(mesh)
     parent, everywhere = np.arange(len(split_mesh.cells)), slice(None)
     longest_edge, longest_length = _longest_edges(split_mesh, everywhere)
@@ -64,8 +70,8 @@ def bisect_with_parents(mesh: Mesh, size: Callable[..., Float[np.ndarray, " m"]]
         split_edges = _edges_to_split(
             split_mesh.cells, longest_edge, np.unique(longest_edge[exceeds_size]), len(points)
         )
-        if len(points) + len(split_edges) > MOST_POINTS:
-            raise ValueError(f"size asks for more than {MOST_POINTS:,} nodes; give longer edges. Are they in metres?")
+        if len(points) + len(split_edges) > max_points:
+            return None
         split_mesh, origin = split_mesh.split(split_edges, points[split_edges].mean(axis=1))
         parent, longest_edge, exceeds_size = parent[origin], longest_edge[origin], exceeds_size[origin]
         is_new = np.bincount(origin)[origin] > 1

@@ -1,7 +1,9 @@
 """Place, contrast, area and strength of bodies with their intervals, in tanks that differ from their description."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from jeit.image import Inclusion
 from jeit.inverse.channels import Data
 from jeit.inverse.placement import ModelError
 from jeit.inverse.shapes import Accuracy, StarPrior, ellipsoid, reconstruct_shapes
+from jeit.inverse.shapes.bodies import Bodies
 from jeit.inverse.shapes.problem import ShapeProblem, SmoothField
 from jeit.inverse.shapes.quantities import _FixedContrastFit, _summary, centroid_radius
 from jeit.inverse.shapes.search import _FitSetting
@@ -105,7 +108,8 @@ def test_the_radius_of_a_place_holds_68_percent_of_a_posterior(dimension):
         model=SimpleNamespace(mesh=SimpleNamespace(points=middle + np.array([[-1.0] * dimension, [1.0] * dimension]))),
         covariance=lambda fit: covariance,
     )
-    bodies = SimpleNamespace(body=body, prior=SimpleNamespace(size=size), span=2.0)
+    bodies: Any = SimpleNamespace(body=body, prior=SimpleNamespace(size=size), span=2.0)
+    bodies.centroid_slope = partial(Bodies.centroid_slope, bodies)
     fit = SimpleNamespace(bodies=bodies, coefficients=np.zeros(number))
     samples = random.normal(size=(100_000, number)) @ factor.T
     offsets = samples[:, 1 + size :] @ slope.T + 0.1 * random.normal(size=(100_000, 1)) * (centroid - middle)

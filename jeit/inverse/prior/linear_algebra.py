@@ -245,14 +245,14 @@ class GriddedGaussian:
 
     def product(self, columns: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
         """Product of the approximated covariance Γ with `columns`."""
-        products = np.empty(columns.shape)
-        for start in range(0, columns.shape[1], _COLUMNS_AT_ONCE):
-            column_range = slice(start, start + _COLUMNS_AT_ONCE)
-            grid = (self._interpolation.T @ columns[:, column_range]).reshape(*self._shape, -1)
+
+        def product_of_block(block: Float[np.ndarray, "m c"]) -> Float[np.ndarray, "m c"]:
+            grid = (self._interpolation.T @ block).reshape(*self._shape, -1)
             for axis, axis_covariance in enumerate(self._axis_covariances):
                 grid = np.moveaxis(np.tensordot(axis_covariance, grid, axes=(1, axis)), 0, axis)
-            products[:, column_range] = self._interpolation @ grid.reshape(int(np.prod(self._shape)), -1)
-        return products
+            return self._interpolation @ grid.reshape(int(np.prod(self._shape)), -1)
+
+        return by_columns(product_of_block, columns, len(columns), _COLUMNS_AT_ONCE)
 
 
 def _cubic_weights(place: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d 4"]:

@@ -21,6 +21,8 @@ from jaxtyping import Bool, Float, Int
 from jeit.arguments import describe, is_number
 from jeit.arguments.checks import Interval
 
+# Step of the finite differences of a centroid, in standard deviations of a coefficient.
+_CENTROID_STEP = 0.1
 # Fields of `Bodies`, except `start`, that have one value per body.
 _FIELDS_PER_BODY = ("sign", "is_other_kind", "is_kind_certain", "same_material", "fixed_contrast")
 
@@ -212,6 +214,17 @@ class Bodies(abc.ABC):
     @abc.abstractmethod
     def body(self, k: int, coefficients: Float[np.ndarray, " n"], rise: float = np.nan) -> Any:
         """Description of body k, such as a `Star`. The area or volume is that of the part inside the domain."""
+
+    def centroid_slope(self, k: int, coefficients, deviations: Float[np.ndarray, " q"]) -> Float[np.ndarray, "d q"]:
+        """Derivatives of the centroid of body k with respect to its q coefficients, metres, by finite differences over
+        a part of the coefficients' standard `deviations`."""
+        slopes = []
+        for index, deviation in enumerate(deviations):
+            step = np.zeros(len(coefficients))
+            step[1 + k * self.prior.size + index] = _CENTROID_STEP * deviation
+            ends = [self.body(k, coefficients + direction * step).centroid for direction in (-1, 1)]
+            slopes.append((ends[1] - ends[0]) / (2 * _CENTROID_STEP * deviation))
+        return np.stack(slopes, axis=1)
 
     @property
     def dimension(self) -> int:

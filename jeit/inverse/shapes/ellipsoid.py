@@ -18,6 +18,7 @@ from jeit.arguments import check_name
 from jeit.inverse.shapes.bodies import TINY, Bodies, BodyPrior, Covered, Quantities, polarisation
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit.mesh import Mesh, measures
+from jeit_solvers import results_on_cores
 from jeit_solvers.module import Module
 
 # Difference of log evidence above which only the likelier of two descriptions is reported (ellipsoid or column, one
@@ -69,17 +70,17 @@ def alternatives(problem: ShapeProblem, fitted: Fit) -> list[tuple[Ellipsoid | N
     bodies, num_bodies = fitted.bodies, len(fitted.bodies.sign)
     if not num_bodies or bodies.prior.is_of_one_kind or not isinstance(bodies, Ellipsoids):
         return [(None, np.nan)] * num_bodies
-    max_surprise, pairs = problem.surprise(fitted) - bodies.odds + _UNDECIDED_ODDS, []
-    for k in range(num_bodies):
+    max_surprise = problem.surprise(fitted) - bodies.odds + _UNDECIDED_ODDS
+
+    def alternative(k: int) -> tuple[Ellipsoid | None, float]:
         if bodies.is_kind_certain[k]:
-            pairs.append((None, np.nan))
-            continue
+            return None, np.nan
         other_fit = problem.fit(*bodies.with_other_kind([k], fitted.coefficients), _STEPS, _COARSE_TOLERANCE)
-        if problem.surprise(other_fit) - other_fit.bodies.odds < max_surprise:
-            pairs.append((other_fit.bodies.body(k, other_fit.coefficients), contrast_deviations(problem, other_fit)[k]))
-        else:
-            pairs.append((None, np.nan))
-    return pairs
+        if problem.surprise(other_fit) - other_fit.bodies.odds >= max_surprise:
+            return None, np.nan
+        return other_fit.bodies.body(k, other_fit.coefficients), contrast_deviations(problem, other_fit)[k]
+
+    return results_on_cores(alternative, range(num_bodies))
 
 
 KINDS = ("either", "ellipsoids", "columns")
@@ -403,14 +404,29 @@ class Ellipsoids(Bodies):
         is_alike = int((self.first == self.first[k]).sum()) > 1
         return Ellipsoid(int(self.sign[k]), centre, axes, volume, centroid, contrast, is_column, is_alike, float(rise))
 
+    def centroid_slope(self, k: int, coefficients, deviations) -> Float[np.ndarray, "3 q"]:
+        """Derivatives of the centroid of body k with respect to its q coefficients, metres."""
+        row = self.rows(coefficients)[k]
+        cells, share, slope = self.coverage(k, row)
+        centre, weight = self.points[:, cells].mean(axis=2), self.weight[cells]
+        fractions = share * weight
+        if not fractions.sum() > 0:  # the body has left the domain: its centroid is its centre
+            return np.eye(3, len(row)) * self.prior.place * self.span
+        centroid = centre @ fractions / fractions.sum()
+        return (centre - centroid[:, None]) @ (weight[:, None] * slope) / fractions.sum()
+
     def coverage(self, k: int, row) -> Covered:
         """Coverage of cells by body k, whose coefficients are `row`."""
         log_stretch, direction = np.linalg.eigh(self._stretch(k, row))
         inverse_stretch = (direction * np.exp(-log_stretch)) @ direction.T
         centre, radius = self.centre(k, row), np.exp(min(self.log_radius(row), np.log(10 * self.span)))
-        extent, axes = radius * np.exp(log_stretch[-1]), self._axes_of(k)
-        is_near = _lengths((self.points[:, :, 0] - centre[:, None]) * axes[:, None]) < extent + _REACH * self.width
-        cells = np.flatnonzero(is_near)
+        axes = self._axes_of(k)
+        # Depth of one point of every cell below the surface, along the ray from the centre.
+        offset = (self.points[:, :, 0] - centre[:, None]) * axes[:, None]
+        distance = np.maximum(_lengths(offset), 1e-9 * self.span)
+        depth = distance * (radius / np.maximum(_lengths(inverse_stretch @ offset), 1e-9 * self.span) - 1)
+        is_near = np.abs(depth) < _REACH * self.width
+        cells, inner_cells = np.flatnonzero(is_near), np.flatnonzero(~is_near & (depth > 0))
         offset = (self.points[:, cells] - centre[:, None, None]) * axes[:, None, None]
         distance, width = _lengths(offset), self.width[cells, None]
         if (is_at_centre := distance == 0).any():
@@ -434,7 +450,11 @@ class Ellipsoids(Bodies):
         form_slope = outer_products.reshape(len(cells), 9) @ stretches.reshape(-1, 9).T
         columns = [centre_slope, (share_slope * growth).sum(axis=1)[:, None], np.zeros((len(cells), 1)), form_slope]
         slopes = np.concatenate(columns, axis=1) * self.prior.deviation(self.span)
-        return Covered(cells, inside.mean(axis=1), slopes)
+        return Covered(
+            np.concatenate([cells, inner_cells]),
+            np.concatenate([inside.mean(axis=1), np.ones(len(inner_cells))]),
+            np.concatenate([slopes, np.zeros((len(inner_cells), slopes.shape[1]))]),
+        )
 
     def _mask(self, k: int) -> Float[np.ndarray, "5"]:
         """Mask (5,) of the basis of S: 1 for the elements along which body k may be stretched, else 0."""

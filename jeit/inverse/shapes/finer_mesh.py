@@ -24,10 +24,12 @@ from jeit.inverse.shapes.ellipsoid import Ellipsoids
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit.mesh import Mesh
 from jeit.mesh.bisection import bisect_with_parents
+from jeit.mesh.checks import MOST_POINTS
 from jeit.protocol import Protocol
 from jeit_solvers.engines import on_host
 
-# Ratio of the number of nodes of the refined mesh to that of the original mesh, below which longer edges are not tried.
+# Maximum ratio of the number of nodes of the refined mesh to that of the original mesh, unless even the longest edges
+# require more.
 _MAX_NODES = 2.5
 
 
@@ -58,18 +60,20 @@ class FinerModel(NamedTuple):
 def refine_at_surfaces(problem: ShapeProblem, fit: Fit, edges: Sequence[float]) -> FinerModel:
     """Refine the mesh of a shape problem at the surfaces of the ellipsoids of a fit.
 
-    `edges`: edge lengths on the surfaces, in units of an ellipsoid's shortest half axis. The first length that does not
-    add too many nodes is used, else the last. The change of the background's voltages due to refinement is added to the
-    data.
+    `edges`: edge lengths on the surfaces, in units of an ellipsoid's shortest half axis, in descending order. The mesh
+    is refined to one length after the other, as long as this does not add too many nodes. The change of the
+    background's voltages due to refinement is added to the data.
     """
     bodies, model = fit.bodies, problem.model
     assert isinstance(bodies, Ellipsoids)
     tagged_mesh, names = _tag_electrodes(model.mesh, model.electrodes)
-    mesh, parent_cells = bisect_with_parents(tagged_mesh, partial(bodies.edges, fit.coefficients, edges[0]))
-    for edge in edges[1:]:
-        if mesh.num_points < _MAX_NODES * tagged_mesh.num_points:
+    mesh, parent_cells, max_points = tagged_mesh, np.arange(tagged_mesh.num_cells), MOST_POINTS
+    for edge in edges:
+        refined = bisect_with_parents(mesh, partial(bodies.edges, fit.coefficients, edge), max_points)
+        if refined is None:
             break
-        mesh, parent_cells = bisect_with_parents(tagged_mesh, partial(bodies.edges, fit.coefficients, edge))
+        mesh, parent_cells = refined[0], parent_cells[refined[1]]
+        max_points = int(_MAX_NODES * tagged_mesh.num_points)
     refined_model = on_host(ForwardModel(mesh, _electrodes_on(mesh, model.electrodes, iter(names)), model.protocol))
     background = problem.background[parent_cells]
     voltage_change = (

@@ -23,7 +23,7 @@ precisely the data determine a coefficient, the more it increases -log evidence.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -33,15 +33,16 @@ from jaxtyping import Float
 
 from jeit.arguments import check_kind
 from jeit.forward import ForwardModel
-from jeit.forward.changes import ConductivityChange, solved_fields
+from jeit.forward.changes import ConductivityChange, SolvedFields, solved_fields
 from jeit.inverse.channels import Data
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes.bodies import Bodies
-from jeit_solvers import Descent, QuadraticModel, ridge_model
+from jeit_solvers import Descent, QuadraticModel, check_not_abandoned, ridge_model
 from jeit_solvers.engines import on_host
 
 # Levels of the smooth field that are tried, in units of the standard deviation of the smooth image's prior.
 _LEVELS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)
+_NUM_RECENT_FIELDS = 6
 
 
 @dataclass(frozen=True)
@@ -122,18 +123,36 @@ class Fit(NamedTuple):
     rows: tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r n"]]
 
 
+class _RecentFields:
+    """Cache of the fields of one model for the last few conductivities."""
+
+    def __init__(self):
+        self._solved: list[tuple[Float[np.ndarray, " m"], SolvedFields]] = []
+
+    def at(self, model: ForwardModel, conductivity: Float[np.ndarray, " m"]) -> SolvedFields:
+        """The fields of the `model` for a `conductivity`, solved now or taken from the cache."""
+        for known_conductivity, solved in self._solved[::-1]:
+            if np.array_equal(known_conductivity, conductivity):
+                return solved
+        solved = solved_fields(model, conductivity)
+        self._solved = [*self._solved, (conductivity, solved)][-_NUM_RECENT_FIELDS:]
+        return solved
+
+
 @dataclass(frozen=True)
 class ShapeProblem:
     """Least squares problem for the coefficients of bodies.
 
     **Fields**: `model`: forward model of the independent channels; `data`: independent voltages ŷ, their weights w and
-    precision G; `background` (m,): σ₀, S/m (2-D: S); `rtol`: relative change of the cost that ends a fit.
+    precision G; `background` (m,): σ₀, S/m (2-D: S); `rtol`: relative change of the cost that ends a fit;
+    `recent_fields`: the last solutions, because a fit often begins where another fit has ended.
     """
 
     model: ForwardModel
     data: Data
     background: Float[np.ndarray, " m"]
     rtol: float = 3e-3
+    recent_fields: _RecentFields = field(default_factory=lambda: _RecentFields(), compare=False)
 
     def with_errors(self, rows: Float[np.ndarray, "r q"]) -> ShapeProblem:
         """Copy of the problem with further errors of the data: `rows` (r, q) are the errors of the r weighted voltages
@@ -145,9 +164,10 @@ class ShapeProblem:
     def linearise(self, coefficients: Float[np.ndarray, " n"], bodies: Bodies) -> tuple[Any, Any, Any, Any]:
         """Residual (r + p,), a function that returns its Jacobian (r + p, n), its covariance and its precision
         (r + p, r + p), for r channels and p pairs of bodies."""
+        check_not_abandoned()
         image, slopes, overlap, overlap_slope = bodies.image(coefficients)
         conductivity = self.background * np.exp(image)
-        fields = solved_fields(self.model, conductivity)
+        fields = self.recent_fields.at(self.model, conductivity)
         weight = np.asarray(self.data.weight)
         # The penalty on the overlap of bodies is an additional datum of unit variance for every pair of bodies.
         overlap_weight, pair_identity = bodies.prior.apart, np.eye(len(overlap))

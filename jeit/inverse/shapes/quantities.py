@@ -25,6 +25,7 @@ from jeit.inverse.placement import ModelError, Uncertainty
 from jeit.inverse.shapes.bodies import TINY, Bodies, Quantities, polarisation
 from jeit.inverse.shapes.ellipsoid import Ellipsoid
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
+from jeit_solvers import results_on_cores
 
 # Prior median of the contrast, and standard deviation and bounds of its logarithm; a contrast of 4.5 is a factor of 90.
 _MEDIAN_LOG_CONTRAST, _LOG_CONTRAST_DEVIATION, _LOG_CONTRAST_BOUNDS = (
@@ -49,8 +50,6 @@ _OPEN_END_RISE = 1.0
 _INTERVAL_PROBABILITIES, _NUM_CONTRASTS, _NUM_NORMAL_DEVIATES = (0.16, 0.84), 240, 31
 # Probability that the circle about a centroid contains the true centroid.
 _CENTROID_PROBABILITY = 0.68
-# Step of the finite differences of a centroid, in standard deviations of a coefficient.
-_CENTROID_STEP = 0.1
 # Standard deviation of a body's place due to an error of the fields, as a share of half the width of the domain times
 # the relative error: a body's voltages change by a factor of about e² over half the width, and a fifth of the error is
 # assumed to resemble a displacement.
@@ -90,7 +89,10 @@ def with_quantities(
         problem = problem.with_errors(np.asarray(problem.data.weight)[:, None] * rows)
     shown_centroids = [fit.bodies.body(int(k), fit.coefficients).centroid for k in order]
     fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
-    explored = {int(k): explore_contrast(problem, fit, int(k)) for k in np.unique(fit.bodies.first)}  # by material
+    materials = np.unique(fit.bodies.first).tolist()
+    explored = dict(
+        zip(materials, results_on_cores(lambda k: explore_contrast(problem, fit, k), materials), strict=True)
+    )
     return [
         replace(
             quantify(problem, explored[int(fit.bodies.first[k])], int(k), float(unmodelled[k]), accuracy),
@@ -113,14 +115,8 @@ def centroid_radius(
     bodies, prior_size = fit.bodies, fit.bodies.prior.size
     indices = np.arange(1 + k * prior_size, 1 + (k + 1) * prior_size)
     coefficient_covariance = problem.covariance(fit)[np.ix_(indices, indices)]
-    slopes = []
-    for index, deviation in zip(indices, np.sqrt(np.diag(coefficient_covariance)), strict=True):
-        step = np.zeros(len(fit.coefficients))
-        step[index] = _CENTROID_STEP * deviation
-        ends = [bodies.body(k, fit.coefficients + direction * step).centroid for direction in (-1, 1)]
-        slopes.append((ends[1] - ends[0]) / (2 * step[index]))
-    slope = np.stack(slopes, axis=1)
     centroid = bodies.body(k, fit.coefficients).centroid
+    slope = bodies.centroid_slope(k, fit.coefficients, np.sqrt(np.diag(coefficient_covariance)))
     points = np.asarray(problem.model.mesh.points)
     scaling_error = accuracy.size * (centroid - (points.min(axis=0) + points.max(axis=0)) / 2)
     field_error = _FIELD_DISPLACEMENT * accuracy.strength * bodies.span / 2
@@ -189,19 +185,25 @@ def explore_contrast(problem: ShapeProblem, fit: Fit, k: int) -> list[ExploredCo
     first_log_contrast = float(np.clip(np.log(contrast), *_LOG_CONTRAST_BOUNDS))
     deviation = problem.deviations(fit)[_radius_and_contrast_index(bodies, k)[1]] * abs(slope) / contrast
     middle_fit = _fit_with_fixed_contrast(problem, bodies, fit.coefficients, k, np.log(contrast), first_log_contrast)
-    explored, max_drop = [middle_fit], _LOG_POSTERIOR_DROP[bodies.dimension]
-    for direction in (-1, 1):
-        last_fit, step = middle_fit, float(np.clip(deviation, *_FIRST_STEP_LIMITS))
-        while last_fit.negative_log_evidence < min(one.negative_log_evidence for one in explored) + max_drop:
+    max_drop = _LOG_POSTERIOR_DROP[bodies.dimension]
+
+    def explore(direction: int) -> list[ExploredContrast]:
+        explored, step = [middle_fit], float(np.clip(deviation, *_FIRST_STEP_LIMITS))
+        while explored[-1].negative_log_evidence < min(one.negative_log_evidence for one in explored) + max_drop:
+            last_fit = explored[-1]
             log_contrast = float(np.clip(last_fit.log_contrast + direction * step, *_LOG_CONTRAST_BOUNDS))
             if log_contrast == last_fit.log_contrast:
                 break
-            last_fit = _fit_with_fixed_contrast(
-                problem, bodies, last_fit.fit.coefficients, k, last_fit.log_contrast, log_contrast
+            explored.append(
+                _fit_with_fixed_contrast(
+                    problem, bodies, last_fit.fit.coefficients, k, last_fit.log_contrast, log_contrast
+                )
             )
-            explored.insert(len(explored) if direction > 0 else 0, last_fit)
             step *= _STEP_GROWTH
-    return explored
+        return explored
+
+    lower, higher = results_on_cores(explore, [-1, 1])
+    return [*lower[:0:-1], *higher]
 
 
 def quantify(

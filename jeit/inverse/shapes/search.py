@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
@@ -29,7 +30,7 @@ from jeit.inverse.shapes.quantities import Accuracy, include_deviation, with_qua
 from jeit.inverse.shapes.reconstruction import Body, FinerImage, ShapeReconstruction
 from jeit.inverse.shapes.star import StarPrior, Stars
 from jeit.mesh import check_flat
-from jeit_solvers import one_thread_of_blas
+from jeit_solvers import one_thread_of_blas, results_on_cores
 from jeit_solvers.engines import as_array
 
 if TYPE_CHECKING:
@@ -38,7 +39,10 @@ if TYPE_CHECKING:
 # A body is a ghost if the objective rises by less than this factor when the body is left out and all other bodies are
 # fitted again.
 LEAST_RISE = 1.4
-_FIRST_STEPS, _STEPS, _REMOVAL_STEPS, _TRIAL_STEPS = 15, 40, 8, 6
+_FIRST_STEPS, _STEPS, _TRIAL_STEPS = 15, 40, 6
+# Steps of the fit without a body: in all, and those after which the fit ends if the cost exceeds the cost at which the
+# body is beyond doubt by more than this factor.
+_REMOVAL_STEPS, _FIRST_REMOVAL_STEPS, _HOPELESS_RISE = 6, 3, 30.0
 _COARSE_TOLERANCE = 1e-2
 # Number of successive starts that the data do not support, after which the remaining, weaker starts are not tried.
 _MAX_UNSUPPORTED = 2
@@ -52,7 +56,7 @@ _MAX_CHANGES = 10
 # Maximum number of times that the mesh is refined at the bodies, which move as a result. Edge lengths on the bodies'
 # surfaces, in units of the shortest half axis, that are tried in turn: in the first refinement, when some bodies may
 # still be ghosts (false bodies), and in later refinements.
-_MAX_REFINEMENTS, _EDGE_LENGTHS = 3, ((0.7,), (0.25, 0.35, 0.5, 0.7))
+_MAX_REFINEMENTS, _EDGE_LENGTHS = 3, ((0.7,), (0.7, 0.5, 0.35, 0.25))
 # Minimum gain of log evidence with which a description of the bodies with more parameters is accepted.
 _MIN_EVIDENCE_GAIN = 2.0
 
@@ -140,11 +144,13 @@ def reconstruct_shapes(
         problem = setting.problem(level)
     fitted = problem.fit(*_grow_bodies(problem, bodies, coefficients, _FIRST_STEPS), _STEPS)
     result = _remove_unsupported(problem, fitted, (), least_rise)
-    report("bodies, how many")
-    state, finer_model = _SearchState(setting, level, _improve_fit(problem, result, least_rise)), None
+    state, finer_model = _SearchState(setting, level, result), None
     if is_solid:
         state, finer_model = _refine_meshes(state, least_rise, report)
         report("bodies, of which kind")
+    else:
+        report("bodies, how many")
+        state = state._replace(found=_improve_fit(problem, result, least_rise))
     (setting, level, (free_fit, rises, doubtful)), smooth_field = state, state.setting.smooth_field
     problem = setting.problem(level)
     fitted = _with_common_contrast(problem, free_fit)
@@ -293,8 +299,9 @@ def _refine_meshes(
 ) -> tuple[_SearchState, FinerModel | None]:
     """Fit the bodies on meshes refined at their surfaces, until the surfaces stay within the refined cells.
 
-    Ghosts due to the coarse mesh are removed. Returns the state and the last refined problem, which is None if there
-    are no bodies.
+    Ghosts due to the coarse mesh are removed. The number and kinds of the bodies are determined on the first refined
+    mesh, because on the coarse mesh further bodies would explain its errors. Returns the state and the last refined
+    problem, which is None if there are no bodies.
     """
     from jeit.inverse.shapes.finer_mesh import refine_at_surfaces
 
@@ -325,7 +332,10 @@ def _refine_meshes(
         problem = setting.problem(level)
         fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
         result = _remove_unsupported(problem, fit, doubtful, least_rise, costs)
-        if refinement < _MAX_REFINEMENTS - 1:
+        if refinement == 0:
+            report("bodies, how many")
+            result = _improve_fit(problem, result, least_rise)
+        elif refinement < _MAX_REFINEMENTS - 1:
             result, other_fit = _alternative_fits(problem, result)
             if other_fit is not None:
                 result = _remove_unsupported(problem, other_fit, result.doubtful, least_rise)
@@ -353,10 +363,11 @@ def _remove_unsupported(
         # After a ghost is removed, leaving out a further body raises the cost at least as much as before, so costs
         # computed earlier are lower limits.
         certain_cost = max(_CERTAIN_RISE * cost, problem.surprise(fitted) + _MIN_EVIDENCE_GAIN)
-        uncertain, fits = np.flatnonzero(costs <= certain_cost).tolist(), {}
-        for k in uncertain:
-            fits[k] = problem.fit(*bodies.without(k, coefficients), _REMOVAL_STEPS, 2 * _COARSE_TOLERANCE)
-            costs[k] = fits[k].cost
+        uncertain = np.flatnonzero(costs <= certain_cost).tolist()
+        starts = [bodies.without(k, coefficients) for k in uncertain]
+        fits_without = results_on_cores(partial(_fit_without, problem, certain_cost), starts)
+        fits = dict(zip(uncertain, fits_without, strict=True))
+        costs[uncertain] = [fit.cost for fit in fits_without]
         weakest = min(fits, key=lambda k: costs[k], default=None)
         if weakest is None or (costs[weakest] >= least_rise * cost and _is_supported(problem, fits[weakest], fitted)):
             return _SearchResult(fitted, list(costs / cost), tuple(doubtful))
@@ -365,15 +376,27 @@ def _remove_unsupported(
         fitted = problem.fit(fits[weakest].bodies, fits[weakest].coefficients, _STEPS)
 
 
+def _fit_without(problem: ShapeProblem, certain_cost: float, start: tuple[Bodies, Float[np.ndarray, " n"]]) -> Fit:
+    """Fit the remaining bodies from their coefficients `start`. The fit ends early if its cost remains far above
+    `certain_cost`, at which the absent body is beyond doubt."""
+    first_fit = problem.fit(*start, _FIRST_REMOVAL_STEPS, 2 * _COARSE_TOLERANCE)
+    if first_fit.cost > _HOPELESS_RISE * certain_cost:
+        return first_fit
+    return problem.fit(first_fit.bodies, first_fit.coefficients, _REMOVAL_STEPS, 2 * _COARSE_TOLERANCE)
+
+
 def _split_bodies(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None:
-    """Fit the bodies with one body split in two; None if the data support no split."""
+    """Fit the bodies with one body split in two; None if the data support no split. Each body adds parameters, so no
+    split is tried if the whole cost is less than the gain of evidence that it needs."""
     bodies, coefficients, cost, _ = fitted
-    starts = [
-        _grow_bodies(problem, *bodies.split(k, coefficients, number), _TRIAL_STEPS)
-        for k in range(len(bodies.sign))
-        for number in range(bodies.num_splits)
-    ]
-    split = _best_fit(problem, fitted, _trial_fits(problem, starts))
+    if cost < _MIN_EVIDENCE_GAIN:
+        return None
+
+    def trial(index: tuple[int, ...]) -> Fit:
+        return _trial_fit(problem, _grow_bodies(problem, *bodies.split(index[0], coefficients, index[1]), _TRIAL_STEPS))
+
+    trials = results_on_cores(trial, list(np.ndindex(len(bodies.sign), bodies.num_splits)))
+    split = _best_fit(problem, fitted, trials)
     return split if split and cost >= least_rise * split.cost and _is_supported(problem, fitted, split) else None
 
 
@@ -388,7 +411,9 @@ def _alternative_fits(problem: ShapeProblem, result: _SearchResult) -> tuple[_Se
     can_change = ~bodies.is_other_kind & ~bodies.is_kind_certain & (not bodies.prior.is_of_one_kind)
     indices = np.flatnonzero(can_change)
     groups = [[k] for k in indices] + [indices] * (len(indices) > 1)
-    trials = _trial_fits(problem, [bodies.with_other_kind(group, fitted.coefficients) for group in groups])
+    trials = results_on_cores(
+        lambda group: _trial_fit(problem, bodies.with_other_kind(group, fitted.coefficients)), groups
+    )
     is_kind_certain = bodies.is_kind_certain.copy()
     for k, trial in zip(indices, trials, strict=False):
         is_kind_certain[k] = trial.cost > _EXCLUDED_RISE * fitted.cost
@@ -407,9 +432,9 @@ def _with_common_contrast(problem: ShapeProblem, fitted: Fit) -> Fit:
     return fitted
 
 
-def _trial_fits(problem: ShapeProblem, starts: Sequence[tuple[Bodies, Float[np.ndarray, " n"]]]) -> list[Fit]:
-    """Make a few steps of the fit from each of several starts."""
-    return [problem.fit(*start, _TRIAL_STEPS, _COARSE_TOLERANCE) for start in starts]
+def _trial_fit(problem: ShapeProblem, start: tuple[Bodies, Float[np.ndarray, " n"]]) -> Fit:
+    """Make a few steps of the fit of bodies from their coefficients `start`."""
+    return problem.fit(*start, _TRIAL_STEPS, _COARSE_TOLERANCE)
 
 
 def _best_fit(problem: ShapeProblem, fitted: Fit, trial_fits: Sequence[Fit]) -> Fit | None:
@@ -429,22 +454,33 @@ def _is_supported(problem: ShapeProblem, simple_fit: Fit, other_fit: Fit) -> boo
 def _improve_fit(problem: ShapeProblem, result: _SearchResult, least_rise: float) -> _SearchResult:
     """Search for likelier bodies, starting once with a split and once with a change of kind. Returns the likelier
     result, or `result` if the data support neither change."""
-    split = _split_bodies(problem, result.fit, least_rise)
-    result, other_fit = _alternative_fits(problem, result)
-    starts = [fit for fit in (split, other_fit) if fit is not None]
-    results = [_search_until_stable(problem, result, start, least_rise) for start in starts] or [result]
-    return min(results, key=lambda candidate: problem.surprise(candidate.fit))
+
+    def after_split() -> _SearchResult | None:
+        split = _split_bodies(problem, result.fit, least_rise)
+        return split and _search_until_stable(problem, result.doubtful, split, least_rise)
+
+    def after_change_of_kind() -> tuple[_SearchResult, _SearchResult | None]:
+        marked_result, other_fit = _alternative_fits(problem, result)
+        return marked_result, other_fit and _search_until_stable(problem, result.doubtful, other_fit, least_rise)
+
+    split_result, (marked_result, other_result) = results_on_cores(
+        lambda search: search(), [after_split, after_change_of_kind]
+    )
+    candidates = [found for found in (split_result, other_result) if found is not None] or [marked_result]
+    return min(candidates, key=lambda candidate: problem.surprise(candidate.fit))
 
 
-def _search_until_stable(problem: ShapeProblem, result: _SearchResult, start: Fit, least_rise: float) -> _SearchResult:
+def _search_until_stable(
+    problem: ShapeProblem, doubtful: Sequence[Body], start: Fit, least_rise: float
+) -> _SearchResult:
     """Continue the search from the bodies `start`: remove ghosts, then split a body or, if no split is supported,
-    change the kind of a body, until the data support no change."""
+    change the kind of a body, until the data support no change. `doubtful`: bodies that were removed before."""
+    result = _remove_unsupported(problem, start, doubtful, least_rise)
     for _ in range(_MAX_CHANGES):
-        result = _remove_unsupported(problem, start, result.doubtful, least_rise)
         next_fit = _split_bodies(problem, result.fit, least_rise)
         if next_fit is None:
             result, next_fit = _alternative_fits(problem, result)
         if next_fit is None:
             break
-        start = next_fit
+        result = _remove_unsupported(problem, next_fit, result.doubtful, least_rise)
     return result
