@@ -83,7 +83,7 @@ def draw(seed: int, *, columns: bool = False) -> SolidTank:
     if columns:
         balls = tuple(ball._replace(height=domain.thickness) for ball in balls)
     mesh, factors_of_cells = mesh_along(domain, electrodes, balls)
-    model = on_host(ForwardModel(mesh, electrodes, protocol, solver="cholesky"))
+    model = on_host(ForwardModel(mesh, electrodes, protocol))
 
     def measured(factors, name):
         voltages = solved_fields(model, conductivity * factors).voltages

@@ -14,6 +14,7 @@ from jeit.imaging.preparation import PreparedDifference
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.prior.matern import MEASURED_DATA_PRIOR
 from jeit.inverse.shapes import ShapeReconstruction
+from jeit_solvers import results_on_cores
 
 # Changes of conductivity relative to the background above which voltages are not linear in conductivity: in general,
 # and for noisy data, whose images show far less than the true change. Data are noisy if the share of noise in the
@@ -63,7 +64,7 @@ def image_automatically(prepared: PreparedDifference, options: MethodOptions, se
     )
     if fault:
         try:
-            gauss_newton = _image_by("gauss-newton", prepared, options)
+            gauss_newton = _image_for_bodies(prepared, options)
         except ValueError as error:
             return ChosenMethod("one-step", f"{fault}; but Gauss-Newton found no image. {error}", imaged)
         assert isinstance(gauss_newton[0], Reconstruction)
@@ -88,6 +89,15 @@ def _image_by(name: str, prepared: PreparedDifference, options: MethodOptions) -
     return method.image(prepared, options._replace(hyperparameter=method.hyperparameter))
 
 
+def _image_for_bodies(prepared: PreparedDifference, options: MethodOptions) -> Imaged:
+    """Gauss-Newton image, from which bodies are fitted. In a solid, the accuracy of the difference, which their fit
+    needs, is computed at the same time."""
+    if prepared.mesh.dimension < 3:
+        return _image_by("gauss-newton", prepared, options)
+    jobs = [lambda: _image_by("gauss-newton", prepared, options), lambda: prepared.accuracy]
+    return results_on_cores(lambda job: job(), jobs)[0]
+
+
 def _bodies_in_solid(
     prepared: PreparedDifference, options: MethodOptions, change: Float[Array, " m"]
 ) -> ChosenMethod | None:
@@ -102,7 +112,7 @@ def _bodies_in_solid(
     ):
         return None
     try:
-        smooth = _image_by("gauss-newton", prepared, options)
+        smooth = _image_for_bodies(prepared, options)
     except ValueError:
         return None
     assert isinstance(smooth[0], Reconstruction)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import ParamSpec, TypeVar
 
@@ -19,7 +19,6 @@ from jeit.forward import ForwardModel
 from jeit.inverse import calibrate, relative_noise
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.placement import Placement, Uncertainty, place_electrodes
-from jeit.mesh import Mesh
 from jeit_solvers import one_thread_of_blas
 from jeit_solvers.engines import as_array
 
@@ -103,7 +102,7 @@ def calibrated_model(
     ```
     """
     clock = Clock(None) if clock is None else clock
-    with clock("calibrate"), threads_for(model.mesh):
+    with clock("calibrate"), one_thread_of_blas():
         return _calibrate(model, base, contact)
 
 
@@ -125,12 +124,6 @@ def _calibrate(model: ForwardModel, base: Measurement, contact: str | None) -> t
             "and are geometry and protocol right?"
         )
     return calibration, contact_method
-
-
-def threads_for(mesh: Mesh) -> AbstractContextManager:
-    """Context in which the BLAS has one thread for a sheet. The matrices of a sheet are small, and several threads that
-    wait for each other on a busy machine take ten times as long."""
-    return one_thread_of_blas() if mesh.dimension == 2 else nullcontext()
 
 
 def _with_estimated_positions(

@@ -21,7 +21,7 @@ from jeit.image import Inclusion, Raster, SolidForm
 from jeit.image.inclusions import inclusion_regions
 from jeit.image.rasters import CONDUCTIVE, RESISTIVE
 from jeit.imaging.automatic import image_automatically
-from jeit.imaging.calibration import Clock, threads_for
+from jeit.imaging.calibration import Clock
 from jeit.imaging.doubts import doubts_of_data
 from jeit.imaging.method import AUTO, METHODS, ImagingSettings, MethodOptions, as_settings
 from jeit.imaging.preparation import prepare_difference
@@ -32,7 +32,7 @@ from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes import KINDS, Ellipsoid, ShapeReconstruction, Star
 from jeit.inverse.uncertainty import image_noise
 from jeit.mesh import Mesh
-from jeit_solvers import Status
+from jeit_solvers import Status, one_thread_of_blas
 from jeit_solvers.engines import as_array
 
 _SEGMENTATION_LEVEL = 0.5
@@ -250,7 +250,9 @@ def image_difference(
     calibration = prepared.calibration
     if prepared.mesh.dimension == 2 and settings.bodies != KINDS[0]:
         raise ValueError("bodies: ellipsoids and columns are of solids, and this is a sheet; leave it out.")
-    with clock("image"), threads_for(prepared.mesh):
+    # Threads of the BLAS wait for each other: if another program occupies a core, images of solids take four times as
+    # long with them, and those of sheets ten times as long.
+    with clock("image"), one_thread_of_blas():
         reason, shapes = "", None
         options = MethodOptions(settings.prior, settings.hyperparameter, settings.bodies, progress)
         if settings.method == AUTO:

@@ -172,7 +172,7 @@ class PreparedDifference:
         bodies with sharp outlines, unlike smooth images, cannot adapt to model errors."""
         return self._noise_with_error_share(_SHARP_FACTOR * max(self._misfit, _MIN_MISFIT))
 
-    @property
+    @functools.cached_property
     def accuracy(self) -> Accuracy:
         """Errors of the voltage difference, from which the intervals of fitted bodies are computed.
 

@@ -14,13 +14,13 @@ from jeit.data import Measurement
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import find_inclusions
-from jeit.imaging import ImagingSettings, automatic, calibration, prepare_difference
+from jeit.imaging import ImagingSettings, automatic, calibration, difference, prepare_difference
 from jeit.imaging.automatic import linear_image_fault
 from jeit.imaging.method import METHODS
 from jeit.inverse import Gaussian, calibrate, reconstruct
 from jeit.inverse.uncertainty import image_noise
 from jeit.layout import ring
-from jeit.mesh import Disk, centroids, cylinder
+from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
 from jeit.report.image import report_image
 
@@ -59,19 +59,17 @@ def test_a_small_change_is_imaged_in_one_step():
     assert report_image(result)["reconstruction"]["why"] == result.why
 
 
-def test_sheets_are_imaged_with_one_blas_thread(monkeypatch):
-    """Even if imaging fails. Solids, whose matrices are large, use all threads."""
+def test_frames_are_imaged_with_one_blas_thread(monkeypatch):
     entered = []
 
     def context():
         entered.append(True)
         return nullcontext()
 
-    monkeypatch.setattr(calibration, "one_thread_of_blas", context)
+    for module in (calibration, difference):
+        monkeypatch.setattr(module, "one_thread_of_blas", context)
     image(20.0, method="one-step", raster_shape=(16, 16))
     assert len(entered) == 2  # during calibration and during imaging
-    with calibration.threads_for(cylinder(0.1, 0.1, cell_size=0.05)):
-        assert len(entered) == 2
 
 
 def test_a_sheet_has_no_columns():

@@ -111,6 +111,7 @@ def prepared(dimension, strongest, noise):
         quality=SimpleNamespace(difference_noise=difference_noise),
         calibration=SimpleNamespace(conductivity=BATH),
         mesh=SimpleNamespace(dimension=dimension),
+        accuracy=None,
     ), np.array([0.0, -strongest * BATH])
 
 
