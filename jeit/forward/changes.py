@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from jeit.electrodes.electrodes import AbstractElectrodes, AbstractMovableElectrodes
+from jeit.electrodes.electrodes import AbstractElectrodes, AbstractMovableElectrodes, Contact
 from jeit.forward.model import ForwardModel, channel_voltages, evaluate, fields_and_impedance_of, select_channels
 from jeit.forward.system import cached_geometry, stiffness
 from jeit.forward.transfer import ElectrodeImpedance
@@ -121,15 +121,23 @@ class _ContactMass(NamedTuple):
     mass: Float[np.ndarray, "q k k"]
 
 
-def _contact_masses_of(mesh: Mesh, electrodes: AbstractElectrodes, electrode: int) -> list[_ContactMass]:
-    """Contact mass matrices of one electrode, for unit contact impedance, if electrodes share facets or cells."""
-    contact_impedance = np.where(np.arange(electrodes.num_electrodes) == electrode, 1.0, _OPEN_CONTACT)
-    contact = on_host(electrodes.with_contact_impedance(contact_impedance)).contact(mesh)
-    pieces = []
-    for nodes, mass in zip(contact.nodes, contact.mass, strict=True):
-        touched = np.abs(mass).max(axis=(1, 2)) > 2 / _OPEN_CONTACT * np.abs(mass).max()
-        pieces.append(_ContactMass(np.asarray(nodes)[touched], np.asarray(mass)[touched]))
-    return pieces
+def _contact_of(mesh: Mesh, electrodes: AbstractElectrodes, members: Bool[np.ndarray, " L"]) -> Contact:
+    """Contact integrals for unit contact impedance of the electrodes that are `members`, and open contacts of all
+    others."""
+    contact_impedance = np.where(members, 1.0, _OPEN_CONTACT)
+    return on_host(electrodes.with_contact_impedance(contact_impedance)).contact(mesh)
+
+
+def _groups_without_neighbours(shares: Bool[np.ndarray, "L L"]) -> list[Bool[np.ndarray, " L"]]:
+    """Divide electrodes into as few groups as a simple search finds, so that no two electrodes of a group share a facet
+    or cell. `shares`: whether two electrodes share one. Each group is a mask of its members."""
+    groups: list[Bool[np.ndarray, " L"]] = []
+    for electrode, neighbours in enumerate(shares):
+        group = next((group for group in groups if not (group & neighbours).any()), None)
+        if group is None:
+            groups.append(group := np.zeros(len(shares), bool))
+        group[electrode] = True
+    return groups
 
 
 class ContactSensitivity:
@@ -138,20 +146,23 @@ class ContactSensitivity:
 
     def __init__(self, mesh: Mesh, electrodes: AbstractElectrodes):
         mesh, num_electrodes = on_host(mesh), electrodes.num_electrodes
-        contact = on_host(electrodes.with_contact_impedance(np.ones(num_electrodes))).contact(mesh)
-        self._loads: list[Float[np.ndarray, " n"]] = list(np.asarray(contact.load).T)
+        contact = _contact_of(mesh, electrodes, np.ones(num_electrodes, bool))
+        load = np.asarray(contact.load)
+        self._loads: list[Float[np.ndarray, " n"]] = list(load.T)
         self._pieces: list[list[_ContactMass]] = [[] for _ in range(num_electrodes)]
-        for nodes, mass in zip(contact.nodes, contact.mass, strict=True):
-            nodes, mass = np.asarray(nodes), np.asarray(mass)
-            covered_elements = np.flatnonzero(np.abs(mass).max(axis=(1, 2)) > 0)
-            # If an electrode covers a part of a facet or cell, all nodes of this facet or cell have a load.
-            is_touched = (np.asarray(contact.load)[nodes[covered_elements]] != 0).all(axis=1)
-            if (is_touched.sum(axis=1) > 1).any():
-                self._pieces = [_contact_masses_of(mesh, electrodes, electrode) for electrode in range(num_electrodes)]
-                return
-            for electrode, pieces in enumerate(self._pieces):
-                electrode_elements = covered_elements[is_touched[:, electrode]]
-                pieces.append(_ContactMass(nodes[electrode_elements], mass[electrode_elements]))
+        # If an electrode covers a part of a facet or cell, all nodes of this facet or cell have a load.
+        is_touched = [(load[np.asarray(nodes)] != 0).all(axis=1) for nodes in contact.nodes]
+        counts = sum(touched.T.astype(float) @ touched for touched in is_touched)
+        groups = _groups_without_neighbours((counts > 0) & ~np.eye(num_electrodes, dtype=bool))
+        for members in groups:
+            own_contact = contact if members.all() else _contact_of(mesh, electrodes, members)
+            for nodes, mass, touched in zip(own_contact.nodes, own_contact.mass, is_touched, strict=True):
+                nodes, mass = np.asarray(nodes), np.asarray(mass)
+                size = np.abs(mass).max(axis=(1, 2), initial=0)
+                is_covered = size > 2 / _OPEN_CONTACT * size.max(initial=0)
+                for electrode in np.flatnonzero(members):
+                    own = np.flatnonzero(is_covered & touched[:, electrode])
+                    self._pieces[electrode].append(_ContactMass(nodes[own], mass[own]))
 
     def __call__(
         self, fields: Float[np.ndarray, "n L"], impedance: Float[np.ndarray, "L L"], contact_impedance

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jeit.electrodes import BoundaryElectrodes, PointElectrodes
-from jeit.forward import ForwardModel
+from jeit.forward import ForwardModel, changes
 from jeit.forward.changes import ContactSensitivity
 from jeit.inverse import calibrate
 from jeit.layout import ring
@@ -85,6 +85,20 @@ def test_every_impedance_is_recovered_separately(model):
 
 
 def test_contact_sensitivity_against_differences(model):
+    check_contact_sensitivity(model)
+
+
+def test_contact_sensitivity_of_electrodes_that_share_facets(monkeypatch):
+    """Electrodes around the disk share a facet with a neighbour, so that the integrals of groups without neighbours are
+    needed, but not of each electrode."""
+    contact, computed = changes._contact_of, []
+    monkeypatch.setattr(changes, "_contact_of", lambda *given: computed.append(given[2].sum()) or contact(*given))
+    check_contact_sensitivity(ForwardModel(MESH, BoundaryElectrodes(ring(0.1, 8), 0.075, 1e-3), PROTOCOL))
+    assert computed[0] == sum(computed[1:]) == 8
+    assert len(computed) <= 4
+
+
+def check_contact_sensitivity(model):
     fields, impedance = map(np.asarray, model.fields(0.4))
     sensitivity = ContactSensitivity(model.mesh, model.electrodes)
     z = np.asarray(model.electrodes.contact_impedance)
