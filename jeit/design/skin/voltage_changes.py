@@ -106,8 +106,15 @@ def _exact_changes(model: ForwardModel, conductivity, touched: TouchedCells):
     solved_system = evaluate(model, solved_system_of, conductivity)
     fields_and_inverse_of_skin = fields_and_inverse(solved_system, touched_at.strips, max_distance)
     touches = on_device((touched.cells, touched.change, touched_at.nodes, touched_at.corners))
-    num_touches, element_matrices = len(touched.cells), cell_stiffness(model, conductivity)
-    compute_changes = partial(changes_between, model.protocol, element_matrices, fields_and_inverse_of_skin, touches)
+    compute_changes = partial(
+        changes_between, model.protocol, cell_stiffness(model, conductivity), fields_and_inverse_of_skin, touches
+    )
+    return _changes_over_cores(compute_changes, touched)
+
+
+def _changes_over_cores(compute_changes, touched: TouchedCells):
+    """Compute the changes due to all touches in one call of a compiled program per core."""
+    num_touches = len(touched.cells)
     changes = over_cores(compute_changes, num_touches, EXACT_BATCH_SIZE)[:num_touches]
     check_finite_changes(changes, np.asarray(touched.places))
     return changes
@@ -321,6 +328,16 @@ class RestingSkin(Module):
                 voltage_changes[chunk] = np.asarray(over_cores(work, _TOUCHES_PER_CALL, EXACT_BATCH_SIZE))[: len(chunk)]
         check_finite_changes(voltage_changes, np.asarray(touched.places))
         return voltage_changes
+
+    def changes_together(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
+        """As `changes`, for touches of about equal numbers of cells and nodes: all are padded to the largest, and one
+        program computes them. One is compiled for each number of touches, and for each size."""
+        touched_at = touched_nodes(self.model, touched, self.strips)
+        nodes = _pad_rows(touched_at.nodes, int(_padded_size(touched_at.nodes.shape[1], _NODE_SIZE_RATIO)), "edge")
+        touches = on_device((touched.cells, touched.change, nodes, touched_at.corners))
+        skin_fields_and_inverse = self.fields, self.inverse
+        work = partial(changes_between, self.model.protocol, self.element, skin_fields_and_inverse, touches)
+        return np.asarray(_changes_over_cores(work, touched))
 
 
 def _padded_size(count, ratio: float):

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import check_key, check_kind, check_name, describe, is_number, real_array
 from jeit.design.skin.touched_cells import TouchedCells, is_curved, pad_rows
-from jeit.design.skin.voltage_changes import touch_changes
+from jeit.design.skin.voltage_changes import RestingSkin, touch_changes
 from jeit.forward import ForwardModel
 from jeit.forward.changes import ContactSensitivity
 from jeit.forward.model import check_model, select_channels
@@ -129,6 +129,8 @@ def _creep_branches(material: Material) -> tuple[np.ndarray, np.ndarray]:
 
 # Number of touches processed at once.
 _TOUCHES_AT_ONCE = 1024
+# Maximum size of the inverse of a system matrix between all nodes.
+_MAX_INVERSE_BYTES = 160 * 2**20
 # Limits between groups of touches, in numbers of cells.
 _GROUP_NUM_CELLS = (128, 512, 2048)
 # Ratio of the extent of a touch to the square root of its area above which the touch is assumed to consist of
@@ -193,6 +195,10 @@ class PressedSkin(Module):
         self.model, self.material, self.face = model, material, face
         self.conductivity = np.asarray(check_conductivity(model.mesh, conductivity))
         self.gain = draw_gains(key, material.gain_spread, model.protocol.num_measurements)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The skin without its large inverse, which would be sent to each worker of a cluster."""
+        return {name: value for name, value in self.__dict__.items() if name != "_resting_skin"}
 
     def rest(self) -> Float[np.ndarray, " M"]:
         """Return the voltages (M,) of the untouched skin with gains, but without drift and noise."""
@@ -343,7 +349,7 @@ class PressedSkin(Module):
                     as_array(changes[padded_chunk, used_columns]),
                 )
                 rows = TouchedCells(*arrays, num_cells=touched.num_cells)
-                voltages[chunk] += np.asarray(touch_changes(self.model, self.conductivity, rows))[: len(chunk)]
+                voltages[chunk] += self._changes(rows)[: len(chunk)]
                 num_done += len(chunk)
                 if progress is not None:
                     progress(f"voltages: {num_done} of {len(voltages)}")
@@ -374,6 +380,19 @@ class PressedSkin(Module):
             )
         deviation = material.noise * float(np.sqrt(np.mean(self._rest_voltages**2)))
         return self.gain * (exact + white_noise(noise_key, deviation, exact.shape))
+
+    def _changes(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
+        """Exact changes (n, M), volts, of the voltages due to n touches of similar cost."""
+        if self._resting_skin is None:
+            return np.asarray(touch_changes(self.model, self.conductivity, touched))
+        return self._resting_skin.changes_together(touched)
+
+    @cached_property
+    def _resting_skin(self) -> RestingSkin | None:
+        """The skin at rest, which is solved once, and by one program, for all touches; None if its mesh is too large
+        for the inverse between all nodes."""
+        all_nodes = np.ones(self.model.mesh.num_points, bool)
+        return RestingSkin.create(self.model, self.conductivity, all_nodes, max_bytes=_MAX_INVERSE_BYTES)
 
     @property
     def _dimension(self) -> int:

@@ -1,6 +1,7 @@
 """Frames of pressed skins: presses carry their loads, voltages are those of the solved model, and effects in time."""
 
 import dataclasses
+import pickle
 
 import jax
 import numpy as np
@@ -24,6 +25,7 @@ from jeit.touch.simulate.contact import (
     PressedSkin,
     ball_indenter,
     material,
+    pressed_skin,
 )
 from jeit.touch.simulate.contact.cell_pressure import pressed_cells
 from jeit.touch.simulate.contact.samples import Samples
@@ -128,13 +130,21 @@ def test_pressure_on_cells_is_that_under_the_indenter(model):
     assert np.abs(along @ [np.cos(0.5), np.sin(0.5)]).max() == pytest.approx(0.015, rel=0.1)
 
 
-def test_frames_are_those_of_the_model_solved_anew(skin):
+@pytest.mark.parametrize("max_bytes", [0, pressed_skin._MAX_INVERSE_BYTES], ids=["large mesh", "small mesh"])
+def test_frames_are_those_of_the_model_solved_anew(model, max_bytes, monkeypatch):
+    """On meshes with and without an inverse between all nodes."""
+    monkeypatch.setattr(pressed_skin, "_MAX_INVERSE_BYTES", max_bytes)
+    skin = PressedSkin(KEY, model, STILL)
     presses = [*PRESSES, tuple(PRESSES), ()]
     found = skin.frames(KEY, presses)
     exact = anew(skin, skin.touched(presses))
     assert np.abs(found - exact).max() < 1e-8 * np.abs(exact - skin.rest()).max()
     np.testing.assert_array_equal(found[-1], skin.rest())
     assert np.abs(found[0] - skin.rest()).max() > 1e-3 * np.abs(skin.rest()).max()
+    assert (skin._resting_skin is None) == (max_bytes == 0)
+    copy = pickle.loads(pickle.dumps(skin))
+    assert "_resting_skin" not in vars(copy)  # it is large, and made anew
+    np.testing.assert_array_equal(copy.frames(KEY, presses), found)
 
 
 def test_a_layer_is_pressed_too():
