@@ -109,7 +109,9 @@ def test_bodies_are_detected_and_ghosts_rejected(found):
 
 
 class Named:
-    """Bodies that have only a name."""
+    """Bodies of a sheet that have only a name."""
+
+    dimension = 2
 
     def __init__(self, names):
         self.names = self.sign = names

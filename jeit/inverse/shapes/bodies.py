@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import abc
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from jeit.arguments import describe, is_number
 from jeit.arguments.checks import Interval
+from jeit_solvers import results_on_cores
 
 # Step of the finite differences of a centroid, in standard deviations of a coefficient.
 _CENTROID_STEP = 0.1
@@ -128,6 +129,12 @@ def polarisation(contrast, axes: int):
     and n = `axes`, the number of axes along which the body is bounded. Ammari and Kang, Polarization and Moment Tensors
     (2007), chapter 4."""
     return np.expm1(contrast) / (np.exp(contrast) + axes - 1)
+
+
+def results_for(bodies: Bodies, function: Callable[[Any], Any], parts: Sequence[Any]) -> list[Any]:
+    """Results of a `function` that fits `bodies`, for each of its `parts`: on several cores in a solid. The arrays of a
+    sheet are so small that several threads would mostly wait for each other in Python."""
+    return results_on_cores(function, parts) if bodies.dimension == 3 else [function(part) for part in parts]
 
 
 class BodyImage(NamedTuple):

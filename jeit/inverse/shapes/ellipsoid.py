@@ -15,10 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jeit.arguments import check_name
-from jeit.inverse.shapes.bodies import TINY, Bodies, BodyPrior, Covered, Quantities, polarisation
+from jeit.inverse.shapes.bodies import TINY, Bodies, BodyPrior, Covered, Quantities, polarisation, results_for
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit.mesh import Mesh, measures
-from jeit_solvers import results_on_cores
 from jeit_solvers.module import Module
 
 # Difference of log evidence above which only the likelier of two descriptions is reported (ellipsoid or column, one
@@ -80,7 +79,7 @@ def alternatives(problem: ShapeProblem, fitted: Fit) -> list[tuple[Ellipsoid | N
             return None, np.nan
         return other_fit.bodies.body(k, other_fit.coefficients), contrast_deviations(problem, other_fit)[k]
 
-    return results_on_cores(alternative, range(num_bodies))
+    return results_for(bodies, alternative, range(num_bodies))
 
 
 KINDS = ("either", "ellipsoids", "columns")

@@ -22,10 +22,9 @@ from scipy.special import chdtri, ndtri
 
 from jeit.arguments.checks import Interval
 from jeit.inverse.placement import ModelError, Uncertainty
-from jeit.inverse.shapes.bodies import TINY, Bodies, Quantities, polarisation
+from jeit.inverse.shapes.bodies import TINY, Bodies, Quantities, polarisation, results_for
 from jeit.inverse.shapes.ellipsoid import Ellipsoid
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
-from jeit_solvers import results_on_cores
 
 # Prior median of the contrast, and standard deviation and bounds of its logarithm; a contrast of 4.5 is a factor of 90.
 _MEDIAN_LOG_CONTRAST, _LOG_CONTRAST_DEVIATION, _LOG_CONTRAST_BOUNDS = (
@@ -91,7 +90,7 @@ def with_quantities(
     fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
     materials = np.unique(fit.bodies.first).tolist()
     explored = dict(
-        zip(materials, results_on_cores(lambda k: explore_contrast(problem, fit, k), materials), strict=True)
+        zip(materials, results_for(fit.bodies, lambda k: explore_contrast(problem, fit, k), materials), strict=True)
     )
     return [
         replace(
@@ -202,7 +201,7 @@ def explore_contrast(problem: ShapeProblem, fit: Fit, k: int) -> list[ExploredCo
             step *= _STEP_GROWTH
         return explored
 
-    lower, higher = results_on_cores(explore, [-1, 1])
+    lower, higher = results_for(bodies, explore, [-1, 1])
     return [*lower[:0:-1], *higher]
 
 

@@ -17,7 +17,7 @@ from jeit.forward import ForwardModel
 from jeit.inverse.channels import Data
 from jeit.inverse.nonlinear.problem import check_background, check_frame, check_noise, independent_data
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
-from jeit.inverse.shapes.bodies import Bodies, BodyPrior
+from jeit.inverse.shapes.bodies import Bodies, BodyPrior, results_for
 from jeit.inverse.shapes.ellipsoid import (
     EllipsoidPrior,
     Ellipsoids,
@@ -30,7 +30,7 @@ from jeit.inverse.shapes.quantities import Accuracy, include_deviation, with_qua
 from jeit.inverse.shapes.reconstruction import Body, FinerImage, ShapeReconstruction
 from jeit.inverse.shapes.star import StarPrior, Stars
 from jeit.mesh import check_flat
-from jeit_solvers import one_thread_of_blas, results_on_cores
+from jeit_solvers import one_thread_of_blas
 from jeit_solvers.engines import as_array
 
 if TYPE_CHECKING:
@@ -365,7 +365,7 @@ def _remove_unsupported(
         certain_cost = max(_CERTAIN_RISE * cost, problem.surprise(fitted) + _MIN_EVIDENCE_GAIN)
         uncertain = np.flatnonzero(costs <= certain_cost).tolist()
         starts = [bodies.without(k, coefficients) for k in uncertain]
-        fits_without = results_on_cores(partial(_fit_without, problem, certain_cost), starts)
+        fits_without = results_for(bodies, partial(_fit_without, problem, certain_cost), starts)
         fits = dict(zip(uncertain, fits_without, strict=True))
         costs[uncertain] = [fit.cost for fit in fits_without]
         weakest = min(fits, key=lambda k: costs[k], default=None)
@@ -395,7 +395,7 @@ def _split_bodies(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit 
     def trial(index: tuple[int, ...]) -> Fit:
         return _trial_fit(problem, _grow_bodies(problem, *bodies.split(index[0], coefficients, index[1]), _TRIAL_STEPS))
 
-    trials = results_on_cores(trial, list(np.ndindex(len(bodies.sign), bodies.num_splits)))
+    trials = results_for(bodies, trial, list(np.ndindex(len(bodies.sign), bodies.num_splits)))
     split = _best_fit(problem, fitted, trials)
     return split if split and cost >= least_rise * split.cost and _is_supported(problem, fitted, split) else None
 
@@ -411,8 +411,8 @@ def _alternative_fits(problem: ShapeProblem, result: _SearchResult) -> tuple[_Se
     can_change = ~bodies.is_other_kind & ~bodies.is_kind_certain & (not bodies.prior.is_of_one_kind)
     indices = np.flatnonzero(can_change)
     groups = [[k] for k in indices] + [indices] * (len(indices) > 1)
-    trials = results_on_cores(
-        lambda group: _trial_fit(problem, bodies.with_other_kind(group, fitted.coefficients)), groups
+    trials = results_for(
+        bodies, lambda group: _trial_fit(problem, bodies.with_other_kind(group, fitted.coefficients)), groups
     )
     is_kind_certain = bodies.is_kind_certain.copy()
     for k, trial in zip(indices, trials, strict=False):
@@ -439,9 +439,12 @@ def _trial_fit(problem: ShapeProblem, start: tuple[Bodies, Float[np.ndarray, " n
 
 def _best_fit(problem: ShapeProblem, fitted: Fit, trial_fits: Sequence[Fit]) -> Fit | None:
     """Fit to convergence from the best of several trial fits. None if its cost is more than `_CERTAIN_RISE` times that
-    of `fitted`."""
+    of `fitted`, or if the data could not support it even if its cost fell to zero."""
     best_trial = min(trial_fits, key=lambda trial: trial.cost, default=None)
     if best_trial is None or best_trial.cost > _CERTAIN_RISE * fitted.cost:
+        return None
+    least_surprise = problem.surprise(best_trial) - best_trial.cost
+    if least_surprise + _MIN_EVIDENCE_GAIN > problem.surprise(fitted):
         return None
     return problem.fit(best_trial.bodies, best_trial.coefficients, _STEPS)
 
@@ -452,22 +455,18 @@ def _is_supported(problem: ShapeProblem, simple_fit: Fit, other_fit: Fit) -> boo
 
 
 def _improve_fit(problem: ShapeProblem, result: _SearchResult, least_rise: float) -> _SearchResult:
-    """Search for likelier bodies, starting once with a split and once with a change of kind. Returns the likelier
-    result, or `result` if the data support neither change."""
-
-    def after_split() -> _SearchResult | None:
-        split = _split_bodies(problem, result.fit, least_rise)
-        return split and _search_until_stable(problem, result.doubtful, split, least_rise)
-
-    def after_change_of_kind() -> tuple[_SearchResult, _SearchResult | None]:
-        marked_result, other_fit = _alternative_fits(problem, result)
-        return marked_result, other_fit and _search_until_stable(problem, result.doubtful, other_fit, least_rise)
-
-    split_result, (marked_result, other_result) = results_on_cores(
-        lambda search: search(), [after_split, after_change_of_kind]
-    )
-    candidates = [found for found in (split_result, other_result) if found is not None] or [marked_result]
-    return min(candidates, key=lambda candidate: problem.surprise(candidate.fit))
+    """Search for likelier bodies, starting once with a change of kind and once with a split. Returns the likelier
+    result, or `result` if the data support neither change. The second search is left out if even a perfect fit of more
+    bodies of these kinds would be less likely than the result of the first."""
+    base_fit, doubtful = result.fit, result.doubtful
+    result, other_fit = _alternative_fits(problem, result)
+    results = [] if other_fit is None else [_search_until_stable(problem, doubtful, other_fit, least_rise)]
+    least_surprise = problem.surprise(base_fit) - base_fit.cost
+    if all(least_surprise <= problem.surprise(found.fit) for found in results):
+        split = _split_bodies(problem, base_fit, least_rise)
+        if split is not None:
+            results.append(_search_until_stable(problem, doubtful, split, least_rise))
+    return min(results or [result], key=lambda candidate: problem.surprise(candidate.fit))
 
 
 def _search_until_stable(
