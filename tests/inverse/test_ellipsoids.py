@@ -17,7 +17,8 @@ from jeit.inverse.shapes import (
     EllipsoidPrior,
     Quantities,
     StarPrior,
-    ellipsoid,
+    alternatives,
+    number_and_kinds,
     problem,
     quantities,
     reconstruct_shapes,
@@ -136,9 +137,9 @@ def test_the_kind_of_bodies_can_be_given(coarse):
     columns, point = bodies.with_other_kind([0], bodies.of_radii([RADIUS]))
     assert columns.odds == 0
     problem: Any = None
-    result = search._SearchResult(Fit(bodies, point, 1.0, ROWS), [9.0], ())  # pyright: ignore
-    assert search._alternative_fits(problem, result)[1] is None
-    assert ellipsoid.alternatives(problem, Fit(columns, point, 1.0, ROWS)) == [
+    result = number_and_kinds.SearchResult(Fit(bodies, point, 1.0, ROWS), [9.0], ())  # pyright: ignore
+    assert number_and_kinds.alternative_fits(problem, result)[1] is None
+    assert alternatives.alternatives(problem, Fit(columns, point, 1.0, ROWS)) == [
         (None, pytest.approx(np.nan, nan_ok=True))
     ]
 
@@ -161,7 +162,7 @@ def test_the_deviation_of_a_common_contrast_includes_that_of_separate_ones(ellip
     moved = point.copy()
     moved[25] = np.log(2) / spread
     one, each = Fit(same, point, 1.0, ROWS), Fit(ellipsoids, moved, 1.0, ROWS)
-    found = ellipsoid.contrast_deviations(problem, one, each)
+    found = alternatives.contrast_deviations(problem, one, each)
     slope = spread * contrast
     wide = [0.3 * slope, 0.3 * slope, contrast + 0.3 * 2 * slope]
     np.testing.assert_allclose(found, np.hypot([0.1 * slope] * 3 if decided else wide, 0.1))
@@ -272,91 +273,6 @@ def test_displayed_values_on_the_surface_are_half_of_the_contrast(coarse):
     assert shown.max() <= contrast * (1 + 1e-9)
     drifted = balls.display_image(coefficients + np.eye(len(coefficients))[0])
     np.testing.assert_allclose(drifted - shown, EllipsoidPrior().drift)
-
-
-@pytest.mark.parametrize("column", [True, False])
-@pytest.mark.parametrize(("worse", "decided"), [(3.0, False), (5.0, True)])
-def test_an_alternative_kind_depends_on_the_data_alone_and_has_its_own_deviation(coarse, worse, decided, column):
-    bodies = Ellipsoids.create(coarse.mesh, EllipsoidPrior(odds_for_columns=1e6), [[0.0, 0.0, 0.05]], [1])
-    bodies, coefficients = bodies.with_other_kind([0] if column else [], bodies.of_radii([RADIUS]))
-
-    class Evidence:
-        """The other kind is `worse` and has twice the deviation."""
-
-        def fit(self, bodies, coefficients, *steps):
-            return Fit(bodies, coefficients, 1.0, ROWS)
-
-        def surprise(self, fit):
-            return fit.bodies.odds + (0.0 if fit.bodies.is_other_kind[0] == column else worse)
-
-        def deviations(self, fit):
-            return np.full(len(fit.coefficients), 0.1 if fit.bodies.is_other_kind[0] == column else 0.2)
-
-    problem: Any = Evidence()
-    fitted = Fit(bodies, coefficients, 1.0, ROWS)
-    ((other, deviation),) = ellipsoid.alternatives(problem, fitted)  # pyright: ignore
-    assert (other is None) == decided
-    if other is not None:
-        (own,) = ellipsoid.contrast_deviations(problem, fitted)  # pyright: ignore
-        assert other.column != column
-        assert deviation**2 - 0.01 == pytest.approx(4 * (own**2 - 0.01))
-
-
-def test_a_kind_that_the_data_exclude_by_far_is_not_tried_again(coarse):
-    bodies = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [[0.0, 0.0, 0.05], [0.03, 0.0, 0.04]], [1, 1])
-    tried = []
-
-    class Evidence:
-        """The first body as a column costs 200 times as much; the second one costs 20 times as much."""
-
-        def fit(self, bodies, coefficients, *steps):
-            tried.append(bodies.is_other_kind.tolist())
-            return Fit(bodies, coefficients, 200.0 if bodies.is_other_kind[0] else 20.0, ROWS)
-
-        def surprise(self, fit):
-            return fit.bodies.odds + fit.cost
-
-    problem: Any = Evidence()
-    found = search._SearchResult(Fit(bodies, bodies.of_radii([0.02, 0.02]), 1.0, ROWS), [9.0, 9.0], ())  # pyright: ignore
-    found, change = search._alternative_fits(problem, found)
-    assert change is None
-    assert sorted(tried) == [[False, True], [True, False], [True, True]]  # in any order, on several cores
-    assert found.fit.bodies.is_kind_certain.tolist() == [True, False]
-    tried.clear()
-    assert search._alternative_fits(problem, found)[1] is None
-    ellipsoid.alternatives(problem, found.fit)
-    assert tried == [[False, True], [False, True]]
-    on_another_mesh = found.fit.bodies.on(coarse.mesh)  # type: ignore[attr-defined]
-    assert on_another_mesh.subset([1, 0]).is_kind_certain.tolist() == [False, True]
-    assert found.fit.bodies.split(0, found.fit.coefficients, 0)[0].is_kind_certain.tolist() == [False] * 3
-
-
-class Costs:
-    """Problem whose fits cost what is given, one after the other."""
-
-    def __init__(self, *costs):
-        self.costs, self.steps = list(costs), []
-
-    def fit(self, bodies, coefficients, steps, *_):
-        self.steps.append(steps)
-        return Fit(bodies, coefficients, self.costs.pop(0), ROWS)
-
-    def surprise(self, fit):
-        return fit.cost
-
-
-def test_fits_that_cannot_be_supported_are_not_made(coarse):
-    """A split when no gain of evidence is left; more steps without a body that is beyond doubt."""
-    bodies = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [[0.0, 0.0, 0.05], [0.03, 0.0, 0.04]], [1, 1])
-    coefficients = bodies.of_radii([0.02, 0.02])
-    nothing_left: Any = Costs()
-    assert search._split_bodies(nothing_left, Fit(bodies, coefficients, 1.9, ROWS), 1.0) is None
-    without = bodies.without(0, coefficients)
-    hopeless: Any = Costs(1000.0)
-    assert search._fit_without(hopeless, 30.0, without).cost == 1000.0
-    doubtful: Any = Costs(800.0, 20.0)
-    assert search._fit_without(doubtful, 30.0, without).cost == 20.0
-    assert doubtful.steps == [3, 6]
 
 
 def test_a_fit_begins_with_the_fields_at_which_another_has_ended(coarse, monkeypatch):
@@ -485,23 +401,3 @@ def test_only_starts_required_by_the_data_are_used(coarse, fine):
     _, fit, chosen = search._add_bodies(setting, balls, balls.of_radii([0.025, 0.02]))
     assert chosen == [0]
     assert len(fit.bodies.sign) == 1
-
-
-def test_certain_bodies_are_fitted_together_before_others_are_tried(coarse):
-    """Alone, the first of the two would move between them. Fits are replaced by a record of their starts."""
-    fitted = []
-
-    class Recorded:
-        def fit_level(self, bodies, coefficients, level, steps):
-            fitted.append((list(bodies.sign), coefficients))
-            return level, Fit(bodies, coefficients, 1.0, ROWS), 0.0  # no other is more probable
-
-    places = [BALL, [-0.03, 0.04, 0.03], [0.0, 0.0, 0.05]]
-    balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(modes=1), places, [1, 1, -1])
-    start: Any = balls.of_radii([0.02, 0.02, 0.02])
-    recorded: Any = Recorded()
-    _, _, chosen = search._add_bodies(recorded, balls, start, 2)
-    assert chosen == [0, 1]
-    assert [signs for signs, _ in fitted] == [[1, 1], [1, 1, -1]]
-    np.testing.assert_array_equal(fitted[0][1], balls.without(2, start)[1])
-    np.testing.assert_array_equal(fitted[1][1], start)

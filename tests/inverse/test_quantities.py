@@ -15,7 +15,7 @@ from jeit.electrodes.face_patches import body_mesh
 from jeit.image import Inclusion
 from jeit.inverse.channels import Data
 from jeit.inverse.placement import ModelError
-from jeit.inverse.shapes import Accuracy, StarPrior, ellipsoid, reconstruct_shapes
+from jeit.inverse.shapes import Accuracy, StarPrior, alternatives, reconstruct_shapes
 from jeit.inverse.shapes.bodies import Bodies
 from jeit.inverse.shapes.problem import ShapeProblem, SmoothField
 from jeit.inverse.shapes.quantities import _FixedContrastFit, _summary, centroid_radius
@@ -52,7 +52,7 @@ def test_quantities_of_a_fitted_body_and_wider_intervals_by_model_errors(monkeyp
 
     The data are of the same mesh, so that the error of the mesh is set to zero.
     """
-    monkeypatch.setitem(ellipsoid._MESH_DEVIATION, 2, 1e-9)
+    monkeypatch.setitem(alternatives._MESH_DEVIATION, 2, 1e-9)
     model = ForwardModel(DISK.mesh(num_points=500), DESCRIBED, PROTOCOL)
     middle, radius = np.asarray(centroids(model.mesh)), 0.025
     inside = np.linalg.norm(middle - [0.02, 0.035], axis=1) < radius
@@ -136,7 +136,7 @@ def test_errors_of_the_mesh_and_of_the_size_widen_intervals(monkeypatch):
     options = {"start": [(1, (0.02, 0.03), 0.02)], "noise": noise, "prior": StarPrior(modes=1)}
     found = {}
     for mesh, size, strength in ((1e-9, 1e-9, 0.0), (0.3, 1e-9, 0.0), (1e-9, 0.05, 0.0), (1e-9, 1e-9, 0.1)):
-        monkeypatch.setitem(ellipsoid._MESH_DEVIATION, 2, mesh)
+        monkeypatch.setitem(alternatives._MESH_DEVIATION, 2, mesh)
         accuracy = Accuracy(noise, None, size, strength)
         (one,) = reconstruct_shapes(model, voltages, SIGMA, accuracy=accuracy, **options).bodies
         low, high = one.quantities.change_interval

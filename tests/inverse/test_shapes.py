@@ -8,8 +8,8 @@ import pytest
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse.shapes import Star, StarPrior, reconstruct_shapes
+from jeit.inverse.shapes.number_and_kinds import remove_unsupported
 from jeit.inverse.shapes.problem import Fit
-from jeit.inverse.shapes.search import _remove_unsupported
 from jeit.inverse.shapes.star import Stars
 from jeit.layout import ring
 from jeit.mesh import Disk, centroids
@@ -149,7 +149,7 @@ def test_ghosts_are_removed_weakest_first(least_rise, weight, left, ghosts):
     """By the factor by which the cost rises without a body, and by the evidence for the body."""
     costs = {"abc": 40.0, "ab": 44.0, "ac": 60.0, "bc": 900.0, "a": 55.0, "b": 950.0, "": 2000.0}
     problem = Listed(costs, weight)
-    result = _remove_unsupported(problem, problem.fit(Named("abc"), np.zeros(3)), (), least_rise)
+    result = remove_unsupported(problem, problem.fit(Named("abc"), np.zeros(3)), (), least_rise)
     assert result.fit.bodies.names == left
     assert [name for name, _ in result.doubtful] == [name for name, _ in ghosts]
     np.testing.assert_allclose([rise for _, rise in result.doubtful], [rise for _, rise in ghosts])

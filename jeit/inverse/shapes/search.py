@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
@@ -17,17 +16,23 @@ from jeit.forward import ForwardModel
 from jeit.inverse.channels import Data
 from jeit.inverse.nonlinear.problem import check_background, check_frame, check_noise, independent_data
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
-from jeit.inverse.shapes.bodies import Bodies, BodyPrior, results_for
-from jeit.inverse.shapes.ellipsoid import (
-    EllipsoidPrior,
-    Ellipsoids,
-    alternatives,
-    contrast_deviations,
-    unmodelled_deviations,
+from jeit.inverse.shapes.alternatives import alternatives, contrast_deviations, unmodelled_deviations
+from jeit.inverse.shapes.bodies import Bodies, BodyPrior
+from jeit.inverse.shapes.ellipsoid import EllipsoidPrior, Ellipsoids
+from jeit.inverse.shapes.number_and_kinds import (
+    CERTAIN_RISE,
+    COARSE_TOLERANCE,
+    MIN_EVIDENCE_GAIN,
+    STEPS,
+    SearchResult,
+    alternative_fits,
+    grow_bodies,
+    improve_fit,
+    remove_unsupported,
 )
 from jeit.inverse.shapes.problem import Fit, ShapeProblem, SmoothField
 from jeit.inverse.shapes.quantities import Accuracy, include_deviation, with_quantities
-from jeit.inverse.shapes.reconstruction import Body, FinerImage, ShapeReconstruction
+from jeit.inverse.shapes.reconstruction import FinerImage, ShapeReconstruction
 from jeit.inverse.shapes.star import StarPrior, Stars
 from jeit.mesh import check_flat
 from jeit_solvers import one_thread_of_blas
@@ -39,26 +44,13 @@ if TYPE_CHECKING:
 # A body is a ghost if the objective rises by less than this factor when the body is left out and all other bodies are
 # fitted again.
 LEAST_RISE = 1.4
-_FIRST_STEPS, _STEPS, _TRIAL_STEPS = 15, 40, 6
-# Steps of the fit without a body: in all, and those after which the fit ends if the cost exceeds the cost at which the
-# body is beyond doubt by more than this factor.
-_REMOVAL_STEPS, _FIRST_REMOVAL_STEPS, _HOPELESS_RISE = 6, 3, 30.0
-_COARSE_TOLERANCE = 1e-2
+_FIRST_STEPS = 15
 # Number of successive starts that the data do not support, after which the remaining, weaker starts are not tried.
 _MAX_UNSUPPORTED = 2
-# A body is beyond doubt if the objective without it is larger by more than this factor.
-_CERTAIN_RISE = 10.0
-# The data exclude a change of a body's kind if it raises the objective, after a few steps of the fit, by more than this
-# factor: on finer meshes the factor increases, because the objective of the right kind decreases.
-_EXCLUDED_RISE = 100.0
-# Maximum number of changes of the number or kind of bodies in a search.
-_MAX_CHANGES = 10
 # Maximum number of times that the mesh is refined at the bodies, which move as a result. Edge lengths on the bodies'
 # surfaces, in units of the shortest half axis, that are tried in turn: in the first refinement, when some bodies may
 # still be ghosts (false bodies), and in later refinements.
 _MAX_REFINEMENTS, _EDGE_LENGTHS = 3, ((0.7,), (0.7, 0.5, 0.35, 0.25))
-# Minimum gain of log evidence with which a description of the bodies with more parameters is accepted.
-_MIN_EVIDENCE_GAIN = 2.0
 
 
 @one_thread_of_blas()  # several threads would only wait for each other in its small products
@@ -130,7 +122,7 @@ def reconstruct_shapes(
     sign, centre, radius = _check_start(start, model.mesh.dimension)
     independent_model, data = independent_data(model, measured, used, deviation, at_once=True)
     is_solid = model.mesh.dimension == 3
-    problem = ShapeProblem(independent_model, data, background, _COARSE_TOLERANCE if is_solid else ShapeProblem.rtol)
+    problem = ShapeProblem(independent_model, data, background, COARSE_TOLERANCE if is_solid else ShapeProblem.rtol)
     bodies = form.create(model.mesh, prior, centre, sign)
     coefficients = bodies.of_radii(radius)
     if isinstance(prior, EllipsoidPrior) and prior.kinds == "columns":
@@ -142,15 +134,15 @@ def reconstruct_shapes(
         level, ball_fit, _ = _add_bodies(setting, *bodies.with_modes(1, coefficients))
         bodies, coefficients = ball_fit.bodies.with_modes(prior.modes, ball_fit.coefficients)
         problem = setting.problem(level)
-    fitted = problem.fit(*_grow_bodies(problem, bodies, coefficients, _FIRST_STEPS), _STEPS)
-    result = _remove_unsupported(problem, fitted, (), least_rise)
+    fitted = problem.fit(*grow_bodies(problem, bodies, coefficients, _FIRST_STEPS), STEPS)
+    result = remove_unsupported(problem, fitted, (), least_rise)
     state, finer_model = _SearchState(setting, level, result), None
     if is_solid:
         state, finer_model = _refine_meshes(state, least_rise, report)
         report("bodies, of which kind")
     else:
         report("bodies, how many")
-        state = state._replace(found=_improve_fit(problem, result, least_rise))
+        state = state._replace(found=improve_fit(problem, result, least_rise))
     (setting, level, (free_fit, rises, doubtful)), smooth_field = state, state.setting.smooth_field
     problem = setting.problem(level)
     fitted = _with_common_contrast(problem, free_fit)
@@ -208,12 +200,6 @@ def _check_start(start, dimension: int):
     return sign, centre, radius
 
 
-def _grow_bodies(problem: ShapeProblem, bodies: Bodies, coefficients, steps: int):
-    """Fit the bodies as disks or balls, and return the bodies with all modes of their form, and their coefficients."""
-    ball_fit = problem.fit(*bodies.with_modes(1, coefficients), steps, _COARSE_TOLERANCE)
-    return ball_fit.bodies.with_modes(bodies.prior.modes, ball_fit.coefficients)
-
-
 class _FitSetting(NamedTuple):
     """Setting in which bodies are fitted: the problem of bodies without a smooth field, and the smooth field, or None
     if there is none."""
@@ -249,7 +235,7 @@ class _FitSetting(NamedTuple):
         """
         while True:
             problem = self.problem(level)
-            fitted = problem.fit(bodies, coefficients, steps, _COARSE_TOLERANCE)
+            fitted = problem.fit(bodies, coefficients, steps, COARSE_TOLERANCE)
             best_level = level if self.smooth_field is None else self.smooth_field.likeliest_level(fitted)
             if best_level >= level:
                 return level, fitted, problem.surprise(fitted) + problem.half_log_determinant
@@ -270,19 +256,11 @@ def _add_bodies(setting: _FitSetting, bodies: Bodies, coefficients, num_sure: in
     for k in range(num_sure, len(rows)):
         start = np.append(fit.coefficients, rows[k])
         new_level, new_fit, surprise = setting.fit_level(bodies.subset([*supported, k]), start, level, _FIRST_STEPS)
-        if surprise + _MIN_EVIDENCE_GAIN <= min_surprise:
+        if surprise + MIN_EVIDENCE_GAIN <= min_surprise:
             level, fit, min_surprise, supported, num_refused = new_level, new_fit, surprise, [*supported, k], 0
         elif (num_refused := num_refused + 1) == _MAX_UNSUPPORTED:
             break
     return level, fit, supported
-
-
-class _SearchResult(NamedTuple):
-    """Result of removing ghosts: `fit` of the remaining bodies, their `rises`, and the removed bodies, `doubtful`."""
-
-    fit: Fit
-    rises: list[float]
-    doubtful: tuple[Body, ...]
 
 
 class _SearchState(NamedTuple):
@@ -291,7 +269,7 @@ class _SearchState(NamedTuple):
 
     setting: _FitSetting
     level: float
-    found: _SearchResult
+    found: SearchResult
 
 
 def _refine_meshes(
@@ -319,107 +297,30 @@ def _refine_meshes(
         )
         costs = np.array(rises) * last_fit.cost
         if refinement:
-            level, fit, _ = setting.fit_level(bodies, coefficients, level, _STEPS)
+            level, fit, _ = setting.fit_level(bodies, coefficients, level, STEPS)
         else:
             order = np.argsort(-costs)
             start = np.append(coefficients[0], bodies.rows(coefficients)[order])
-            num_sure = int((costs > _CERTAIN_RISE * last_fit.cost).sum())
+            num_sure = int((costs > CERTAIN_RISE * last_fit.cost).sum())
             level, fit, supported = _add_bodies(setting, bodies.subset(order), start, num_sure)
             unsupported = np.setdiff1d(np.arange(len(order)), supported)
             doubtful = (*doubtful, *(bodies.body(k, coefficients, rises[k]) for k in order[unsupported]))
             costs = costs[order[supported]]
             coefficients = np.append(coefficients[0], bodies.rows(coefficients)[order[supported]])
         problem = setting.problem(level)
-        fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
-        result = _remove_unsupported(problem, fit, doubtful, least_rise, costs)
+        fit = problem.fit(fit.bodies, fit.coefficients, STEPS)
+        result = remove_unsupported(problem, fit, doubtful, least_rise, costs)
         if refinement == 0:
             report("bodies, how many")
-            result = _improve_fit(problem, result, least_rise)
+            result = improve_fit(problem, result, least_rise)
         elif refinement < _MAX_REFINEMENTS - 1:
-            result, other_fit = _alternative_fits(problem, result)
+            result, other_fit = alternative_fits(problem, result)
             if other_fit is not None:
-                result = _remove_unsupported(problem, other_fit, result.doubtful, least_rise)
+                result = remove_unsupported(problem, other_fit, result.doubtful, least_rise)
         state, new_fit = _SearchState(setting, level, result), result.fit
         if refinement and not bodies.left_refined_cells(coefficients, new_fit.bodies, new_fit.coefficients):
             break
     return state, finer_model
-
-
-def _remove_unsupported(
-    problem: ShapeProblem,
-    fitted: Fit,
-    doubtful: Sequence[Body],
-    least_rise: float,
-    min_costs: Float[np.ndarray, " k"] | None = None,
-) -> _SearchResult:
-    """Remove, one at a time, bodies without which the other bodies, fitted again, explain the data about as well. The
-    body whose absence raises the cost least is removed first.
-
-    `min_costs`: lower limit of the cost without each body, if known.
-    """
-    doubtful, costs = list(doubtful), np.zeros(len(fitted.bodies.sign)) if min_costs is None else min_costs.copy()
-    while True:
-        bodies, coefficients, cost, _ = fitted
-        # After a ghost is removed, leaving out a further body raises the cost at least as much as before, so costs
-        # computed earlier are lower limits.
-        certain_cost = max(_CERTAIN_RISE * cost, problem.surprise(fitted) + _MIN_EVIDENCE_GAIN)
-        uncertain = np.flatnonzero(costs <= certain_cost).tolist()
-        starts = [bodies.without(k, coefficients) for k in uncertain]
-        fits_without = results_for(bodies, partial(_fit_without, problem, certain_cost), starts)
-        fits = dict(zip(uncertain, fits_without, strict=True))
-        costs[uncertain] = [fit.cost for fit in fits_without]
-        weakest = min(fits, key=lambda k: costs[k], default=None)
-        if weakest is None or (costs[weakest] >= least_rise * cost and _is_supported(problem, fits[weakest], fitted)):
-            return _SearchResult(fitted, list(costs / cost), tuple(doubtful))
-        doubtful.append(bodies.body(weakest, coefficients, float(costs[weakest]) / cost))
-        costs = np.delete(costs, weakest)
-        fitted = problem.fit(fits[weakest].bodies, fits[weakest].coefficients, _STEPS)
-
-
-def _fit_without(problem: ShapeProblem, certain_cost: float, start: tuple[Bodies, Float[np.ndarray, " n"]]) -> Fit:
-    """Fit the remaining bodies from their coefficients `start`. The fit ends early if its cost remains far above
-    `certain_cost`, at which the absent body is beyond doubt."""
-    first_fit = problem.fit(*start, _FIRST_REMOVAL_STEPS, 2 * _COARSE_TOLERANCE)
-    if first_fit.cost > _HOPELESS_RISE * certain_cost:
-        return first_fit
-    return problem.fit(first_fit.bodies, first_fit.coefficients, _REMOVAL_STEPS, 2 * _COARSE_TOLERANCE)
-
-
-def _split_bodies(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None:
-    """Fit the bodies with one body split in two; None if the data support no split. Each body adds parameters, so no
-    split is tried if the whole cost is less than the gain of evidence that it needs."""
-    bodies, coefficients, cost, _ = fitted
-    if cost < _MIN_EVIDENCE_GAIN:
-        return None
-
-    def trial(index: tuple[int, ...]) -> Fit:
-        return _trial_fit(problem, _grow_bodies(problem, *bodies.split(index[0], coefficients, index[1]), _TRIAL_STEPS))
-
-    trials = results_for(bodies, trial, list(np.ndindex(len(bodies.sign), bodies.num_splits)))
-    split = _best_fit(problem, fitted, trials)
-    return split if split and cost >= least_rise * split.cost and _is_supported(problem, fitted, split) else None
-
-
-def _alternative_fits(problem: ShapeProblem, result: _SearchResult) -> tuple[_SearchResult, Fit | None]:
-    """Fit the bodies with one or all of them changed to the other kind (weak star or column).
-
-    Returns the `result`, with those bodies marked whose kind is certain, and the fit; None if the data support no
-    change.
-    """
-    fitted = result.fit
-    bodies = fitted.bodies
-    can_change = ~bodies.is_other_kind & ~bodies.is_kind_certain & (not bodies.prior.is_of_one_kind)
-    indices = np.flatnonzero(can_change)
-    groups = [[k] for k in indices] + [indices] * (len(indices) > 1)
-    trials = results_for(
-        bodies, lambda group: _trial_fit(problem, bodies.with_other_kind(group, fitted.coefficients)), groups
-    )
-    is_kind_certain = bodies.is_kind_certain.copy()
-    for k, trial in zip(indices, trials, strict=False):
-        is_kind_certain[k] = trial.cost > _EXCLUDED_RISE * fitted.cost
-    result = result._replace(fit=fitted._replace(bodies=replace(bodies, is_kind_certain=is_kind_certain)))
-    change = _best_fit(problem, fitted, trials)
-    return result, change if change and _is_supported(problem, fitted, change) else None
 
 
 def _with_common_contrast(problem: ShapeProblem, fitted: Fit) -> Fit:
@@ -427,59 +328,6 @@ def _with_common_contrast(problem: ShapeProblem, fitted: Fit) -> Fit:
     for sign in (1, -1):
         bodies = fitted.bodies
         if isinstance(bodies, Ellipsoids) and ((bodies.sign == sign) & ~bodies.same_material).sum() > 1:
-            common_fit = problem.fit(*bodies.of_one_material(sign, fitted.coefficients), _STEPS)
+            common_fit = problem.fit(*bodies.of_one_material(sign, fitted.coefficients), STEPS)
             fitted = min(fitted, common_fit, key=problem.surprise)
     return fitted
-
-
-def _trial_fit(problem: ShapeProblem, start: tuple[Bodies, Float[np.ndarray, " n"]]) -> Fit:
-    """Make a few steps of the fit of bodies from their coefficients `start`."""
-    return problem.fit(*start, _TRIAL_STEPS, _COARSE_TOLERANCE)
-
-
-def _best_fit(problem: ShapeProblem, fitted: Fit, trial_fits: Sequence[Fit]) -> Fit | None:
-    """Fit to convergence from the best of several trial fits. None if its cost is more than `_CERTAIN_RISE` times that
-    of `fitted`, or if the data could not support it even if its cost fell to zero."""
-    best_trial = min(trial_fits, key=lambda trial: trial.cost, default=None)
-    if best_trial is None or best_trial.cost > _CERTAIN_RISE * fitted.cost:
-        return None
-    least_surprise = problem.surprise(best_trial) - best_trial.cost
-    if least_surprise + _MIN_EVIDENCE_GAIN > problem.surprise(fitted):
-        return None
-    return problem.fit(best_trial.bodies, best_trial.coefficients, _STEPS)
-
-
-def _is_supported(problem: ShapeProblem, simple_fit: Fit, other_fit: Fit) -> bool:
-    """Whether the log evidence of `other_fit` exceeds that of `simple_fit` by `_MIN_EVIDENCE_GAIN`."""
-    return problem.surprise(other_fit) + _MIN_EVIDENCE_GAIN <= problem.surprise(simple_fit)
-
-
-def _improve_fit(problem: ShapeProblem, result: _SearchResult, least_rise: float) -> _SearchResult:
-    """Search for likelier bodies, starting once with a change of kind and once with a split. Returns the likelier
-    result, or `result` if the data support neither change. The second search is left out if even a perfect fit of more
-    bodies of these kinds would be less likely than the result of the first."""
-    base_fit, doubtful = result.fit, result.doubtful
-    result, other_fit = _alternative_fits(problem, result)
-    results = [] if other_fit is None else [_search_until_stable(problem, doubtful, other_fit, least_rise)]
-    least_surprise = problem.surprise(base_fit) - base_fit.cost
-    if all(least_surprise <= problem.surprise(found.fit) for found in results):
-        split = _split_bodies(problem, base_fit, least_rise)
-        if split is not None:
-            results.append(_search_until_stable(problem, doubtful, split, least_rise))
-    return min(results or [result], key=lambda candidate: problem.surprise(candidate.fit))
-
-
-def _search_until_stable(
-    problem: ShapeProblem, doubtful: Sequence[Body], start: Fit, least_rise: float
-) -> _SearchResult:
-    """Continue the search from the bodies `start`: remove ghosts, then split a body or, if no split is supported,
-    change the kind of a body, until the data support no change. `doubtful`: bodies that were removed before."""
-    result = _remove_unsupported(problem, start, doubtful, least_rise)
-    for _ in range(_MAX_CHANGES):
-        next_fit = _split_bodies(problem, result.fit, least_rise)
-        if next_fit is None:
-            result, next_fit = _alternative_fits(problem, result)
-        if next_fit is None:
-            break
-        result = _remove_unsupported(problem, next_fit, result.doubtful, least_rise)
-    return result

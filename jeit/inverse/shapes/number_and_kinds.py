@@ -1,0 +1,178 @@
+"""Number and kinds of bodies: removal of ghosts (false bodies), splits in two, and changes to the other kind (a weak
+star, or a column), as the evidence (`ShapeProblem.surprise`) supports them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jeit.inverse.shapes.bodies import Bodies, results_for
+from jeit.inverse.shapes.problem import Fit, ShapeProblem
+from jeit.inverse.shapes.reconstruction import Body
+
+STEPS = 40
+"""Maximum number of steps of a fit."""
+COARSE_TOLERANCE = 1e-2
+"""Relative change of the cost that ends a fit whose result is only compared."""
+CERTAIN_RISE = 10.0
+"""A body is beyond doubt if the objective without it is larger by more than this factor."""
+MIN_EVIDENCE_GAIN = 2.0
+"""Minimum gain of log evidence with which a description of the bodies with more parameters is accepted."""
+_TRIAL_STEPS = 6
+# Steps of the fit without a body: in all, and those after which the fit ends if the cost exceeds the cost at which the
+# body is beyond doubt by more than this factor.
+_REMOVAL_STEPS, _FIRST_REMOVAL_STEPS, _HOPELESS_RISE = 6, 3, 30.0
+# The data exclude a change of a body's kind if it raises the objective, after a few steps of the fit, by more than this
+# factor: on finer meshes the factor increases, because the objective of the right kind decreases.
+_EXCLUDED_RISE = 100.0
+# Maximum number of changes of the number or kind of bodies in a search.
+_MAX_CHANGES = 10
+
+
+class SearchResult(NamedTuple):
+    """Result of removing ghosts: `fit` of the remaining bodies, their `rises`, and the removed bodies, `doubtful`."""
+
+    fit: Fit
+    rises: list[float]
+    doubtful: tuple[Body, ...]
+
+
+def grow_bodies(problem: ShapeProblem, bodies: Bodies, coefficients, steps: int):
+    """Fit the bodies as disks or balls, and return the bodies with all modes of their form, and their coefficients."""
+    ball_fit = problem.fit(*bodies.with_modes(1, coefficients), steps, COARSE_TOLERANCE)
+    return ball_fit.bodies.with_modes(bodies.prior.modes, ball_fit.coefficients)
+
+
+def remove_unsupported(
+    problem: ShapeProblem,
+    fitted: Fit,
+    doubtful: Sequence[Body],
+    least_rise: float,
+    min_costs: Float[np.ndarray, " k"] | None = None,
+) -> SearchResult:
+    """Remove, one at a time, bodies without which the other bodies, fitted again, explain the data about as well. The
+    body whose absence raises the cost least is removed first.
+
+    `min_costs`: lower limit of the cost without each body, if known.
+    """
+    doubtful, costs = list(doubtful), np.zeros(len(fitted.bodies.sign)) if min_costs is None else min_costs.copy()
+    while True:
+        bodies, coefficients, cost, _ = fitted
+        # After a ghost is removed, leaving out a further body raises the cost at least as much as before, so costs
+        # computed earlier are lower limits.
+        certain_cost = max(CERTAIN_RISE * cost, problem.surprise(fitted) + MIN_EVIDENCE_GAIN)
+        uncertain = np.flatnonzero(costs <= certain_cost).tolist()
+        starts = [bodies.without(k, coefficients) for k in uncertain]
+        fits_without = results_for(bodies, partial(_fit_without, problem, certain_cost), starts)
+        fits = dict(zip(uncertain, fits_without, strict=True))
+        costs[uncertain] = [fit.cost for fit in fits_without]
+        weakest = min(fits, key=lambda k: costs[k], default=None)
+        if weakest is None or (costs[weakest] >= least_rise * cost and _is_supported(problem, fits[weakest], fitted)):
+            return SearchResult(fitted, list(costs / cost), tuple(doubtful))
+        doubtful.append(bodies.body(weakest, coefficients, float(costs[weakest]) / cost))
+        costs = np.delete(costs, weakest)
+        fitted = problem.fit(fits[weakest].bodies, fits[weakest].coefficients, STEPS)
+
+
+def _fit_without(problem: ShapeProblem, certain_cost: float, start: tuple[Bodies, Float[np.ndarray, " n"]]) -> Fit:
+    """Fit the remaining bodies from their coefficients `start`. The fit ends early if its cost remains far above
+    `certain_cost`, at which the absent body is beyond doubt."""
+    first_fit = problem.fit(*start, _FIRST_REMOVAL_STEPS, 2 * COARSE_TOLERANCE)
+    if first_fit.cost > _HOPELESS_RISE * certain_cost:
+        return first_fit
+    return problem.fit(first_fit.bodies, first_fit.coefficients, _REMOVAL_STEPS, 2 * COARSE_TOLERANCE)
+
+
+def _split_bodies(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None:
+    """Fit the bodies with one body split in two; None if the data support no split. Each body adds parameters, so no
+    split is tried if the whole cost is less than the gain of evidence that it needs."""
+    bodies, coefficients, cost, _ = fitted
+    if cost < MIN_EVIDENCE_GAIN:
+        return None
+
+    def trial(index: tuple[int, ...]) -> Fit:
+        return _trial_fit(problem, grow_bodies(problem, *bodies.split(index[0], coefficients, index[1]), _TRIAL_STEPS))
+
+    trials = results_for(bodies, trial, list(np.ndindex(len(bodies.sign), bodies.num_splits)))
+    split = _best_fit(problem, fitted, trials)
+    return split if split and cost >= least_rise * split.cost and _is_supported(problem, fitted, split) else None
+
+
+def alternative_fits(problem: ShapeProblem, result: SearchResult) -> tuple[SearchResult, Fit | None]:
+    """Fit the bodies with one or all of them changed to the other kind (weak star or column).
+
+    Returns the `result`, with those bodies marked whose kind is certain, and the fit; None if the data support no
+    change.
+    """
+    fitted = result.fit
+    bodies = fitted.bodies
+    can_change = ~bodies.is_other_kind & ~bodies.is_kind_certain & (not bodies.prior.is_of_one_kind)
+    indices = np.flatnonzero(can_change)
+    groups = [[k] for k in indices] + [indices] * (len(indices) > 1)
+    trials = results_for(
+        bodies, lambda group: _trial_fit(problem, bodies.with_other_kind(group, fitted.coefficients)), groups
+    )
+    is_kind_certain = bodies.is_kind_certain.copy()
+    for k, trial in zip(indices, trials, strict=False):
+        is_kind_certain[k] = trial.cost > _EXCLUDED_RISE * fitted.cost
+    result = result._replace(fit=fitted._replace(bodies=replace(bodies, is_kind_certain=is_kind_certain)))
+    change = _best_fit(problem, fitted, trials)
+    return result, change if change and _is_supported(problem, fitted, change) else None
+
+
+def _trial_fit(problem: ShapeProblem, start: tuple[Bodies, Float[np.ndarray, " n"]]) -> Fit:
+    """Make a few steps of the fit of bodies from their coefficients `start`."""
+    return problem.fit(*start, _TRIAL_STEPS, COARSE_TOLERANCE)
+
+
+def _best_fit(problem: ShapeProblem, fitted: Fit, trial_fits: Sequence[Fit]) -> Fit | None:
+    """Fit to convergence from the best of several trial fits. None if its cost is more than `CERTAIN_RISE` times that
+    of `fitted`, or if the data could not support it even if its cost fell to zero."""
+    best_trial = min(trial_fits, key=lambda trial: trial.cost, default=None)
+    if best_trial is None or best_trial.cost > CERTAIN_RISE * fitted.cost:
+        return None
+    least_surprise = problem.surprise(best_trial) - best_trial.cost
+    if least_surprise + MIN_EVIDENCE_GAIN > problem.surprise(fitted):
+        return None
+    return problem.fit(best_trial.bodies, best_trial.coefficients, STEPS)
+
+
+def _is_supported(problem: ShapeProblem, simple_fit: Fit, other_fit: Fit) -> bool:
+    """Whether the log evidence of `other_fit` exceeds that of `simple_fit` by `MIN_EVIDENCE_GAIN`."""
+    return problem.surprise(other_fit) + MIN_EVIDENCE_GAIN <= problem.surprise(simple_fit)
+
+
+def improve_fit(problem: ShapeProblem, result: SearchResult, least_rise: float) -> SearchResult:
+    """Search for likelier bodies, starting once with a change of kind and once with a split. Returns the likelier
+    result, or `result` if the data support neither change. The second search is left out if even a perfect fit of more
+    bodies of these kinds would be less likely than the result of the first."""
+    base_fit, doubtful = result.fit, result.doubtful
+    result, other_fit = alternative_fits(problem, result)
+    results = [] if other_fit is None else [_search_until_stable(problem, doubtful, other_fit, least_rise)]
+    least_surprise = problem.surprise(base_fit) - base_fit.cost
+    if all(least_surprise <= problem.surprise(found.fit) for found in results):
+        split = _split_bodies(problem, base_fit, least_rise)
+        if split is not None:
+            results.append(_search_until_stable(problem, doubtful, split, least_rise))
+    return min(results or [result], key=lambda candidate: problem.surprise(candidate.fit))
+
+
+def _search_until_stable(
+    problem: ShapeProblem, doubtful: Sequence[Body], start: Fit, least_rise: float
+) -> SearchResult:
+    """Continue the search from the bodies `start`: remove ghosts, then split a body or, if no split is supported,
+    change the kind of a body, until the data support no change. `doubtful`: bodies that were removed before."""
+    result = remove_unsupported(problem, start, doubtful, least_rise)
+    for _ in range(_MAX_CHANGES):
+        next_fit = _split_bodies(problem, result.fit, least_rise)
+        if next_fit is None:
+            result, next_fit = alternative_fits(problem, result)
+        if next_fit is None:
+            break
+        result = remove_unsupported(problem, next_fit, result.doubtful, least_rise)
+    return result
