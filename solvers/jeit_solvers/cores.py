@@ -85,11 +85,11 @@ def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
     """Apply `function` to each part, in NumPy, in parallel on several cores; the function must store its results
     itself.
 
-    The calling thread processes the parts in turn, and further threads help as long as cores are free. A part may call
-    `on_cores` itself: its own parts are shared as soon as another core has no work left. No part waits for a core, so
-    parts may also wait for compiled programs that call NumPy from other threads. If a part raises an error, or the user
-    interrupts, the other parts end at their next call of `check_not_abandoned`. Floating-point warnings are suppressed,
-    because NaN is reported elsewhere.
+    Threads that are kept for this purpose process the parts, on as many cores as are free; the calling thread does if
+    none is. A part may call `on_cores` itself: its own parts are shared as soon as another core has no work left. No
+    part waits for a core, so parts may also wait for compiled programs that call NumPy from other threads. If a part
+    raises an error, or the user interrupts, the other parts end at their next call of `check_not_abandoned`. Floating-
+    point warnings are suppressed, because NaN is reported elsewhere.
 
     **Arguments:**
 
@@ -103,49 +103,70 @@ def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
     on_cores(lambda part: squares.__setitem__(part, part**2), range(4))
     ```
     """
-    remaining, errors, helpers = collections.deque(parts), [], []
-    # A part is abandoned with the call that it belongs to, and with the calls around that.
-    abandoned = threading.Event()
-    abandoned_calls = (*getattr(_thread, "abandoned_calls", ()), abandoned)
-    free_cores, pool = _free_cores(os.getpid()), _thread_pool(os.getpid())
+    call, is_nested = _Call(function, parts), getattr(_thread, "has_core", False)
+    with one_thread_of_blas() if len(parts) > 1 else contextlib.nullcontext():
+        if len(parts) <= 1 or is_nested or not call.take_core():
+            call.process_parts()
+        with call.free_cores.lend() if is_nested else contextlib.nullcontext():
+            call.wait()
+    if call.errors:
+        raise call.errors[0]
 
-    def process_parts() -> None:
-        calls_around, _thread.abandoned_calls = getattr(_thread, "abandoned_calls", ()), abandoned_calls
+
+class _Call:
+    """A call of `on_cores`. Its state is in an object, because functions that refer to each other would keep the arrays
+    of the parts in memory."""
+
+    def __init__(self, function: Callable[[Any], Any], parts: Sequence[Any]):
+        self.function, self.remaining = function, collections.deque(parts)
+        self.errors: list[BaseException] = []
+        self.threads: list[Any] = []
+        # A part is abandoned with the call that it belongs to, and with the calls around that.
+        self.abandoned = threading.Event()
+        self.abandoned_calls = (*getattr(_thread, "abandoned_calls", ()), self.abandoned)
+        self.free_cores = _free_cores(os.getpid())
+
+    def take_core(self) -> bool:
+        """Start a thread that processes parts, if a core is free."""
+        is_free = self.free_cores.take()
+        if is_free:
+            self.threads.append(_thread_pool(os.getpid()).submit(self._process_parts_on_core))
+        return is_free
+
+    def process_parts(self) -> None:
+        """Process parts until none is left, and start further threads meanwhile."""
+        calls_around, _thread.abandoned_calls = getattr(_thread, "abandoned_calls", ()), self.abandoned_calls
         try:
             with np.errstate(all="ignore"):  # every thread has its own error state
-                while remaining and not abandoned.is_set():
-                    if len(remaining) > 1 and free_cores.take():
-                        helpers.append(pool.submit(help_out))
+                while self.remaining and not self.abandoned.is_set():
+                    if len(self.remaining) > 1:
+                        self.take_core()
                     try:
-                        part = remaining.popleft()
+                        part = self.remaining.popleft()
                     except IndexError:  # another thread has taken the last part
                         break
-                    function(part)
+                    self.function(part)
         except BaseException as error:
-            abandoned.set()
-            errors.append(error)
+            self.abandoned.set()
+            self.errors.append(error)
         finally:
             _thread.abandoned_calls = calls_around
 
-    def help_out() -> None:
+    def _process_parts_on_core(self) -> None:
+        _thread.has_core = True
         try:
-            process_parts()
+            self.process_parts()
         finally:
-            free_cores.give_back()
+            self.free_cores.give_back()
 
-    with one_thread_of_blas() if len(parts) > 1 else contextlib.nullcontext():
-        process_parts()
-        free_cores.give_back()  # that of this thread, while it waits
+    def wait(self) -> None:
+        """Wait until all threads have ended, or one of them with an error."""
         try:
-            while not errors and (unfinished := [helper for helper in helpers if not helper.done()]):
-                wait(unfinished)
+            while not self.errors and (running := [thread for thread in self.threads if not thread.done()]):
+                wait(running)
         except BaseException:  # the user has interrupted
-            abandoned.set()
+            self.abandoned.set()
             raise
-        finally:
-            free_cores.take_back()
-    if errors:
-        raise errors[0]
 
 
 def results_on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> list[Any]:
@@ -194,43 +215,50 @@ def parts_for_cores(number: int) -> list[slice]:
 
 
 class _FreeCores:
-    """Number of cores without work, one of which is used by the thread that calls `on_cores` first."""
+    """The number of cores without work, and the number of threads that have not ended: at most one more than there are
+    cores, as a thread that waits for others lends its core."""
 
     def __init__(self, number: int):
-        self._number, self._lock = number, threading.Lock()
+        self._number, self._max_threads, self._num_threads = number, number + 1, 0
+        self._lock = threading.Lock()
 
     def take(self) -> bool:
-        """Take a core if one is free."""
+        """Take a core for a thread, if one is free."""
         with self._lock:
-            if self._number <= 0:
+            if self._number <= 0 or self._num_threads == self._max_threads:
                 return False
-            self._number -= 1
+            self._number, self._num_threads = self._number - 1, self._num_threads + 1
             return True
 
     def give_back(self) -> None:
-        """Return a core."""
+        """Return the core of a thread that has ended."""
+        with self._lock:
+            self._number, self._num_threads = self._number + 1, self._num_threads - 1
+
+    @contextlib.contextmanager
+    def lend(self) -> Iterator[None]:
+        """Lend the core of the calling thread while this thread waits. If another thread still uses the core then, both
+        share it until one of them ends."""
         with self._lock:
             self._number += 1
-
-    def take_back(self) -> None:
-        """Take a core that was given back for a while. If another thread uses it, two threads share a core until one
-        of them ends."""
-        with self._lock:
-            self._number -= 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._number -= 1
 
 
 @functools.cache
 def _free_cores(process: int) -> _FreeCores:
     """The free cores of a process."""
-    return _FreeCores(min(number_of_cores(), _MAX_THREADS) - 1)
+    return _FreeCores(min(number_of_cores(), _MAX_THREADS))
 
 
 @functools.cache
 def _thread_pool(process: int) -> ThreadPoolExecutor:
-    """Threads of a process that help the calling threads (a forked process needs new ones). They are reused, because
-    memory that new threads allocate and free, about a hundred megabytes, is not returned to the system. Threads that
-    wait for each other use no core, so that there are more threads than cores."""
-    return ThreadPoolExecutor(8 * _MAX_THREADS, "jeit-core")
+    """Threads of a process that process parts (a forked process needs new ones). They are few and reused, because
+    memory that new threads allocate and free, about a hundred megabytes, is not returned to the system."""
+    return ThreadPoolExecutor(min(number_of_cores(), _MAX_THREADS) + 1, "jeit-core")
 
 
 @functools.cache

@@ -1,9 +1,11 @@
 """Work of NumPy shared between cores: results do not depend on the threads, and the BLAS settings are restored."""
 
 import functools
+import gc
 import threading
 import time
 import warnings
+import weakref
 
 import numpy as np
 import pytest
@@ -88,7 +90,7 @@ def test_an_error_in_a_part_is_raised_and_the_blas_threads_are_restored():
 
 def test_a_free_core_helps_with_the_parts_of_a_part(monkeypatch):
     """The second part of the outer call ends at once; a thread then takes a part of the inner call of the first."""
-    monkeypatch.setattr(cores, "_free_cores", functools.cache(lambda process: cores._FreeCores(1)))
+    monkeypatch.setattr(cores, "_free_cores", functools.cache(lambda process: cores._FreeCores(2)))
     threads, is_free = set(), threading.Event()
 
     def inner(number):
@@ -109,8 +111,21 @@ def test_a_free_core_helps_with_the_parts_of_a_part(monkeypatch):
     assert results_on_cores(lambda number: number**2, range(5)) == [0, 1, 4, 9, 16]
 
 
+def test_arrays_of_parts_are_freed_at_once():
+    """Not when garbage is collected: gigabytes would remain until then."""
+    array = np.ones(3)
+    reference = weakref.ref(array)
+    gc.disable()
+    try:
+        on_cores(functools.partial(lambda array, part: array.sum() + part, array), range(4))
+        del array
+        assert reference() is None
+    finally:
+        gc.enable()
+
+
 def test_other_parts_end_when_one_raises_an_error(monkeypatch):
-    monkeypatch.setattr(cores, "_free_cores", functools.cache(lambda process: cores._FreeCores(1)))
+    monkeypatch.setattr(cores, "_free_cores", functools.cache(lambda process: cores._FreeCores(2)))
     failed, ended = threading.Event(), threading.Event()
 
     def endless():
