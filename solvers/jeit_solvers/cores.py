@@ -16,7 +16,7 @@ import itertools
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from typing import Any
 
 import jax
@@ -163,7 +163,7 @@ class _Call:
         """Wait until all threads have ended, or one of them with an error."""
         try:
             while not self.errors and (running := [thread for thread in self.threads if not thread.done()]):
-                wait(running)
+                wait(running, return_when=FIRST_COMPLETED)
         except BaseException:  # the user has interrupted
             self.abandoned.set()
             raise
