@@ -96,6 +96,8 @@ def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
     - `function`: function of a part.
     - `parts`: arguments, one for each call of `function`.
 
+    Raises the first error of a part.
+
     **Example:**
 
     ```python

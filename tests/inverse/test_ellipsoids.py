@@ -18,6 +18,7 @@ from jeit.inverse.shapes import (
     Quantities,
     StarPrior,
     alternatives,
+    finer_mesh,
     number_and_kinds,
     problem,
     quantities,
@@ -354,9 +355,11 @@ def test_conductivity_of_partly_covered_cells(ellipsoids):
     np.testing.assert_allclose(resistive, [1, (0.5 + 0.5 * 0.5) ** 2, 0.25], rtol=1e-12)
 
 
-def test_refined_cells_know_their_parent_cells(coarse):
+def test_refined_cells_know_their_parent_cells(coarse, monkeypatch):
+    """Of the mesh before all refinements."""
+    monkeypatch.setattr(finer_mesh, "_MAX_NODES", 10.0)
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])
-    there = refine_at_surfaces(shape_problem(coarse), Fit(balls, balls.of_radii([RADIUS]), 0.0, ROWS), (0.5,))
+    there = refine_at_surfaces(shape_problem(coarse), Fit(balls, balls.of_radii([RADIUS]), 0.0, ROWS), (0.6, 0.3))
     volume = np.asarray(measures(there.problem.model.mesh))
     np.testing.assert_allclose(np.bincount(there.cell, volume), np.asarray(measures(coarse.mesh)), rtol=1e-9)
 
@@ -401,3 +404,21 @@ def test_only_starts_required_by_the_data_are_used(coarse, fine):
     _, fit, chosen = search._add_bodies(setting, balls, balls.of_radii([0.025, 0.02]))
     assert chosen == [0]
     assert len(fit.bodies.sign) == 1
+
+
+def test_number_and_kinds_are_determined_on_a_refined_mesh(coarse, fine, monkeypatch):
+    meshes = []
+
+    def improve(problem, result, least_rise):
+        meshes.append(problem.model.mesh.num_points)
+        return result
+
+    monkeypatch.setattr(search, "improve_fit", improve)
+    monkeypatch.setattr(search, "_MAX_REFINEMENTS", 1)
+    cut_along, held, rest = fine
+    change = np.asarray(cut_along.voltages(BATH * np.where(held, 4.0, 1.0))) - rest
+    frame = np.asarray(coarse.voltages(BATH)) + change
+    prior, noise = EllipsoidPrior(modes=1, kinds="ellipsoids"), 0.03 * np.sqrt(np.mean(change**2))
+    reconstruct_shapes(coarse, frame, BATH, start=[(1, BALL, RADIUS)], noise=noise, prior=prior)  # pyright: ignore
+    (num_points,) = meshes
+    assert num_points > coarse.mesh.num_points

@@ -1,5 +1,6 @@
 """Number and kinds of bodies in a solid: which descriptions are tried, and which are left out, for given evidence."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -96,6 +97,15 @@ def test_fits_that_cannot_be_supported_are_not_made():
     without = bodies.without(0, coefficients)
     hopeless: Any = Costs(1000.0)
     assert number_and_kinds._fit_without(hopeless, 30.0, without).cost == 1000.0
+    # Of two trials the one with the least cost has more parameters than any cost could justify.
+    trials = [Fit(bodies, coefficients, cost, ROWS) for cost in (1.0, 2.0)]
+    evidence: Any = SimpleNamespace(
+        surprise=lambda fit: {1.0: 12.0, 2.0: 9.0, 3.0: 10.0}[fit.cost],
+        fit=lambda bodies, coefficients, steps: Fit(bodies, coefficients, 2.0, ROWS),
+    )
+    fitted = Fit(bodies, coefficients, 3.0, ROWS)
+    assert number_and_kinds._best_fit(evidence, fitted, trials[:1]) is None
+    assert number_and_kinds._best_fit(evidence, fitted, trials) is not None
     doubtful: Any = Costs(800.0, 20.0)
     assert number_and_kinds._fit_without(doubtful, 30.0, without).cost == 20.0
     assert doubtful.steps == [3, 6]
@@ -119,3 +129,18 @@ def test_certain_bodies_are_fitted_together_before_others_are_tried():
     assert [signs for signs, _ in fitted] == [[1, 1], [1, 1, -1]]
     np.testing.assert_array_equal(fitted[0][1], balls.without(2, start)[1])
     np.testing.assert_array_equal(fitted[1][1], start)
+
+
+@pytest.mark.parametrize(("found", "is_tried"), [(8.0, False), (9.0, True)])
+def test_splits_are_tried_unless_a_change_of_kind_is_likelier_than_any(monkeypatch, found, is_tried):
+    """The bodies cost 4, and -log evidence is 12.5, so that a perfect fit would have 8.5."""
+    tried = []
+    bodies = Ellipsoids.create(MESH, EllipsoidPrior(), [[0.0, 0.0, 0.05]], [1])
+    base, changed = (Fit(bodies, bodies.of_radii([0.02]), cost, ROWS) for cost in (4.0, 1.0))
+    problem: Any = SimpleNamespace(surprise=lambda fit: 12.5 if fit is base else found)
+    result = number_and_kinds.SearchResult(base, [9.0], ())
+    monkeypatch.setattr(number_and_kinds, "alternative_fits", lambda *_: (result, changed))
+    monkeypatch.setattr(number_and_kinds, "_split_bodies", lambda *_: tried.append(True))
+    monkeypatch.setattr(number_and_kinds, "_search_until_stable", lambda *_: result._replace(fit=changed))
+    assert number_and_kinds.improve_fit(problem, result, 1.0).fit is changed
+    assert bool(tried) == is_tried

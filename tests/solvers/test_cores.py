@@ -111,6 +111,16 @@ def test_a_free_core_helps_with_the_parts_of_a_part(monkeypatch):
     assert results_on_cores(lambda number: number**2, range(5)) == [0, 1, 4, 9, 16]
 
 
+def test_a_thread_that_waits_lends_its_core():
+    free_cores = cores._FreeCores(1)
+    assert free_cores.take()
+    assert not free_cores.take()
+    with free_cores.lend():
+        assert free_cores.take()
+        free_cores.give_back()
+    assert not free_cores.take()
+
+
 def test_arrays_of_parts_are_freed_at_once():
     """Not when garbage is collected: gigabytes would remain until then."""
     array = np.ones(3)

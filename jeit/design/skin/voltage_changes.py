@@ -330,8 +330,8 @@ class RestingSkin(Module):
         return voltage_changes
 
     def changes_together(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
-        """As `changes`, for touches of about equal numbers of cells and nodes: all are padded to the largest, and one
-        program computes them. One is compiled for each number of touches, and for each size."""
+        """As `changes` (n, M), in volts, for touches of about equal numbers of cells and nodes: all are padded to the
+        largest, and one program computes them. One is compiled for each number of touches, and for each size."""
         touched_at = touched_nodes(self.model, touched, self.strips)
         nodes = _pad_rows(touched_at.nodes, int(_padded_size(touched_at.nodes.shape[1], _NODE_SIZE_RATIO)), "edge")
         touches = on_device((touched.cells, touched.change, nodes, touched_at.corners))

@@ -24,9 +24,9 @@ CERTAIN_RISE = 10.0
 MIN_EVIDENCE_GAIN = 2.0
 """Minimum gain of log evidence with which a description of the bodies with more parameters is accepted."""
 _TRIAL_STEPS = 6
-# Steps of the fit without a body: in all, and those after which the fit ends if the cost exceeds the cost at which the
-# body is beyond doubt by more than this factor.
-_REMOVAL_STEPS, _FIRST_REMOVAL_STEPS, _HOPELESS_RISE = 6, 3, 30.0
+# Maximum number of steps of the first part of a fit without a body, after which the fit ends if the cost exceeds the
+# cost at which the body is beyond doubt by more than this factor; and maximum number of further steps.
+_FIRST_REMOVAL_STEPS, _HOPELESS_RISE, _REMOVAL_STEPS = 3, 30.0, 6
 # The data exclude a change of a body's kind if it raises the objective, after a few steps of the fit, by more than this
 # factor: on finer meshes the factor increases, because the objective of the right kind decreases.
 _EXCLUDED_RISE = 100.0
@@ -131,14 +131,17 @@ def _trial_fit(problem: ShapeProblem, start: tuple[Bodies, Float[np.ndarray, " n
 
 
 def _best_fit(problem: ShapeProblem, fitted: Fit, trial_fits: Sequence[Fit]) -> Fit | None:
-    """Fit to convergence from the best of several trial fits. None if its cost is more than `CERTAIN_RISE` times that
-    of `fitted`, or if the data could not support it even if its cost fell to zero."""
-    best_trial = min(trial_fits, key=lambda trial: trial.cost, default=None)
-    if best_trial is None or best_trial.cost > CERTAIN_RISE * fitted.cost:
+    """Fit to convergence from the trial fit with the least cost, of those whose cost is at most `CERTAIN_RISE` times
+    that of `fitted` and that the data would support if their cost fell to zero. None if there are none."""
+    possible_trials = [
+        trial
+        for trial in trial_fits
+        if trial.cost <= CERTAIN_RISE * fitted.cost
+        and problem.surprise(trial) - trial.cost + MIN_EVIDENCE_GAIN <= problem.surprise(fitted)
+    ]
+    if not possible_trials:
         return None
-    least_surprise = problem.surprise(best_trial) - best_trial.cost
-    if least_surprise + MIN_EVIDENCE_GAIN > problem.surprise(fitted):
-        return None
+    best_trial = min(possible_trials, key=lambda trial: trial.cost)
     return problem.fit(best_trial.bodies, best_trial.coefficients, STEPS)
 
 

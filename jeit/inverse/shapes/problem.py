@@ -42,6 +42,7 @@ from jeit_solvers.engines import on_host
 
 # Levels of the smooth field that are tried, in units of the standard deviation of the smooth image's prior.
 _LEVELS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)
+# Number of conductivities of which a problem keeps the fields.
 _NUM_RECENT_FIELDS = 6
 
 
@@ -124,7 +125,7 @@ class Fit(NamedTuple):
 
 
 class _RecentFields:
-    """Cache of the fields of one model for the last few conductivities."""
+    """Cache of the fields of one model for the last few conductivities, which are compared by value."""
 
     def __init__(self):
         self._solved: list[tuple[Float[np.ndarray, " m"], SolvedFields]] = []
@@ -152,7 +153,7 @@ class ShapeProblem:
     data: Data
     background: Float[np.ndarray, " m"]
     rtol: float = 3e-3
-    recent_fields: _RecentFields = field(default_factory=lambda: _RecentFields(), compare=False)
+    recent_fields: _RecentFields = field(default_factory=_RecentFields, compare=False)
 
     def with_errors(self, rows: Float[np.ndarray, "r q"]) -> ShapeProblem:
         """Copy of the problem with further errors of the data: `rows` (r, q) are the errors of the r weighted voltages
