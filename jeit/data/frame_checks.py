@@ -17,6 +17,7 @@ from jeit.data.quality import (
     reciprocity_error,
     reciprocity_noise,
     rounding_deviation,
+    signal_evidence,
 )
 from jeit.inverse import relative_noise
 from jeit_solvers.engines import as_array
@@ -26,9 +27,12 @@ from jeit_solvers.engines import as_array
 MOST_IMPOSSIBLE_SIGNS = 0.25
 # Fraction of voltages with an impossible sign above which the polarity is reversed: noise alone yields only one half.
 MOST_OPPOSITE_SIGNS = 0.75
-# Maximum reciprocity error of the difference between frame and reference. A reciprocity error r corresponds to a ratio
-# of noise to signal of r / sqrt(2 - r²), here one half.
-MOST_DIFFERENCE_RECIPROCITY_ERROR = 0.63
+# Maximum reciprocity error of a frame. A reciprocity error r corresponds to a ratio of noise to signal of
+# r / sqrt(2 - r²), here one half.
+MOST_RECIPROCITY_ERROR = 0.63
+# Minimum evidence that a difference contains more than noise, in standard deviations (`signal_evidence`). Bodies are
+# found reliably where noise exceeds the signal, because a body alters many channels in a pattern.
+MIN_SIGNAL_EVIDENCE = 3.0
 # Cosine of the angle between a frame and its reference below which the frame or the reference has the opposite
 # polarity.
 _MIN_COSINE = -0.5
@@ -154,9 +158,10 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
     - more than a quarter of the voltages of the frame, or of the reference, have an impossible sign
       (`impossible_signs`): at least half of the voltages are then smaller than the noise or the offset of the
       instrument;
-    - the reciprocity error of the frame, of the reference, or of their difference exceeds 0.63, so that noise exceeds
-      half of the signal. In the difference, channels are weighted as in imaging (`jeit.inverse.relative_noise`),
-      because voltages on driven electrodes are large and mostly due to contact impedances;
+    - the reciprocity error of the frame or of the reference exceeds 0.63, so that noise exceeds half of the signal;
+    - by reciprocity, the difference of both is not distinguishable from noise (`jeit.data.quality.signal_evidence`).
+      Channels are weighted as in imaging (`jeit.inverse.relative_noise`), because voltages on driven electrodes are
+      large and mostly due to contact impedances;
     - the cosine of the angle between the voltages of frame and reference is less than -0.5: no change of a passive body
       reverses all voltages, so the frame or the reference has the opposite polarity;
     - the frame does not differ from the reference, or the difference is mostly rounding of the voltages;
@@ -189,7 +194,11 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
         cosine = _cosine(
             *(np.where(common_mask, np.asarray(each_frame.filled()), 0).ravel() for each_frame in (frame, mean))
         )
-        error = reciprocity_error(change, deviations) if num_usable and size > 0 else None
+        error, evidence = (
+            (reciprocity_error(change, deviations), signal_evidence(change, deviations))
+            if num_usable and size > 0
+            else (None, None)
+        )
         own_errors = {f"the reference '{reference.name}'": reference_error, "the frame": reciprocity_error(frame)}
         impossible_share = max(signs) if signs else None
         rounding = float(np.linalg.norm(rounding_of_difference(frame, mean))) / size if size > 0 else 0.0
@@ -208,7 +217,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
                     relative_difference,
                     rounding,
                     impossible_share,
-                    error,
+                    (error, evidence),
                     own_errors,
                     cosine,
                 ),
@@ -392,12 +401,13 @@ def _rejection_reason(
     relative_difference: float,
     rounding: float,
     impossible_share: float | None,
-    difference_error: float | None,
+    of_difference: tuple[float | None, float | None],
     own_errors: dict[str, float | None],
     cosine: float,
 ) -> str:
-    """Reason why a frame cannot be imaged; empty if it can. `own_errors`: reciprocity errors of frame and reference by
-    name; `cosine`: cosine of the angle between frame and reference."""
+    """Reason why a frame cannot be imaged; empty if it can. `of_difference`: reciprocity error of the difference and
+    the evidence that it is not noise; `own_errors`: reciprocity errors of frame and reference by name; `cosine`: cosine
+    of the angle between frame and reference."""
     if num_usable < num_electrodes:
         return (
             f"only {counted(num_usable, 'channel')} usable in both it and its reference, for {num_electrodes} "
@@ -425,15 +435,16 @@ def _rejection_reason(
             "its voltages have the opposite sign of its reference's: reverse the polarity of it, or of its reference."
         )
     for name, error in own_errors.items():
-        if error is not None and error > MOST_DIFFERENCE_RECIPROCITY_ERROR:
+        if error is not None and error > MOST_RECIPROCITY_ERROR:
             return (
                 f"{name} breaks reciprocity by {percent(error)} on its own: it is too noisy, or its channels are in "
                 "another order than described. See `jeit info`."
             )
-    if difference_error is not None and difference_error > MOST_DIFFERENCE_RECIPROCITY_ERROR:
+    error, evidence = of_difference
+    if error is not None and evidence is not None and evidence < MIN_SIGNAL_EVIDENCE:
         return (
-            f"too noisy: the difference from the reference breaks reciprocity by {percent(difference_error)}, "
-            "so that its noise is more than half its signal. Average more frames, or use more current."
+            f"too noisy: the difference from the reference breaks reciprocity by {percent(error)}, as noise alone "
+            "would. Average more frames, or use more current."
         )
     return ""
 

@@ -225,6 +225,35 @@ def reciprocity_noise(measurement: Measurement, deviation: Float[np.ndarray, " M
     return _robust_deviation(error / noise) if error.size else None
 
 
+def signal_evidence(measurement: Measurement, deviation: Float[np.ndarray, " M"]) -> float | None:
+    """Evidence that a difference of two frames contains more than noise, in standard deviations of what noise alone
+    would yield; None if no two usable channels are related by reciprocity.
+
+    Of the matrix T of transfer between drives (see `reciprocity_error`), T - Tᵀ contains only noise, T + Tᵀ noise and
+    signal. For noise alone the power of both is equal, up to a relative deviation of about 2 / √N for N pairs of
+    entries. The evidence grows with N, so it may be large where noise exceeds the signal in every single channel.
+
+    **Arguments:**
+
+    - `measurement`: the difference of two frames.
+    - `deviation` (channels,): expected errors of the channels, relative to each other.
+
+    **Example:**
+
+    ```python
+    evidence = signal_evidence(difference, relative_noise(voltages))
+    ```
+    """
+    error, noise, signal = _asymmetry(measurement, deviation)
+    if error.size == 0:
+        return None
+    # An entry of `signal` off the diagonal counts two entries of T, an entry of the diagonal half as much.
+    num_pairs, num_diagonal = error.size, signal.size - error.size
+    noise_power = float(np.mean(np.abs(error / noise) ** 2)) * (num_pairs / 2 + num_diagonal / 4)
+    power = float(np.sum(signal**2))
+    return (power / noise_power - 1) * np.sqrt(num_pairs) if noise_power > 0 else np.inf
+
+
 def rounding_deviation(voltages: Float[np.ndarray, " M"], mask: Bool[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
     """Standard deviation (channels,) of the rounding errors of voltages, in volts; zero if no rounding is found.
 

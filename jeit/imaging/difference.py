@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Inexact, UInt8
 
 from jeit.arguments import object_html, object_text, percent, picture
 from jeit.data import Measurement
-from jeit.data.frame_checks import FrameQuality
+from jeit.data.frame_checks import MOST_RECIPROCITY_ERROR, FrameQuality
 from jeit.electrodes import AbstractElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import Inclusion, Raster, SolidForm
@@ -149,10 +149,17 @@ class ImagedDifference:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Reasons to doubt the image, in sentences: too few channels, an implausible background, an iteration that did
-        not converge, voltages not explained by the image, or bodies whose kind the data do not determine."""
+        """Reasons to doubt the image, in sentences: too few channels, noise, an implausible background, an iteration
+        that did not converge, voltages not explained by the image, or bodies whose kind the data do not determine."""
         reconstruction = self.reconstruction
         doubts = doubts_of_data(self.measurement, self.reference, self.calibration)
+        error = self.quality.difference_reciprocity_error
+        if error is not None and error > MOST_RECIPROCITY_ERROR:
+            doubts.append(
+                f"the difference from the reference breaks reciprocity by {percent(error)}, so that its noise exceeds "
+                "half its signal: bodies may be missed, or shown where none are. Average more frames, or use more "
+                "current."
+            )
         if isinstance(reconstruction, LinearReconstruction):
             return tuple(doubts)
         if isinstance(reconstruction, Reconstruction) and reconstruction.status != Status.CONVERGED:

@@ -10,7 +10,7 @@ import numpy as np
 
 from jeit.arguments import counted, percent
 from jeit.data import Measurement, estimate_noise, impossible_signs, reciprocity_error
-from jeit.data.frame_checks import MOST_DIFFERENCE_RECIPROCITY_ERROR
+from jeit.data.frame_checks import MOST_RECIPROCITY_ERROR
 from jeit.forward import ForwardModel
 from jeit.imaging import imaging_mesh
 from jeit.imaging.hyperparameter_rules import ComparedRules, RuleOutcome
@@ -75,7 +75,7 @@ def _describe_wiring(measurement: Measurement) -> str | None:
         imaging_mesh(domain, electrodes, None, usual=_MAX_MESH_NODES), electrodes, measurement.protocol
     )
     wiring, error = find_wiring(model, reference), reciprocity_error(reference)
-    if error is not None and error > MOST_DIFFERENCE_RECIPROCITY_ERROR and not wiring.explanation:
+    if error is not None and error > MOST_RECIPROCITY_ERROR and not wiring.explanation:
         return (
             f"reciprocity broken by {percent(error)}, and nothing that was tried mends it: channels or drives in "
             "another order than described, or nothing but noise"

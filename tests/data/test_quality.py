@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from jeit import data, protocol
-from jeit.data.frame_checks import assess, mask_spikes
+from jeit.data.frame_checks import MIN_SIGNAL_EVIDENCE, assess, mask_spikes
 from jeit.data.inferred_properties import channel_gains
-from jeit.data.quality import channel_reciprocity_error, expected_signs, rounding_deviation
+from jeit.data.quality import channel_reciprocity_error, expected_signs, rounding_deviation, signal_evidence
 from jeit.inverse import relative_noise
 from jeit.report.hyperparameter_rules import report_measurement
 
@@ -152,10 +152,24 @@ def test_noise_in_the_difference_is_refused(tank, setup):
     (quality,) = data.check_imageable(little, reference)
     # Independent noise of relative size 0.1 breaks reciprocity by about √2 times as much.
     assert quality.difference_reciprocity_error == pytest.approx(0.14, rel=0.2)
-    much = data.screen(other + noise, chosen, **setup(16))
-    with pytest.raises(ValueError, match="breaks reciprocity"):
-        data.check_imageable(much, reference)
-    assert [q.imageable for q in assess(much, reference)] == [False]
+    as_much = data.screen(other + noise, chosen, **setup(16))
+    (quality,) = data.check_imageable(as_much, reference)
+    assert quality.difference_reciprocity_error == pytest.approx(1, rel=0.2)
+    too_much = data.screen(other + 5 * noise, chosen, **setup(16))
+    with pytest.raises(ValueError, match=r"breaks reciprocity .* as noise alone would"):
+        data.check_imageable(too_much, reference)
+    assert [q.imageable for q in assess(too_much, reference)] == [False]
+
+
+@pytest.mark.parametrize("driven_electrodes", [False, True])
+def test_the_evidence_of_a_signal_in_noise_alone_is_about_zero(tank, driven_electrodes):
+    chosen = protocol.adjacent(16, driven_electrodes=driven_electrodes)
+    deviation = np.asarray(relative_noise(tank(chosen)))
+    noise = deviation * np.random.default_rng(8).normal(size=(100, len(deviation)))
+    evidence = np.array([signal_evidence(data.screen(one, chosen), deviation) for one in noise])
+    assert abs(evidence.mean()) < 0.4  # four standard deviations of the mean
+    assert np.std(evidence) == pytest.approx(1, rel=0.3)
+    assert np.mean(evidence > MIN_SIGNAL_EVIDENCE) < 0.03
 
 
 @pytest.mark.parametrize("patterns", [protocol.adjacent, protocol.haar])

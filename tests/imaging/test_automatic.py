@@ -210,6 +210,15 @@ def test_reasons_to_doubt_an_image_are_reported():
     assert report_image(stiff)["doubts"] == list(stiff.doubts)
 
 
+def test_a_strong_body_is_found_although_the_noise_equals_the_signal():
+    noisy = [frame(factor, noise=0.2, seed=seed) for factor, seed in ((0.05, 4), (1.0, 5))]
+    result = image_difference(*noisy, ImagingSettings(**FEW))
+    (body,) = result.inclusions
+    assert body.sign < 0
+    np.testing.assert_allclose(body.centroid, [0.02, 0.01], atol=0.05 * RADIUS)
+    assert "noise exceeds half its signal" in result.doubts[0]
+
+
 def test_exchanged_files_are_doubted():
     """Of a tank whose reference contains a strong body."""
     assert image(20.0).doubts == ()

@@ -234,7 +234,10 @@ def test_where_electrodes_do_not_distinguish_the_kind_of_a_body_it_is_doubted_an
         mask=np.ones((1, 2), bool), voltages=np.ones((1, 2)), notes=(), electrodes=None, domain=None
     )
     whole = SimpleNamespace(measurement=frame, reference=frame)
-    image: Any = SimpleNamespace(shapes=shapes, reconstruction=shapes, calibration=calibration, **vars(whole))
+    quality = SimpleNamespace(difference_reciprocity_error=0.01)
+    image: Any = SimpleNamespace(
+        shapes=shapes, reconstruction=shapes, calibration=calibration, quality=quality, **vars(whole)
+    )
     own = Quantities(2.0, (1.7, 2.3), 3e-5, (2e-5, None), 1.5e-5, (1.4e-5, 1.6e-5), 1e-3)
     elsewhere = replace(body(False, np.log(6)), centroid=BALL + np.array([0.0, 0.0, 0.005]))
     known = include_deviation(own, body(True, np.log(3)), elsewhere, 0.5)
