@@ -11,8 +11,9 @@ from small_networks import SKIN
 
 from jeit.design import read_described_skin
 from jeit.touch.networks import PRESETS, read_network
-from jeit.touch.networks.learn import TouchExamples, TrainingRuns, evaluate_network, shuffle_pairs, train_unrolled
+from jeit.touch.networks.learn import TrainingRuns, evaluate_network, shuffle_pairs, train_unrolled
 from jeit.touch.networks.linear_channels import LinearChannels
+from jeit.touch.networks.simulated_touches import TouchExamples
 from jeit.touch.networks.three_stage_network import ThreeStages
 from jeit.touch.networks.unrolled_network import Unrolled
 from jeit.touch.simulate.contact.indent_sets import image_places

@@ -26,7 +26,8 @@ from jeit.layout import named_layout
 from jeit.mesh import Rectangle
 from jeit.protocol import adjacent
 from jeit.touch.networks import NetworkPreset, learn_images, read_network, write_network
-from jeit.touch.networks.learn import TouchExamples, evaluate_network
+from jeit.touch.networks.learn import evaluate_network
+from jeit.touch.networks.simulated_touches import TouchExamples
 from jeit.touch.simulate import DiscIndenter, Indent, relative_changes
 from jeit.touch.training import TrainingPlan
 

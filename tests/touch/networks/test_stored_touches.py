@@ -10,15 +10,9 @@ import pytest
 from small_networks import bits
 
 from jeit.touch.networks import ImageNetwork
-from jeit.touch.networks.learn import (
-    StoredTouches,
-    TouchExamples,
-    TrainingRuns,
-    mean_and_deviation,
-    shuffle_pairs,
-    train_three_stages,
-)
+from jeit.touch.networks.learn import TrainingRuns, mean_and_deviation, shuffle_pairs, train_three_stages
 from jeit.touch.networks.linear_channels import touch_draws
+from jeit.touch.networks.simulated_touches import StoredTouches, TouchExamples
 from jeit.touch.simulate import IndentSet, simulate_presses
 from jeit.touch.training import MappedRows, TrainingPlan, TrainingResult
 from jeit.touch.training.model_file import Course

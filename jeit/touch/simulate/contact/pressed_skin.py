@@ -1,25 +1,11 @@
-"""Pressed skins: compute conductivity from loads, and voltages from conductivity, with hysteresis, creep and drift.
-
-The effective pressure q of a material follows from the pressure p over time by hysteresis, then creep.
-
-**Hysteresis** is a generalised play operator (Visintin, Differential Models of Hysteresis, 1994, section III.2) between
-the curve w = p, on which the load rises, and the curve w = p / (1 − H), on which it falls; between the curves, w is
-constant. Hysteresis does not depend on the rate of loading. Both curves end at zero, and their maximum difference after
-a load p is H p.
-
-**Creep** is that of a standard linear solid with several branches, in which a share a_k of w is delayed:
-
-q = (1 − Σ a_k) w + Σ a_k y_k, τ_k dy_k/dt = w − y_k,
-
-solved exactly for w that is linear between two times.
-"""
+"""Pressed skins: compute conductivity from loads, and voltages from conductivity, with hysteresis, creep and drift."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -36,7 +22,7 @@ from jeit.forward.model import check_model, select_channels
 from jeit.forward.system import check_conductivity
 from jeit.mesh import Mesh, centroids, measures
 from jeit.touch.simulate.contact.cell_pressure import pressed_cells
-from jeit.touch.simulate.contact.materials import Material
+from jeit.touch.simulate.contact.materials import Material, advance_state, held_pressure, unloaded_state
 from jeit.touch.simulate.contact.press import MovingPress, Press, motions_of, touches_of
 from jeit.touch.simulate.contact.samples import Samples
 from jeit_solvers.engines import as_array, on_host
@@ -82,49 +68,6 @@ def draw_gains(key: Array, spread: float, num_channels: int) -> Float[np.ndarray
 def white_noise(key: Array, deviation: float, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
     """Draw independent normal noise with standard `deviation`, volts."""
     return deviation * standard_normal(key, shape)
-
-
-class MaterialState(NamedTuple):
-    """State of a material at m points, pascals. **Fields**: `hysteresis_output`: (m,), pressure w after hysteresis;
-    `branch_states`: (k, m), states y of the k delayed branches of creep."""
-
-    hysteresis_output: Float[np.ndarray, " m"]
-    branch_states: Float[np.ndarray, "k m"]
-
-
-def unloaded_state(material: Material, num_points: int) -> MaterialState:
-    """Return the state of a material at `num_points` points without earlier load."""
-    return MaterialState(np.zeros(num_points), np.zeros((len(material.creep), num_points)))
-
-
-def advance_state(
-    material: Material, state: MaterialState, pressure: Float[np.ndarray, " m"], seconds: float
-) -> tuple[MaterialState, Float[np.ndarray, " m"]]:
-    """Advance a material's `state` by a time step of `seconds`, at the end of which the material bears `pressure` (m,);
-    return the new state and the effective pressure (m,), pascals."""
-    output = np.maximum(pressure, np.minimum(state.hysteresis_output, pressure / (1 - material.hysteresis)))
-    shares, times = _creep_branches(material)
-    branch_states = state.branch_states
-    if seconds > 0:
-        relative_times = seconds / times
-        decay_factors = np.exp(-relative_times)
-        ramp_weights = 1 + np.expm1(-relative_times) / relative_times
-        branch_states = decay_factors * branch_states + (1 - decay_factors) * state.hysteresis_output
-        branch_states += ramp_weights * (output - state.hysteresis_output)
-    return MaterialState(output, branch_states), (1 - shares.sum()) * output + np.sum(shares * branch_states, axis=0)
-
-
-def held_pressure(material: Material, pressure: Float[np.ndarray, "..."], seconds: float) -> Float[np.ndarray, "..."]:
-    """Compute the effective pressure (…), pascals, under the first `pressure` on a material, applied suddenly and
-    constant for `seconds`."""
-    shares, times = _creep_branches(material)
-    return np.asarray(pressure) * (1 - np.sum(shares * np.exp(-seconds / times)))
-
-
-def _creep_branches(material: Material) -> tuple[np.ndarray, np.ndarray]:
-    """Return the shares (k, 1) and time constants (k, 1), seconds, of a material's k branches of creep."""
-    pairs = np.array(material.creep, float).reshape(-1, 2)
-    return pairs[:, :1], pairs[:, 1:]
 
 
 # Number of touches processed at once.

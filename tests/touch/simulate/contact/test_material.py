@@ -7,17 +7,8 @@ import numpy as np
 import pytest
 
 from jeit.touch.simulate.contact import Foundation, Material, material
-from jeit.touch.simulate.contact.materials import MATERIALS
-from jeit.touch.simulate.contact.pressed_skin import (
-    advance_state,
-    draw_gains,
-    held_pressure,
-    random_walk,
-    split_keys,
-    standard_normal,
-    unloaded_state,
-    white_noise,
-)
+from jeit.touch.simulate.contact.materials import MATERIALS, advance_state, held_pressure, unloaded_state
+from jeit.touch.simulate.contact.pressed_skin import draw_gains, random_walk, split_keys, standard_normal, white_noise
 
 PLAIN = Material(0.2, 1e-4, Foundation(1e6, 2e-3), saturation=1.5, half_pressure=20e3)
 HYSTERETIC = dataclasses.replace(PLAIN, hysteresis=0.2)

@@ -1,0 +1,103 @@
+"""Simulated touches that train and test a network, in memory or in the store of a finished set."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from jeit.design.study.store import Store
+from jeit.touch.simulate import IndentSet
+from jeit.touch.training import ArrayRows, Rows
+
+# Maximum number of simulated touches that are in memory, and shuffled, together: 120 MB for 94 channels and 48 × 48
+# maps.
+_MAX_TOUCHES_IN_MEMORY = 12_000
+
+
+class SimulatedTouches(Protocol):
+    """Simulated touches: voltage changes "change" (touches, channels), depth maps "depth" (touches, rows, columns).
+
+    Changes are relative, without noise. Depths are divided by the skin's thickness.
+    """
+
+    def rows(self, *names: str) -> Rows:
+        """Return the float32 arrays "change" or "depth" in the order of `names`; for a single name, the array
+        itself."""
+        ...
+
+
+class TouchExamples(NamedTuple):
+    """Simulated touches in memory.
+
+    **Fields**: `change` (touches, channels): relative voltage changes without noise; `depth` (touches, rows, columns):
+    depth maps, divided by the thickness of the skin.
+    """
+
+    change: Float[np.ndarray, "n M"]
+    depth: Float[np.ndarray, "n r c"]
+
+    def rows(self, *names: str) -> ArrayRows:
+        """Return the arrays of these names, as `SimulatedTouches.rows` does."""
+        arrays = tuple(np.asarray(getattr(self, name), np.float32) for name in names)
+        return ArrayRows(arrays[0] if len(arrays) == 1 else arrays)
+
+
+class StoredTouches:
+    """Simulated touches of a finished set of `simulate_presses`, read from the set's store on access.
+
+    Several chunks of the store are read together as one larger chunk of about `max_chunk_size` touches or fewer.
+    """
+
+    def __init__(self, indents: IndentSet, path: str | Path, max_chunk_size: int = _MAX_TOUCHES_IN_MEMORY):
+        """Open the store of touches. Raises `ValueError` if the set is not finished, and as `Store` does."""
+        store, chunks = Store(indents.contents(), path, create=False), indents.chunks
+        checksums = store.finished_checksums()
+        if len(checksums) < len(chunks):
+            raise ValueError(
+                f"path: {len(checksums)} of {len(chunks)} chunks of {path} are simulated; run simulate_presses again."
+            )
+        self.fingerprint = hashlib.sha256(repr(sorted(checksums.items())).encode()).hexdigest()
+        self._arrays = store.open_dataset()
+        # The chunks are of similar size, so that no chunk is smaller than a batch.
+        num_chunks = min(-(-indents.number // max_chunk_size), len(chunks))
+        chunk_groups = np.array_split(np.arange(len(chunks)), num_chunks)
+        self.spans = [range(chunks[chunk_group[0]].start, chunks[chunk_group[-1]].stop) for chunk_group in chunk_groups]
+
+    def rows(self, *names: str) -> "StoredRows":
+        """Return the arrays of these names, to be read chunk by chunk; see `SimulatedTouches`."""
+        return StoredRows(self, names)
+
+    def in_memory(self) -> TouchExamples:
+        """Read all touches of the set into memory."""
+        return TouchExamples(self._arrays["change"].to_numpy(), self._arrays["depth"].to_numpy())
+
+    def read(self, name: str, chunk: int) -> Float[np.ndarray, "n *shape"]:
+        """Read the array `name` of one chunk of touches, float32."""
+        span = self.spans[chunk]
+        return self._arrays[name][span.start : span.stop].to_numpy().astype(np.float32, copy=False)
+
+
+class StoredRows:
+    """The named arrays of `StoredTouches`, with the interface of `Rows`."""
+
+    def __init__(self, touches: StoredTouches, names: tuple[str, ...]):
+        self._touches, self._names = touches, names
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Number of simulated touches of each chunk."""
+        return tuple(map(len, self._touches.spans))
+
+    @property
+    def fingerprint(self) -> str:
+        """Fingerprint of the touches, the names of the arrays, and the sizes of the chunks."""
+        return f"{self._touches.fingerprint} {' '.join(self._names)} {self.sizes}"
+
+    def chunk(self, index: int):
+        """Read the arrays of one chunk of touches; for a single name, returns the array itself."""
+        arrays = tuple(self._touches.read(name, index) for name in self._names)
+        return arrays[0] if len(arrays) == 1 else arrays
