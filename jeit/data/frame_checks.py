@@ -12,6 +12,7 @@ from jeit.arguments import counted, percent
 from jeit.data.measurement import Measurement
 from jeit.data.quality import (
     NoiseEstimate,
+    channel_reciprocity_error,
     estimate_noise,
     impossible_signs,
     reciprocity_error,
@@ -30,6 +31,10 @@ MOST_OPPOSITE_SIGNS = 0.75
 # Maximum reciprocity error of a frame. A reciprocity error r corresponds to a ratio of noise to signal of
 # r / sqrt(2 - r²), here one half.
 MOST_RECIPROCITY_ERROR = 0.63
+# Maximum of `FrameQuality.noise_share` that raises no doubt; it corresponds to that reciprocity error.
+MOST_NOISE = MOST_RECIPROCITY_ERROR / np.sqrt(2)
+# Maximum fraction of the noise that is left without the channels of an electrode that explains the noise.
+_MOST_LEFT = 0.5
 # Minimum evidence that a difference contains more than noise, in standard deviations (`signal_evidence`). Bodies are
 # found reliably where noise exceeds the signal, because a body alters many channels in a pattern.
 MIN_SIGNAL_EVIDENCE = 3.0
@@ -67,6 +72,10 @@ class FrameQuality:
     - `rounding`: standard deviation of the difference due to rounding of the voltages, relative to the difference; 0 if
       the voltages are not rounded.
     - `difference_reciprocity_error`: relative reciprocity error of the difference; None if no channels are reciprocal.
+    - `noise_share`: root mean square of the noise relative to that of the difference, from reciprocity, without a
+      factor that all voltages have in common; None if no channels are reciprocal.
+    - `noisy_electrode`: the electrode, numbered from 0, whose channels contain most of the noise, if `noise_share` is
+      large and a single electrode explains it; otherwise None.
     - `impossible_signs`: fraction of voltages whose sign is impossible on a passive body (the larger of the fractions
       of frame and reference); None if no sign is known.
     - `usable_channels`: number of channels that are usable in both frame and reference.
@@ -88,6 +97,24 @@ class FrameQuality:
     usable_channels: int
     reason: str
     rounding: float = 0.0
+    noise_share: float | None = None
+    noisy_electrode: int | None = None
+
+    @property
+    def doubt(self) -> str:
+        """A sentence about noise that exceeds half of the signal; otherwise empty."""
+        if self.noise_share is None or self.noise_share <= MOST_NOISE:
+            return ""
+        found = f"by reciprocity, noise is {percent(self.noise_share)} of the difference from the reference"
+        if self.noisy_electrode is not None:
+            return (
+                f"{found}, most of it in the channels of electrode {self.noisy_electrode + 1}: check its contact and "
+                "cable, or leave the channels out (NaN in the file)."
+            )
+        return (
+            f"{found} (apart from a common factor): bodies may be missed, or shown where none are. Average more "
+            "frames, or use more current."
+        )
 
     @property
     def imageable(self) -> bool:
@@ -199,6 +226,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
             if num_usable and size > 0
             else (None, None)
         )
+        noise_share, noisy_electrode = (None, None) if error is None else _noise_in(change, mean, deviations)
         own_errors = {f"the reference '{reference.name}'": reference_error, "the frame": reciprocity_error(frame)}
         impossible_share = max(signs) if signs else None
         rounding = float(np.linalg.norm(rounding_of_difference(frame, mean))) / size if size > 0 else 0.0
@@ -211,6 +239,8 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
                 impossible_signs=impossible_share,
                 usable_channels=num_usable,
                 rounding=rounding,
+                noise_share=noise_share,
+                noisy_electrode=noisy_electrode,
                 reason=_rejection_reason(
                     measurement.protocol.num_electrodes,
                     num_usable,
@@ -224,6 +254,29 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
             )
         )
     return results
+
+
+def _noise_in(
+    change: Measurement, mean: Measurement, deviations: Float[np.ndarray, " M"]
+) -> tuple[float | None, int | None]:
+    """`FrameQuality.noise_share` and `FrameQuality.noisy_electrode` of a `change` from the reference `mean`.
+    `deviations` (M,): expected errors of the channels, relative to each other."""
+    common_mask, protocol = np.asarray(change.mask)[0], change.protocol
+    voltages, levels = np.nan_to_num(np.asarray(change.voltages)[0]), np.nan_to_num(np.asarray(mean.voltages)[0])
+    weights = np.where(common_mask, deviations**-2.0, 0.0)
+    power = float(np.sum(weights * np.abs(levels) ** 2))
+    factor = np.vdot(levels, weights * voltages) / power if power > 0 else 0.0
+    rest = replace(change, voltages=as_array((voltages - factor * levels)[None]))
+    if not (error := reciprocity_error(rest, deviations)):
+        return error, None
+    share, electrode = min(1.0, error / np.sqrt(2)), None
+    if share > MOST_NOISE:
+        square = np.nan_to_num(channel_reciprocity_error(rest)[0] / deviations) ** 2
+        touching = np.array([protocol.channels_touching(one) for one in range(protocol.num_electrodes)])
+        worst = int(np.argmax(touching @ square / np.maximum(touching.sum(axis=1), 1)))
+        left = reciprocity_error(rest.masked(~touching[worst], "they use the noisy electrode."), deviations)
+        electrode = worst if left is not None and left < _MOST_LEFT * error else None
+    return share, electrode
 
 
 def mask_spikes(measurement: Measurement, reference: Measurement, *, fill: bool = False) -> Measurement:
@@ -443,8 +496,9 @@ def _rejection_reason(
     error, evidence = of_difference
     if error is not None and evidence is not None and evidence < MIN_SIGNAL_EVIDENCE:
         return (
-            f"too noisy: the difference from the reference breaks reciprocity by {percent(error)}, as noise alone "
-            "would. Average more frames, or use more current."
+            f"too noisy: the difference from the reference breaks reciprocity by {percent(error)}, as noise alone does "
+            "(141 %, less with few channels). Average more frames, or use more current; and check that its channels "
+            "and drives are in the order of the reference's."
         )
     return ""
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Inexact, UInt8
 
 from jeit.arguments import object_html, object_text, percent, picture
 from jeit.data import Measurement
-from jeit.data.frame_checks import MOST_RECIPROCITY_ERROR, FrameQuality
+from jeit.data.frame_checks import FrameQuality
 from jeit.electrodes import AbstractElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import Inclusion, Raster, SolidForm
@@ -100,10 +100,15 @@ class ImagedDifference:
                 f"ImagedDifference({self.measurement.name!r}, by {self.settings.method}: "
                 f"{len(self.inclusions)} inclusions in {self.mesh.num_cells} cells,\n"
                 f"  background {complex(self.calibration.conductivity).real:.3g}, "
-                f"misfit {percent(float(self.calibration.misfit))})"
+                f"misfit {percent(float(self.calibration.misfit))}"
+                f"{self._doubts_text})"
             ),
             self,
         )
+
+    @property
+    def _doubts_text(self) -> str:
+        return f";\n  doubts: {' '.join(self.doubts)}" if self.doubts else ""
 
     def _repr_png_(self) -> bytes | None:
         return picture(self)
@@ -153,13 +158,7 @@ class ImagedDifference:
         that did not converge, voltages not explained by the image, or bodies whose kind the data do not determine."""
         reconstruction = self.reconstruction
         doubts = doubts_of_data(self.measurement, self.reference, self.calibration)
-        error = self.quality.difference_reciprocity_error
-        if error is not None and error > MOST_RECIPROCITY_ERROR:
-            doubts.append(
-                f"the difference from the reference breaks reciprocity by {percent(error)}, so that its noise exceeds "
-                "half its signal: bodies may be missed, or shown where none are. Average more frames, or use more "
-                "current."
-            )
+        doubts += [self.quality.doubt] if self.quality.doubt else []
         if isinstance(reconstruction, LinearReconstruction):
             return tuple(doubts)
         if isinstance(reconstruction, Reconstruction) and reconstruction.status != Status.CONVERGED:

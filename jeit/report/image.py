@@ -192,7 +192,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
         else {
             "standard_deviation": noise.standard_deviation,
             "unit": "V",
-            "relative_to_difference": noise.relative,
+            "relative_to_difference": noise.relative if quality.noise_share is None else quality.noise_share,
             "method": noise.method,
         },
         "unlike_electrodes": {electrode + 1: ratio for electrode, ratio in result.unlike_electrodes.items()},

@@ -156,9 +156,37 @@ def test_noise_in_the_difference_is_refused(tank, setup):
     (quality,) = data.check_imageable(as_much, reference)
     assert quality.difference_reciprocity_error == pytest.approx(1, rel=0.2)
     too_much = data.screen(other + 5 * noise, chosen, **setup(16))
-    with pytest.raises(ValueError, match=r"breaks reciprocity .* as noise alone would"):
+    with pytest.raises(ValueError, match=r"breaks reciprocity .* as noise alone does"):
         data.check_imageable(too_much, reference)
     assert [q.imageable for q in assess(too_much, reference)] == [False]
+
+
+def test_noise_of_one_electrode_is_attributed_to_it_and_a_common_factor_does_not_hide_noise(tank, setup):
+    chosen, rng = protocol.adjacent(16), np.random.default_rng(9)
+    clean, other = tank(chosen), tank(chosen, change=0.02)
+    reference = data.screen(clean, chosen, **setup(16))
+    loose = np.asarray(chosen.channel_measurement)[:, 4] != 0
+    (quality,) = assess(data.screen(other * (1 + 0.1 * loose * rng.normal(size=208)), chosen, **setup(16)), reference)
+    assert quality.noisy_electrode == 4
+    assert "most of it in the channels of electrode 5" in quality.doubt
+    noisy = clean * (1 + 0.02 * rng.normal(size=208))
+    for factor in (1.0, 1.1, 2.0):
+        (quality,) = assess(data.screen(factor * noisy, chosen, **setup(16)), reference)
+        assert quality.noise_share > 0.9
+        assert quality.noisy_electrode is None
+        assert "shown where none are" in quality.doubt
+    (quality,) = assess(data.screen(1.1 * other, chosen, **setup(16)), reference)
+    assert quality.noise_share < 1e-6
+    assert not quality.doubt
+
+
+def test_channels_in_another_order_than_in_the_reference_are_refused_with_that_cause(tank, setup):
+    chosen = protocol.adjacent(16)
+    reference = data.screen(tank(chosen), chosen, **setup(16))
+    drives = np.asarray(chosen.drive_index)
+    order = np.concatenate([np.flatnonzero(drives == drive)[::-1] for drive in range(16)])
+    (quality,) = assess(data.screen(tank(chosen, change=0.02)[order], chosen, **setup(16)), reference)
+    assert "in the order of the reference's" in quality.reason
 
 
 @pytest.mark.parametrize("driven_electrodes", [False, True])

@@ -234,7 +234,7 @@ def test_where_electrodes_do_not_distinguish_the_kind_of_a_body_it_is_doubted_an
         mask=np.ones((1, 2), bool), voltages=np.ones((1, 2)), notes=(), electrodes=None, domain=None
     )
     whole = SimpleNamespace(measurement=frame, reference=frame)
-    quality = SimpleNamespace(difference_reciprocity_error=0.01)
+    quality = SimpleNamespace(doubt="")
     image: Any = SimpleNamespace(
         shapes=shapes, reconstruction=shapes, calibration=calibration, quality=quality, **vars(whole)
     )

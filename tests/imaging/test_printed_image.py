@@ -52,7 +52,7 @@ def test_faults_have_rows_of_their_own(imaged, printed):
     assert rows == [*USUAL, "note", "wiring"]
     assert "electrodes 3 and 7 look exchanged" in text
     assert "at 3 (2.5 times): what reads them counts less" in text
-    text, rows = printed(quality=replace(imaged.quality, rounding=0.012, difference_noise=None))
+    text, rows = printed(quality=replace(imaged.quality, rounding=0.012, difference_noise=None, noise_share=None))
     assert rows == [*USUAL[:3], "rounding", *USUAL[3:]]
     assert "noise in it not known" in text
     assert "1.2 % of the difference: voltages have few digits" in text

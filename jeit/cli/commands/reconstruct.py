@@ -180,7 +180,7 @@ def show(console, result: "ImagedDifference", *, frame_given: bool = False) -> N
 
     calibration, reconstruction = result.calibration, result.reconstruction
     unit = "S" if result.mesh.dimension == 2 else "S/m"
-    noise = result.quality.difference_noise
+    noise, share = result.quality.difference_noise, result.quality.noise_share
     hyperparameter = float(reconstruction.hyperparameter)
     choice_text = "none" if result.chosen_by == "none" else f"{hyperparameter:.3g} ({result.chosen_by})"
     background = np.asarray(calibration.conductivity).item()
@@ -188,10 +188,12 @@ def show(console, result: "ImagedDifference", *, frame_given: bool = False) -> N
     background_text += (
         f" and {with_unit(background.imag, unit)} of susceptivity" if isinstance(background, complex) else ""
     )
+    noise_text = "not known" if noise is None else f"{percent(noise.relative)}, from {noise.method}"
+    noise_text = noise_text if share is None else f"{percent(share)}, from reciprocity"
     rows = [
         ("background", f"{background_text}, misfit {percent(float(calibration.misfit))}"),
         ("difference", f"{percent(result.quality.difference)} of the reference"),
-        ("noise in it", "not known" if noise is None else f"{percent(noise.relative)}, from {noise.method}"),
+        ("noise in it", noise_text),
         ("method", f"{result.settings.method}, hyperparameter {choice_text}"),
         ("mesh", f"{counted(result.mesh.num_points, 'node')}, {counted(result.mesh.num_cells, 'cell')}"),
     ]

@@ -30,10 +30,9 @@ _MIN_CHANNELS = 0.5
 _MIN_SATURATED = 3
 # Relative difference within which the undisturbed voltages of these channels count as equal.
 _EQUAL_EXPECTED = 1e-6
-# A frame differs from an undisturbed frame by more than noise if the correlation of the changes of reciprocal channels
-# exceeds that of independent noise. Threshold in standard deviations; minimum number of pairs; relative change below
-# which a frame counts as equal to an undisturbed frame.
-_CORRELATION_THRESHOLD, _MIN_PAIRS, _EQUAL_TOLERANCE = 3.0, 10, 1e-12
+# Minimum evidence that a frame differs from an undisturbed frame by more than noise, in standard deviations; minimum
+# number of pairs; relative change below which a frame counts as equal to an undisturbed frame.
+_MIN_EVIDENCE, _MIN_PAIRS, _EQUAL_TOLERANCE = 3.0, 10, 1e-12
 
 
 class FrameStatus(StrEnum):
@@ -103,10 +102,10 @@ class FrameCheck:
             (self.pair_weights * change[self.first])[pair_is_usable],
             (self.pair_weights * change[self.second] / self.ratio)[pair_is_usable],
         )
-        correlation = (
-            2 * (first_changes @ second_changes) / (first_changes @ first_changes + second_changes @ second_changes)
-        )
-        if correlation * np.sqrt(len(first_changes)) > _CORRELATION_THRESHOLD:
+        # As in `jeit.data.quality.signal_evidence`: differences of reciprocal channels contain noise, sums also signal.
+        noise_power = np.sum((first_changes - second_changes) ** 2)
+        power = np.sum((first_changes + second_changes) ** 2)
+        if (power - noise_power) * np.sqrt(len(first_changes)) > 2 * _MIN_EVIDENCE * noise_power:
             return ""
         return "Nothing but noise: reciprocal channels change alike as by chance."
 
