@@ -87,7 +87,9 @@ def test_the_contrast_is_explored_once_for_each_material(ellipsoids, monkeypatch
     monkeypatch.setattr(quantities, "explore_contrast", explore)
     monkeypatch.setattr(quantities, "quantify", quantify)
     monkeypatch.setattr(quantities, "centroid_radius", lambda *_: 0.0)
-    problem: Any = SimpleNamespace(fit=lambda bodies, coefficients, steps: Fit(bodies, coefficients, 1.0, ROWS))
+    problem: Any = SimpleNamespace(
+        fit=lambda bodies, coefficients, steps: Fit(bodies, coefficients, 1.0, ROWS), misfit=lambda fit: 0.9
+    )
     fit = Fit(same, point, 1.0, ROWS)
     found = quantities.with_quantities(problem, fit, Accuracy(np.ones(3)), [0.1, 0.2, 0.3], [2, 0, 1])  # pyright: ignore
     materials = [(one.change, one.change_interval, one.measure) for one in found]

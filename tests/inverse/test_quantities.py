@@ -77,6 +77,24 @@ def test_quantities_of_a_fitted_body_and_wider_intervals_by_model_errors(monkeyp
     assert radii[1] > 1.2 * radii[0] > 0
 
 
+def test_errors_that_nothing_explains_widen_intervals():
+    """Of data with ten times the noise that is stated, intervals are as wide as where the true noise is stated."""
+    model = ForwardModel(DISK.mesh(num_points=500), DESCRIBED, PROTOCOL)
+    inside = np.linalg.norm(np.asarray(centroids(model.mesh)) - [0.02, 0.035], axis=1) < 0.025
+    voltages = np.asarray(model.voltages(SIGMA * np.where(inside, 3.0, 1.0)))
+    noise = 0.02 * np.abs(voltages)
+    voltages = voltages + noise * np.random.default_rng(0).normal(size=len(voltages))
+    widths = []
+    for stated in (noise, 0.1 * noise):
+        found = reconstruct_shapes(
+            model, voltages, SIGMA, start=[(1, (0.02, 0.03), 0.02)], noise=noise, prior=StarPrior(modes=1),
+            accuracy=Accuracy(stated),
+        )  # fmt: skip
+        low, high = found.bodies[0].quantities.strength_interval
+        widths.append(high - low)
+    assert widths[1] == pytest.approx(widths[0], rel=0.2)
+
+
 def test_a_body_fitted_with_the_other_sign_has_quantities():
     """Of a resistive disc for which a conductive body is fitted, whose contrast is then negative."""
     model = ForwardModel(DISK.mesh(num_points=300), DESCRIBED, PROTOCOL)

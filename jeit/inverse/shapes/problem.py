@@ -155,6 +155,16 @@ class ShapeProblem:
     rtol: float = 3e-3
     recent_fields: _RecentFields = field(default_factory=_RecentFields, compare=False)
 
+    def misfit(self, fit: Fit) -> float:
+        """Misfit of the voltages of a `fit` in standard deviations of the data, errors of the data included."""
+        residual = fit.rows[0][: len(self.data.voltages)]
+        return float(np.sqrt(residual @ np.asarray(self.data.precision) @ residual / len(residual)))
+
+    def with_scaled_errors(self, factor: float) -> ShapeProblem:
+        """Copy of the problem with all errors of the data multiplied by a `factor`."""
+        new_matrices = (factor**2 * np.asarray(self.data.covariance), np.asarray(self.data.precision) / factor**2)
+        return replace(self, data=eqx.tree_at(lambda data: (data.covariance, data.precision), self.data, new_matrices))
+
     def with_errors(self, rows: Float[np.ndarray, "r q"]) -> ShapeProblem:
         """Copy of the problem with further errors of the data: `rows` (r, q) are the errors of the r weighted voltages
         per unit of each of q coefficients of unit variance."""

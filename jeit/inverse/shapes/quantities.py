@@ -88,6 +88,9 @@ def with_quantities(
         problem = problem.with_errors(np.asarray(problem.data.weight)[:, None] * rows)
     shown_centroids = [fit.bodies.body(int(k), fit.coefficients).centroid for k in order]
     fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
+    if (misfit := problem.misfit(fit)) > 1:  # the errors are larger than assumed, whatever their cause
+        problem = problem.with_scaled_errors(misfit)
+        fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
     materials = np.unique(fit.bodies.first).tolist()
     explored = dict(
         zip(materials, results_for(fit.bodies, lambda k: explore_contrast(problem, fit, k), materials), strict=True)
