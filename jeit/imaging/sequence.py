@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jeit.data import Measurement
-from jeit.data.frame_checks import check_same_setup, mask_spikes
+from jeit.data.frame_checks import assess, check_same_setup, mask_spikes
 from jeit.files import check_memory
 from jeit.image.image_series import ImageSeries
 from jeit.imaging.calibration import Clock
@@ -38,6 +38,8 @@ from jeit_solvers.engines import as_array
 _BATCH, _VALUE_BYTES = 256, 4
 # Minimum share of the frames with a valid value of a channel for the channel to be used.
 _MIN_FRAME_SHARE = 0.5
+# Number of frames, those that differ most from the reference, among which one that can be imaged is searched.
+_NUM_CANDIDATES = 10
 
 
 @dataclass(frozen=True)
@@ -91,9 +93,11 @@ def image_sequence(
     - `progress`: function called with the name of each step when the step begins.
 
     Spikes in single channels are replaced by values that other channels determine (`jeit.data.mask_spikes`). Channels
-    missing in more than half of the frames are not used; frames that lack any of the used channels are refused. The
-    images need four bytes per cell and frame. Raises `ValueError` in the same cases as `image_difference`, for a
-    measurement with one frame, for an iterative method, and for images that would not fit in memory.
+    missing in more than half of the frames are not used; frames that lack any of the used channels are refused. Frames
+    that cannot be imaged (`jeit.data.check_imageable`), such as frames of noise, are refused if they differ more from
+    the reference than all frames that can be imaged. The images need four bytes per cell and frame. Raises `ValueError`
+    in the same cases as `image_difference`, for a measurement with one frame, for an iterative method, and for images
+    that would not fit in memory.
 
     **Example:**
 
@@ -123,10 +127,17 @@ def image_sequence(
     if not is_common.any() or refused.all():
         raise ValueError(f"'{measurement.name}': no channel is usable in most frames, or none has all of them.")
     total_change = np.abs(np.where(is_common, voltages - expected, 0)).sum(axis=1)
-    strongest = int(np.argmax(np.where(refused, -1, total_change)))
-    usable = measurement.masked(is_common, "they are missing in most frames, or in the reference.")
+    if not is_common.all():
+        measurement = measurement.masked(is_common, "they are missing in most frames, or in the reference.")
+    strongest_first = np.argsort(np.where(refused, 1.0, -total_change), kind="stable")[: (~refused).sum()]
+    for number, index in enumerate(strongest_first[:_NUM_CANDIDATES]):
+        if assess(measurement.frame(int(index)), base)[0].imageable:
+            refused[strongest_first[:number]] = True
+            strongest_first = strongest_first[number:]
+            break
+    strongest = int(strongest_first[0])
     prepared = prepare_difference(
-        usable if not is_common.all() else measurement,
+        measurement,
         base,
         frame=strongest,
         contact=settings.contact,

@@ -94,6 +94,17 @@ def test_frames_with_missing_channels_are_refused_and_channels_missing_in_most_a
     assert not np.asarray(found.reconstruction.matrix)[:, 40].any()
 
 
+def test_a_frame_of_noise_does_not_refuse_the_others():
+    noise = EMPTY * (1 + 0.2 * np.random.default_rng(0).normal(size=EMPTY.shape))
+    found = image_sequence(tank(FULL, noise, EMPTY), tank(EMPTY), SETTINGS)
+    assert found.refused.tolist() == [False, True, False]
+    assert np.isnan(found.series.changes[1]).all()
+    expected = image_difference(tank(FULL), tank(EMPTY), SETTINGS).change
+    np.testing.assert_allclose(found.series.changes[0], expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
+    with pytest.raises(ValueError, match="as noise alone does"):
+        image_sequence(tank(noise, noise), tank(EMPTY), SETTINGS)
+
+
 def test_the_change_between_two_frequencies_is_relative_to_that_of_the_whole_body():
     """Unless the weight is left out: then it is the plain difference. The first frequency is the mean of its frames."""
     first, second = tank(0.9 * EMPTY, 1.1 * EMPTY), tank(EMPTY, 1.25 * FULL)
