@@ -11,6 +11,7 @@ import numpy as np
 from jeit.arguments import counted, percent
 from jeit.data import Measurement, estimate_noise, impossible_signs, reciprocity_error
 from jeit.data.frame_checks import MOST_RECIPROCITY_ERROR
+from jeit.data.quality import rounding_deviation
 from jeit.forward import ForwardModel
 from jeit.imaging import imaging_mesh
 from jeit.imaging.hyperparameter_rules import ComparedRules, RuleOutcome
@@ -43,7 +44,7 @@ def report_measurement(measurement: Measurement) -> dict[str, Any]:
     report_measurement(pressed)
     ```
     """
-    protocol, noise, signs = measurement.protocol, estimate_noise(measurement), impossible_signs(measurement)
+    protocol, signs = measurement.protocol, impossible_signs(measurement)
     content = {
         **describe_measurement(measurement),
         "frames": measurement.num_frames,
@@ -57,11 +58,22 @@ def report_measurement(measurement: Measurement) -> dict[str, Any]:
         "body": describe_domain(measurement.domain),
         "electrodes": {**describe_electrodes(measurement.electrodes), "number": protocol.num_electrodes},
         "reciprocity_error": reciprocity_error(measurement),
-        "noise": None if noise is None else {"standard_deviation": noise.standard_deviation, "method": noise.method},
+        "noise": _report_noise(measurement),
         "impossible_signs": None if signs is None else float(signs.max()),
         "wiring": _describe_wiring(measurement),
     }
     return as_plain_values(content)
+
+
+def _report_noise(measurement: Measurement) -> dict[str, Any] | None:
+    """Noise of a voltage and the method of its estimate; the rounding of the first frame if it is larger, because
+    reciprocal voltages are rounded in the same way."""
+    noise = estimate_noise(measurement)
+    voltages, mask = np.asarray(measurement.voltages)[0], np.asarray(measurement.mask)[0]
+    rounding = float(np.median(rounding_deviation(voltages, mask)[mask])) if mask.any() else 0.0
+    if rounding > (0 if noise is None else noise.standard_deviation):
+        return {"standard_deviation": rounding, "method": "rounding"}
+    return None if noise is None else {"standard_deviation": noise.standard_deviation, "method": noise.method}
 
 
 def _describe_wiring(measurement: Measurement) -> str | None:

@@ -314,6 +314,13 @@ def test_rounding_deviation_is_that_of_the_rounded_voltages(to):
     assert not rounding_deviation(voltages, np.ones(208, bool)).any()
 
 
+def test_rounding_is_reported_as_noise_where_reciprocity_does_not_show_it(tank):
+    chosen = protocol.adjacent(16)
+    seen = 1e-5 * np.round(tank(chosen) / 1e-5)
+    noise = report_measurement(data.screen(seen, chosen))["noise"]
+    assert noise == {"standard_deviation": pytest.approx(1e-5 / np.sqrt(12)), "method": "rounding"}
+
+
 def test_masked_voltages_do_not_hide_rounding():
     voltages = rounded(np.random.default_rng(1).normal(size=100), 2)
     voltages[3], mask = np.pi, np.arange(100) != 3
