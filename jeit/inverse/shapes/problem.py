@@ -158,7 +158,8 @@ class ShapeProblem:
     def misfit(self, fit: Fit) -> float:
         """Misfit of the voltages of a `fit` in standard deviations of the data, errors of the data included."""
         residual = fit.rows[0][: len(self.data.voltages)]
-        return float(np.sqrt(residual @ np.asarray(self.data.precision) @ residual / len(residual)))
+        # The form is negative by rounding where errors that the model explains exceed all others many times.
+        return float(np.sqrt(max(residual @ np.asarray(self.data.precision) @ residual, 0.0) / len(residual)))
 
     def with_scaled_errors(self, factor: float) -> ShapeProblem:
         """Copy of the problem with all errors of the data multiplied by a `factor`."""
