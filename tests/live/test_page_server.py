@@ -3,6 +3,7 @@
 Pictures are decoded here as by the page, and compared with the arrays that they were made from.
 """
 
+import contextlib
 import http.client
 import json
 import socket
@@ -100,12 +101,10 @@ def idle() -> Any:
 
 def answer(address, path="/", method="GET", **headers):
     """Status, headers and text that the server answers."""
-    connection = http.client.HTTPConnection("127.0.0.1", address.port, timeout=5)
-    connection.request(method, path, headers={name.title(): value for name, value in headers.items()})
-    response = connection.getresponse()
-    text = response.read().decode()
-    connection.close()
-    return response.status, response.headers, text
+    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", address.port, timeout=5)) as connection:
+        connection.request(method, path, headers={name.title(): value for name, value in headers.items()})
+        response = connection.getresponse()
+        return response.status, response.headers, response.read().decode()
 
 
 def page(address, *, host=None, origin=None, query=""):
