@@ -1,19 +1,23 @@
-"""Conversion of raw voltages to a `Measurement`: unusable voltages are masked, and the notes state the reason."""
+"""Conversion of raw voltages to a `Measurement`: unusable voltages, and spikes in single channels, are masked, and the
+notes state the reason."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Inexact
 from numpy.typing import ArrayLike
 
-from jeit.arguments import measurable_values
+from jeit.arguments import counted, measurable_values
+from jeit.data.frame_checks import rounding_of_difference
 from jeit.data.measurement import Measurement
 from jeit.data.quality import order_note
 from jeit.electrodes import AbstractElectrodes
+from jeit.inverse import relative_noise
 from jeit.mesh import Body, Mesh
 from jeit.protocol import Protocol
+from jeit_solvers.engines import as_array
 
 # Maximum number of superfluous columns, such as times, that an error about the shape suggests as the cause.
 _MAX_EXTRA_COLUMNS = 4
@@ -21,6 +25,19 @@ _MAX_EXTRA_COLUMNS = 4
 _MAX_VOLTAGE = 1000.0
 # Minimum number of equal extreme values that count as saturated.
 _MIN_SATURATED = 4
+# Minimum deviation of a spike from the value that the other channels imply, in robust standard deviations; minimum
+# fraction of the unexplained power that a spike explains; maximum number of spikes in a frame. The deviation of a spike
+# must also exceed the typical change of a channel.
+_SPIKE_DEVIATIONS, _SPIKE_SHARE, _MAX_SPIKES = 10.0, 0.5, 8
+# Of two channels that contradict each other, one is faulty if its change is larger than the change of the other channel
+# by this factor.
+_FAULT_RATIO = 3.0
+# Minimum fraction of a channel that the other channels leave undetermined; smaller fractions are rounding errors.
+_MIN_FREE_SHARE = 1e-6
+# Maximum number of operations to find which voltage changes a body can cause; the search takes up to a second.
+_MAX_OPERATIONS = 2e9
+# Maximum number of distinct masks of frames for which the possible voltage changes are found.
+_MAX_MASKS = 8
 
 
 def screen(
@@ -198,3 +215,136 @@ def _drives_without_and_with_current(
         return np.zeros(largest.shape, dtype=bool), largest >= 0
     threshold = 1e-3 * np.median(np.maximum(largest, 0), axis=1, keepdims=True)
     return (largest >= 0) & (largest < threshold), largest >= threshold
+
+
+def mask_spikes(measurement: Measurement, reference: Measurement, *, fill: bool = False) -> Measurement:
+    """Mask spikes: single channels of a frame whose change from the mean of `reference` contradicts the changes of all
+    other channels. A note lists the masked channels.
+
+    The voltages of every body follow from its symmetric transfer impedance, which has fewer entries than most protocols
+    have channels. The part of a frame's change that no symmetric matrix explains is noise, or a spike if one channel
+    contributes more to this part than all other channels together. If it remains unknown which of two reciprocal
+    channels is faulty, both are masked. No spikes are found in protocols whose channels are all independent, and in
+    protocols of more than about 40 electrodes, for which the search would take too long.
+
+    **Arguments:**
+
+    - `measurement`: the frames.
+    - `reference`: frames of the undisturbed body, from the same set-up.
+    - `fill`: replace spikes by the values that the other channels determine, and mask only spikes that they do not
+      determine.
+
+    **Example:**
+
+    ```python
+    clean = mask_spikes(pressed, rest)
+    ```
+    """
+    mean = reference.mean_frame()
+    base_voltages, known_channels = np.asarray(mean.voltages)[0], np.asarray(mean.mask)[0]
+    weight = np.asarray(
+        relative_noise(as_array(np.abs(np.where(known_channels, base_voltages, 0))), as_array(known_channels))
+    )
+    voltages, masks = np.array(measurement.voltages), np.asarray(measurement.mask)
+    spikes, is_filled = np.zeros(masks.shape, bool), np.zeros(masks.shape, bool)
+    distinct_masks, mask_index, num_frames = np.unique(
+        masks & known_channels, axis=0, return_inverse=True, return_counts=True
+    )
+    for index in np.argsort(-num_frames)[:_MAX_MASKS]:
+        mask = distinct_masks[index]
+        basis = _possible_changes(measurement, weight, mask)
+        if basis is None:
+            continue
+        for frame in np.flatnonzero(mask_index.ravel() == index):
+            change = ((voltages[frame] - base_voltages) / weight)[mask]
+            rounding = rounding_of_difference(measurement.frame(int(frame)), mean) / weight
+            is_spike = np.isin(np.arange(len(change)), _spikes(change, basis, rounding[mask]))
+            spikes[frame, mask] = is_spike
+            if fill and is_spike.any():
+                # A channel is determined by the other channels if their rows of the basis span its row.
+                weights = basis[is_spike] @ np.linalg.pinv(basis[~is_spike])
+                is_determined = np.linalg.norm(weights @ basis[~is_spike] - basis[is_spike], axis=1) < _MIN_FREE_SHARE
+                determined_channels = np.flatnonzero(mask)[is_spike][is_determined]
+                voltages[frame, determined_channels] = (
+                    base_voltages[determined_channels]
+                    + weight[determined_channels] * (weights @ change[~is_spike])[is_determined]
+                )
+                is_filled[frame, determined_channels] = True
+    reason = f"spikes, which contradict the other channels ({_listed_spikes(spikes)})."
+    if is_filled.any():
+        note = f"{counted(int(is_filled.sum()), 'voltage')} replaced by what others determine: {reason}"
+        measurement = replace(measurement, voltages=voltages, notes=(*measurement.notes, note))
+    return measurement.masked(~spikes | is_filled, reason) if (spikes & ~is_filled).any() else measurement
+
+
+def _listed_spikes(spikes: Bool[np.ndarray, "F M"]) -> str:
+    """Text that lists the channels with spikes, and their frames if there are several frames."""
+    frames, channels = np.nonzero(spikes)
+    labels = [
+        f"channel {k + 1}" + (f" of frame {f}" if len(spikes) > 1 else "")
+        for f, k in zip(frames, channels, strict=True)
+    ]
+    return ", ".join(labels[:_MAX_SPIKES]) + (" …" if len(labels) > _MAX_SPIKES else "")
+
+
+def _possible_changes(
+    measurement: Measurement, weight: Float[np.ndarray, " M"], mask: Bool[np.ndarray, " M"]
+) -> Float[np.ndarray, "n r"] | None:
+    """Orthonormal basis (n, r) of the r-dimensional space of changes of the n usable channels, divided by `weight`,
+    that a change of a symmetric transfer impedance can cause. None if every change is possible, or if the computation
+    would take too long."""
+    drive = np.asarray(measurement.protocol.channel_drive)[mask]
+    measurements = np.asarray(measurement.protocol.channel_measurement)[mask]
+    row, column = np.triu_indices(drive.shape[1])
+    if len(drive) * len(row) * min(len(drive), len(row)) > _MAX_OPERATIONS or not len(drive):
+        return None
+    drive = drive / np.abs(drive).max()
+    products = drive[:, row] * measurements[:, column] + drive[:, column] * measurements[:, row]
+    basis, size, _ = np.linalg.svd(products / weight[mask, None], full_matrices=False)
+    basis = basis[:, size > 1e-9 * size[0]]
+    return basis if basis.shape[1] < len(drive) else None
+
+
+def _spikes(
+    change: Inexact[np.ndarray, " n"], basis: Float[np.ndarray, "n r"], rounding: Float[np.ndarray, " n"]
+) -> list[int]:
+    """Indices of the channels with spikes in a weighted `change` (n,) of n channels; `rounding` (n,): standard
+    deviation of the change due to rounding.
+
+    If a suspected channel may have any value, its unit vector is added to the basis. The power that this vector
+    explains, `gain`, is compared with the power that the basis alone leaves unexplained.
+    """
+    residual, free_share = change - basis @ (basis.T @ change), 1 - np.sum(basis**2, axis=1)
+    is_remaining, faulty, spikes = np.ones(len(change), bool), [], []
+    for _ in range(_MAX_SPIKES):
+        is_contradicted = is_remaining & (free_share > _MIN_FREE_SHARE)
+        size = np.where(is_contradicted, np.abs(residual) / np.sqrt(np.maximum(free_share, _MIN_FREE_SHARE)), 0)
+        worst_channels = np.flatnonzero(size > (1 - _MIN_FREE_SHARE) * size.max())
+        if not 0 < len(worst_channels) <= 2:
+            break
+        deviation = max(1.4826 * float(np.median(size[is_contradicted])), float(rounding[worst_channels].max()))
+        if not size.max() > _SPIKE_DEVIATIONS * deviation:
+            break
+        direction = np.zeros(len(change))
+        direction[worst_channels[0]] = 1
+        for _ in range(2):  # projected twice, so that rounding errors do not destroy orthogonality
+            direction = direction - basis @ (basis.T @ direction)
+        direction = direction / np.linalg.norm(direction)
+        unexplained_power, gain = float(np.sum(np.abs(residual) ** 2)), float(np.abs(direction @ residual) ** 2)
+        deviation_size = float((size[worst_channels] / np.sqrt(free_share[worst_channels])).max())
+        basis = np.column_stack([basis, direction])
+        residual, free_share = residual - direction * (direction @ residual), free_share - direction**2
+        faulty += _faulty_channels(change, worst_channels)
+        is_remaining[worst_channels] = False
+        typical_change = float(np.sqrt(np.mean(np.abs(change[is_remaining]) ** 2)))
+        if deviation_size > typical_change and gain > _SPIKE_SHARE * unexplained_power:
+            spikes = [*faulty]
+    return spikes
+
+
+def _faulty_channels(change: Inexact[np.ndarray, " n"], channels: np.ndarray) -> list[int]:
+    """Return the faulty channels among one or two channels that contradict the other channels or each other: the
+    channel with the far larger change, or both channels if their changes are similar."""
+    size = np.abs(change[channels])
+    is_single = size.max() > _FAULT_RATIO * size.min()
+    return [int(channels[size.argmax()])] if is_single else channels.tolist()

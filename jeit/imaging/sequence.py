@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from jeit.data import Measurement
-from jeit.data.frame_checks import assess, check_same_setup, mask_spikes
+from jeit.data.frame_checks import assess, check_same_setup
+from jeit.data.screening import mask_spikes
 from jeit.files import check_memory
 from jeit.image.image_series import ImageSeries
 from jeit.imaging.calibration import Clock

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jeit import data
-from jeit.data.frame_checks import mask_spikes
+from jeit.data.screening import mask_spikes
 from jeit.inverse import relative_noise
 from jeit.mesh import Disk
 

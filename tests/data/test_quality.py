@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from jeit import data, protocol
-from jeit.data.frame_checks import MIN_SIGNAL_EVIDENCE, assess, mask_spikes
+from jeit.data.frame_checks import MIN_SIGNAL_EVIDENCE, assess
 from jeit.data.inferred_properties import channel_gains
 from jeit.data.quality import channel_reciprocity_error, expected_signs, rounding_deviation, signal_evidence
+from jeit.data.screening import mask_spikes
 from jeit.inverse import relative_noise
 from jeit.report.hyperparameter_rules import report_measurement
 

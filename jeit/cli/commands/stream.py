@@ -121,7 +121,7 @@ def stream(
     from jeit.cli.console import Steps, plain_console, say_written, with_unit
     from jeit.cli.streams import FrameCounter, Stopping
     from jeit.data.formats.lines import LineParser, read_lines
-    from jeit.data.frame_checks import mask_spikes
+    from jeit.data.screening import mask_spikes
     from jeit.imaging.stream_preparation import StreamSettings, frames_of, prepare_imager
     from jeit.inverse import stream as stream_images
     from jeit.inverse.nonlinear.solvers import SOLVERS, frame_solvers
