@@ -185,6 +185,23 @@ def test_other_weights_of_the_data_keep_the_smooth_field():
     np.testing.assert_allclose(volts, np.diag(1 / weights[1] ** 2) + 0.25 * jacobian @ jacobian.T, rtol=1e-12)
 
 
+def test_errors_are_scaled_to_the_misfit_of_a_fit():
+    """A misfit is in standard deviations, and after scaling by it, it is one. Rounding makes no misfit negative."""
+    random = np.random.default_rng(1)
+    root, residual = random.normal(size=(4, 4)), 3 * random.normal(size=4)
+    covariance = np.eye(4) + root @ root.T
+    problem = ShapeProblem(None, Data(np.zeros(4), np.ones(4), covariance, np.linalg.inv(covariance), 0.0), np.ones(2))  # pyright: ignore
+    fit: Any = SimpleNamespace(rows=(np.append(residual, 9.0), None))  # one pair of bodies follows the channels
+    misfit = problem.misfit(fit)
+    assert misfit == pytest.approx(np.sqrt(residual @ np.linalg.solve(covariance, residual) / 4))
+    scaled = problem.with_scaled_errors(misfit)
+    assert scaled.misfit(fit) == pytest.approx(1)
+    np.testing.assert_allclose(scaled.data.covariance, misfit**2 * covariance)
+    np.testing.assert_allclose(scaled.data.precision @ scaled.data.covariance, np.eye(4), atol=1e-12)
+    rounded = replace(problem, data=replace(problem.data, precision=-1e-16 * np.eye(4)))
+    assert rounded.misfit(fit) == 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("change", "radius"), [(0.5, 0.027), (2.0, 0.025), (-0.5, 0.02), (9.0, 0.012)])
 def test_quantities_in_a_tank_that_differs_from_its_description(change, radius):

@@ -7,6 +7,7 @@ from jeit.electrodes import PointElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse import Gaussian, Imager, Parametrisation, TotalVariation, reconstruct, stream
 from jeit.inverse.nonlinear import GaussNewton, LevenbergMarquardt, OneStep, Scale
+from jeit.inverse.streaming.stream import FrameCheck, FrameStatus
 from jeit.layout import ring
 from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
@@ -449,3 +450,15 @@ def test_bad_input(change, message, model, options):
 def test_one_frame_is_not_a_stream(few, imager):
     with pytest.raises(ValueError, match=r"\[frame\]"):
         list(stream(imager, few[0]))
+
+
+def test_a_frame_of_noise_alone_is_distinguished_from_a_small_signal_in_larger_noise():
+    """By 100 pairs of reciprocal channels with noise of one, and a signal of 0.7 in both channels of each pair."""
+    random = np.random.default_rng(0)
+    noise, pairs = random.normal(size=200), np.arange(200).reshape(2, 100).T
+    signal = np.tile(0.7 * random.choice([-1.0, 1.0], 100), 2)
+    expected = np.full(200, 1e3)
+    check = FrameCheck(np.ones(200, bool), expected, np.zeros((1, 200), bool), (pairs, np.ones(100)), np.ones(200))
+    assert check(expected + noise)[2] == FrameStatus.UNCHANGED
+    assert "Nothing but noise" in check(expected + noise)[3]
+    assert check(expected + signal + noise)[2] != FrameStatus.UNCHANGED
