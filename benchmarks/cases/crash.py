@@ -75,7 +75,7 @@ def _survive_all(folder: Path, kills: int, random: np.random.Generator, *, quick
             yield survive_resumed(command, kills, random), command
     kills = min(kills, FEWER)
     commands = tank(folder / "tank")
-    for one in ("stream",) if quick else ("stream", "reconstruct", "compiling"):
+    for one in ("reconstruct",) if quick else ("stream", "reconstruct", "compiling"):
         yield survive_anew(commands[one], kills, random), commands[one]
     if not quick:
         watched = watch(folder / "sheet")
