@@ -70,6 +70,8 @@ class SolidForm(Module):
 # volume as a fraction of a solid (a ball with an eighth of the solid's width). Images of solids have a coarser
 # resolution.
 _LEAST_AREA = {2: 0.004, 3: 0.001}
+# Default minimum peak of an inclusion as a multiple of the noise of the image.
+LEAST_SIGNIFICANCE = 5.5
 
 
 class Inclusion(Module):
@@ -137,7 +139,7 @@ def find_inclusions(
     least_prominence: float = 0.1,
     least_area: float | None = None,
     noise: Float[Array, " m"] | None = None,
-    least_significance: float = 5.5,
+    least_significance: float = LEAST_SIGNIFICANCE,
 ) -> list[Inclusion]:
     """Find inclusions: the peaks of an image, each with the surrounding region where the change exceeds `level` times
     the peak. The strongest inclusion comes first. Peaks below the minimum values in the arguments are regarded as
@@ -219,7 +221,7 @@ def inclusion_regions(
     least_prominence: float = 0.1,
     least_area: float | None = None,
     noise: Float[Array, " m"] | None = None,
-    least_significance: float = 5.5,
+    least_significance: float = LEAST_SIGNIFICANCE,
 ) -> list[tuple[Inclusion, Bool[np.ndarray, " m"]]]:
     """Return the inclusions of `find_inclusions`, each with a mask (m,) of the cells of its region. Raises `ValueError`
     as `find_inclusions` does."""

@@ -18,13 +18,13 @@ from jeit.data.frame_checks import FrameQuality
 from jeit.electrodes import AbstractElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import Inclusion, Raster, SolidForm
-from jeit.image.inclusions import inclusion_regions
+from jeit.image.inclusions import LEAST_SIGNIFICANCE, inclusion_regions
 from jeit.image.rasters import CONDUCTIVE, RESISTIVE
 from jeit.imaging.automatic import image_automatically
 from jeit.imaging.calibration import Clock
 from jeit.imaging.doubts import doubts_of_data
 from jeit.imaging.method import AUTO, METHODS, ImagingSettings, MethodOptions, as_settings
-from jeit.imaging.preparation import prepare_difference
+from jeit.imaging.preparation import PreparedDifference, prepare_difference
 from jeit.imaging.wiring import Wiring
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.linear.one_step import LinearReconstruction
@@ -57,9 +57,10 @@ class ImagedDifference:
     - `change`: change of conductivity in every cell (m,), S/m (2-D: S), relative to `calibration.conductivity`. For
       complex voltages, the complex change of admittivity σ + iωε.
     - `raster`: `change` on a grid, NaN outside the mesh; `extent`: (x_min, x_max, y_min, y_max) in metres.
-    - `inclusions`: regions of changed conductivity, strongest first; the `shapes` if there are any. In iterative
-      images, inclusions must exceed the noise and are found in the logarithm of conductivity, which weights both signs
-      alike. In complex images they are found in the real part.
+    - `inclusions`: regions of changed conductivity, strongest first; the `shapes` if there are any. Inclusions must
+      exceed the noise of the image. In linear images they must also differ from a change common to all voltages. In
+      iterative images they are found in the logarithm of conductivity, which weights both signs alike; in complex
+      images in the real part.
     - `unlike_electrodes`: electrodes, numbered from 0, whose channels the model fits far worse than those of the other
       electrodes, each with the ratio of the misfits. These channels have less weight.
     - `shapes`: fitted bodies with outlines; None if no bodies were fitted, or if they do not explain the voltages.
@@ -157,8 +158,7 @@ class ImagedDifference:
         """Reasons to doubt the image, in sentences: too few channels, noise, an implausible background, an iteration
         that did not converge, voltages not explained by the image, or bodies whose kind the data do not determine."""
         reconstruction = self.reconstruction
-        doubts = doubts_of_data(self.measurement, self.reference, self.calibration)
-        doubts += [self.quality.doubt] if self.quality.doubt else []
+        doubts = doubts_of_data(self.measurement, self.reference, self.calibration, self.quality)
         if isinstance(reconstruction, LinearReconstruction):
             return tuple(doubts)
         if isinstance(reconstruction, Reconstruction) and reconstruction.status != Status.CONVERGED:
@@ -295,14 +295,15 @@ def image_difference(
             frame=prepared.frame,
             num_frames=prepared.num_frames,
         )
-        inclusions, labels = _inclusions(imaged, grid)
+        inclusions, labels = _inclusions(imaged, grid, prepared)
     return replace(imaged, inclusions=tuple(inclusions), labels=labels)
 
 
 def _inclusions(
-    imaged: ImagedDifference, grid: Raster
+    imaged: ImagedDifference, grid: Raster, prepared: PreparedDifference
 ) -> tuple[list[Inclusion], UInt8[np.ndarray, "rows columns"] | None]:
-    """Inclusions of an image, with the change of conductivity as their peak; and labels of the pixels, if requested."""
+    """Inclusions of an image, with the change of conductivity as their peak; and labels of the pixels, if requested.
+    Inclusions of smooth images must exceed the noise of the image."""
     settings, reconstruction, background = imaged.settings, imaged.reconstruction, imaged.calibration.conductivity
     if imaged.shapes is not None:
         bodies = imaged.shapes.bodies
@@ -311,9 +312,24 @@ def _inclusions(
     departure, noise = as_array(np.real(imaged.departure)), None
     if isinstance(reconstruction, Reconstruction) and reconstruction.inversion.penalty.is_standard_normal:
         noise = as_array(image_noise(reconstruction))
+    elif isinstance(reconstruction, LinearReconstruction):
+        noise = as_array(reconstruction.image_noise(np.where(prepared.mask, prepared.modelled_noise, 0)))
     regions = inclusion_regions(imaged.mesh, departure, level=imaged.level, least_peak=settings.least_peak, noise=noise)
+    if isinstance(reconstruction, LinearReconstruction) and noise is not None:
+        apart = np.abs(departure - np.real(reconstruction.image(_common_change(prepared)))) - LEAST_SIGNIFICANCE * noise
+        regions = [(inclusion, region) for inclusion, region in regions if (apart[region] > 0).any()]
     inclusions = [_with_change(inclusion, background) if imaged.iterative else inclusion for inclusion, _ in regions]
     return inclusions, _region_labels(regions, grid) if settings.segment else None
+
+
+def _common_change(prepared: PreparedDifference) -> Inexact[np.ndarray, " M"]:
+    """The part of the voltage difference (M,), volts, that is a factor common to all voltages, as of a bath that has
+    become warmer or of a gain that has drifted. Channels are weighted by their noise."""
+    used, noise = np.asarray(prepared.mask), np.asarray(prepared.modelled_noise)
+    reference, difference = np.asarray(prepared.reference.voltages)[0], np.asarray(prepared.difference)
+    scaled_reference = np.where(used, reference / noise**2, 0)
+    factor = np.vdot(scaled_reference, difference) / np.vdot(scaled_reference, np.where(used, reference, 0))
+    return factor * np.where(used, reference, 0)
 
 
 def _body_inclusion(body: Star | Ellipsoid, background: float) -> Inclusion:

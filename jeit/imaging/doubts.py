@@ -7,6 +7,7 @@ import numpy as np
 
 from jeit.arguments import percent
 from jeit.data import Measurement
+from jeit.data.frame_checks import FrameQuality
 from jeit.electrodes import BoundaryElectrodes
 from jeit.inverse.calibration import Calibration
 from jeit.mesh import Domain
@@ -26,9 +27,11 @@ _MAX_VOLTS = 60.0
 _SMALLER_UNITS = (("mV", 1e3), ("uV", 1e6))
 
 
-def doubts_of_data(measurement: Measurement, reference: Measurement, calibration: Calibration) -> list[str]:
-    """Reasons to doubt the data: few usable voltages, an implausible level of the voltages, implausible lengths, or a
-    frame that may be the reference."""
+def doubts_of_data(
+    measurement: Measurement, reference: Measurement, calibration: Calibration, quality: FrameQuality | None = None
+) -> list[str]:
+    """Reasons to doubt the data: few usable voltages, an implausible level of the voltages, implausible lengths, a
+    frame that may be the reference, or, with the frame's `quality`, noise."""
     used, doubts = np.asarray(measurement.mask)[0], []
     if (usable_share := np.mean(used)) < _MIN_USABLE_SHARE:
         doubts.append(
@@ -36,7 +39,8 @@ def doubts_of_data(measurement: Measurement, reference: Measurement, calibration
             "little of what is where."
         )
     level, lengths = _doubt_of_units(measurement, reference, calibration), _doubt_of_lengths(measurement)
-    return [*doubts, *filter(None, (level, lengths, _doubt_of_order(measurement, reference, calibration)))]
+    noise = "" if quality is None else quality.doubt
+    return [*doubts, *filter(None, (level, lengths, _doubt_of_order(measurement, reference, calibration), noise))]
 
 
 def _doubt_of_lengths(measurement: Measurement) -> str:

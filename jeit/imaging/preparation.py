@@ -20,6 +20,7 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.face_patches import body_mesh
 from jeit.forward import ForwardModel
 from jeit.imaging.calibration import Clock, calibrated_model, estimated_positions, keep_last_result, relative_misfit
+from jeit.imaging.doubts import doubts_of_data
 from jeit.imaging.wiring import Wiring, exchanges_message, find_wiring
 from jeit.inverse import relative_noise
 from jeit.inverse.calibration import Calibration
@@ -113,6 +114,12 @@ class PreparedDifference:
     def mesh(self) -> Mesh:
         """Mesh of the calibrated model, on which images are computed."""
         return self.calibration.model.mesh
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Reasons to doubt the data, in sentences: too few channels, noise, an implausible background, exchanged
+        frames."""
+        return tuple(doubts_of_data(self.measurement, self.reference, self.calibration, self.quality))
 
     @property
     def uncertainty(self) -> Uncertainty:

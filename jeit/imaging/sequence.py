@@ -69,6 +69,12 @@ class ImagedSequence:
     refused: Bool[np.ndarray, " F"]
     regions: Mapping[str, Bool[np.ndarray, " m"]] = field(default_factory=dict)
 
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Reasons to doubt the images, in sentences, from the frame for which λ was chosen: the one that differs most
+        from the reference."""
+        return self.prepared.doubts
+
 
 def image_sequence(
     measurement: Measurement,

@@ -235,6 +235,6 @@ def report_choice(result: ComparedRules) -> dict[str, Any]:
         "residual_unit": "standard deviations of jeit.inverse.relative_noise",
         "rules": rules,
         "refused": result.refused,
-        "doubt": prepared.quality.doubt or None,
+        "doubts": list(prepared.doubts),
     }
     return as_plain_values(content)

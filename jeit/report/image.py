@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -29,6 +31,8 @@ from jeit.report.saved_image import saved_extras
 
 IMAGE_FILES = ("image.png", "image.npz", "report.json", "image.vtu")
 """Names of the files written by `write_image`; the last is written only for solids."""
+# Letters of a doubt per inch of a picture's width, and their colour.
+_LETTERS_PER_INCH, _DOUBT_COLOUR = 16, "#a3350f"
 _PACKAGES = ("jeit", "jax", "numpy", "scipy", "equinox", "lineax", "optimistix", "matplotlib")
 
 
@@ -125,6 +129,7 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
         figure.suptitle(result.measurement.name)
         electrodes = result.electrodes
         plot_admittivity(result.mesh, np.asarray(result.change), electrodes, figure=figure)
+        _write_doubts(figure, result.doubts)
         return figure
     scale = FACTOR_SCALE if result.iterative else CHANGE_SCALE
     electrodes = result.electrodes
@@ -133,6 +138,7 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
 
         figure = plot_solid(result.mesh, _drawn_values(result), electrodes, inclusions=result.inclusions, scale=scale)
         figure.suptitle(result.measurement.name)
+        _write_doubts(figure, result.doubts)
         return figure
     figure = Figure(figsize=(6.4, 5.6), layout="constrained")
     ax = plot_image(
@@ -155,7 +161,17 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
         ax.plot([], [], color="black", linewidth=1, linestyle=(0, (4, 3)), label="found: sign and area")
     if ax.get_legend_handles_labels()[1]:
         ax.legend(loc="upper left", bbox_to_anchor=(0, 0), frameon=False, borderaxespad=0)
+    _write_doubts(figure, result.doubts)
     return figure
+
+
+def _write_doubts(figure, doubts: Sequence[str]) -> None:
+    """Write the first doubt about an image below it, and the number of further doubts."""
+    if not doubts:
+        return
+    further = f" {len(doubts) - 1} more in report.json." if len(doubts) > 1 else ""
+    width = int(_LETTERS_PER_INCH * figure.get_size_inches()[0])
+    figure.supxlabel(fill(f"Doubt: {doubts[0]}{further}", width), fontsize=8, color=_DOUBT_COLOUR)
 
 
 def report_image(result: ImagedDifference) -> dict[str, Any]:

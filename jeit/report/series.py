@@ -199,6 +199,7 @@ def _report(sequence: ImagedSequence, curves: Mapping[str, np.ndarray], oscillat
             "background": series.background,
             "unit": series.unit,
             "hyperparameter": float(sequence.reconstruction.hyperparameter),
+            "doubts": list(sequence.doubts),
             "oscillations": reported,
         }
     )

@@ -30,7 +30,7 @@ def test_every_rule_is_in_table_picture_and_report(tank, run, tmp_path):
     rows = {line.split()[0]: line for line in output.splitlines() if line.split()}
     assert [entry["rule"] for entry in written["rules"]] == list(RULES)
     assert written["prior"] == "noser"
-    assert written["doubt"] is None
+    assert written["doubts"] == []
     for entry in written["rules"]:
         row = rows[entry["rule"]]
         assert f"{entry['hyperparameter']:.3g}" in row
@@ -59,8 +59,8 @@ def test_noise_in_the_difference_is_doubted(tank, run, tmp_path):
     noisy = tank.write("noisy", touched + deviation * np.random.default_rng(0).normal(size=touched.shape))
     files = (noisy, "--reference", tank.folder / "rest.csv")
     output, written = choose(run, tmp_path / "out", *files, *SMALL, "--rule", "best-resolution")
-    assert "of the difference from the reference" in written["doubt"]
-    assert f"doubt: {written['doubt']}" in output
+    assert "of the difference from the reference" in written["doubts"][0]
+    assert f"doubt: {written['doubts'][0]}" in output
 
 
 @pytest.mark.slow

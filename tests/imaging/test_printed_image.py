@@ -11,10 +11,11 @@ from test_chosen_frame import EMPTY, FULL, MODEL, SETTINGS, tank
 from jeit.cli.commands.reconstruct import show
 from jeit.cli.console import plain_console
 from jeit.image import Inclusion, Raster
-from jeit.imaging import calibration, image_difference
+from jeit.imaging import ImagingSettings, calibration, image_difference
 from jeit.imaging.difference import _region_labels
 from jeit.imaging.wiring import Wiring
 from jeit.mesh import centroids
+from jeit.report.image import draw_image
 from jeit_solvers import Status
 
 
@@ -79,6 +80,25 @@ def test_a_linear_image_of_negative_conductivity_is_doubted(imaged, printed):
     assert "peaks of the image" not in text
     change[0] = -0.9 * background
     assert printed(change=change)[1] == USUAL
+
+
+def test_noise_and_a_common_change_are_no_inclusions_and_a_body_beside_them_is():
+    settings, rng = ImagingSettings(method="one-step", num_points=300), np.random.default_rng(0)
+    signal = np.linalg.norm(FULL - EMPTY) / np.linalg.norm(EMPTY)
+    noise = EMPTY * (1 + signal * rng.normal(size=EMPTY.shape))
+    found = image_difference(tank(1.05 * noise), tank(EMPTY), replace(settings, as_is=True))
+    assert not found.inclusions
+    assert found.quality.noise_share > 0.9
+    warmer = EMPTY / 1.05 * (1 + 0.1 * signal * rng.normal(size=EMPTY.shape))
+    assert not image_difference(tank(warmer), tank(EMPTY), settings).inclusions
+    (body,) = image_difference(tank(0.98 * FULL), tank(EMPTY), settings).inclusions
+    assert np.hypot(body.centroid[0] - 0.02, body.centroid[1] - 0.01) < 0.005
+
+
+def test_the_first_doubt_is_written_in_the_picture(imaged):
+    assert draw_image(imaged).get_supxlabel() == ""
+    doubted = replace(imaged, quality=replace(imaged.quality, noise_share=0.8))
+    assert draw_image(doubted).get_supxlabel().startswith("Doubt: by reciprocity, noise is 80 %")
 
 
 def test_a_step_takes_the_time_from_its_beginning_to_its_end(monkeypatch):

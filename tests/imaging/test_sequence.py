@@ -105,6 +105,14 @@ def test_a_frame_of_noise_does_not_refuse_the_others():
         image_sequence(tank(noise, noise), tank(EMPTY), SETTINGS)
 
 
+def test_noise_is_doubted():
+    assert not image_sequence(tank(FULL, EMPTY), tank(EMPTY), SETTINGS).doubts
+    size = np.linalg.norm(FULL - EMPTY) / np.linalg.norm(EMPTY)
+    noisy = FULL + size * EMPTY * np.random.default_rng(0).normal(size=EMPTY.shape)
+    (doubt,) = image_sequence(tank(noisy, EMPTY), tank(EMPTY), SETTINGS).doubts
+    assert "of the difference from the reference" in doubt
+
+
 def test_the_change_between_two_frequencies_is_relative_to_that_of_the_whole_body():
     """Unless the weight is left out: then it is the plain difference. The first frequency is the mean of its frames."""
     first, second = tank(0.9 * EMPTY, 1.1 * EMPTY), tank(EMPTY, 1.25 * FULL)

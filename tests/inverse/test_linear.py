@@ -8,7 +8,7 @@ import pytest
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import find_inclusions
-from jeit.inverse import RULES, Gaussian, Laplace, Noser, Tikhonov, back_projection, one_step
+from jeit.inverse import RULES, Gaussian, Laplace, LinearReconstruction, Noser, Tikhonov, back_projection, one_step
 from jeit.layout import ring
 from jeit.mesh import centroids, disk
 from jeit.protocol import adjacent
@@ -74,6 +74,20 @@ def test_image_equals_the_full_matrix_for_one_frame_and_many(model, difference):
     assert imaged.nbytes > 1e6
     np.testing.assert_array_equal(imaged, -again)
     np.testing.assert_allclose(imaged[-2:], images, atol=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+def test_the_noise_of_an_image_is_that_of_its_channels(model, mixed):
+    reconstruction = one_step(model, 1.0, hyperparameter=0.03)
+    if mixed:  # a matrix stored as two factors of rank three, by which 104 combined channels are reduced
+        factors = np.random.default_rng(1).normal(size=(400, 3)), np.random.default_rng(2).normal(size=(3, 208))
+        reconstruction = LinearReconstruction.of_factors(model, factors, 0.03, "given", "of factors")
+        assert reconstruction.mixing is not None
+    deviations = np.random.default_rng(0).uniform(1e-4, 1e-3, size=208)
+    expected = np.sqrt((np.asarray(reconstruction.matrix) * deviations) ** 2 @ np.ones(208))
+    np.testing.assert_allclose(reconstruction.image_noise(deviations), expected, rtol=1e-9)
+    with pytest.raises(ValueError, match="a voltage for each of 208"):
+        reconstruction.image_noise(1e-3)
 
 
 def test_images_are_equal_uncompiled_compiled_batched_and_of_a_traced_reconstruction(model, difference):

@@ -107,6 +107,6 @@ def show(console, result: "ComparedRules") -> None:
             console.print(f"  * {outcome.choice.note}", soft_wrap=True)
     for reason in result.refused.values():
         console.print(f"  {reason}", soft_wrap=True)
-    if doubt := result.prepared.quality.doubt:
+    for doubt in result.prepared.doubts:
         console.print(f"  doubt: {doubt}", soft_wrap=True)
     console.print()

@@ -140,6 +140,8 @@ def series(
         (*sequence.prepared.measurement.notes, *(() if reference_measurement is None else reference_measurement.notes))
     ):
         console.print(f"  {note}", style="dim")
+    for doubt in sequence.doubts:
+        console.print(f"  doubt: {doubt}", soft_wrap=True, markup=False)
     for entry in report["oscillations"]:
         console.print(f"{entry['frequency']:.4g} Hz (resolution {entry['resolution']:.2g} Hz):")
         for name, component in entry["regions"].items():

@@ -122,6 +122,7 @@ def stream(
     from jeit.cli.streams import FrameCounter, Stopping
     from jeit.data.formats.lines import LineParser, read_lines
     from jeit.data.screening import mask_spikes
+    from jeit.imaging.doubts import doubts_of_data
     from jeit.imaging.stream_preparation import StreamSettings, frames_of, prepare_imager
     from jeit.inverse import stream as stream_images
     from jeit.inverse.nonlinear.solvers import SOLVERS, frame_solvers
@@ -182,6 +183,9 @@ def stream(
         notes = (*measured.notes, *reference_measurement.notes, *([calibration.note] if calibration.note else []))
         for note in () if quiet else dict.fromkeys(notes):
             console.print(f"  note: {note}", soft_wrap=True, markup=False)
+        base_frame = reference_measurement.mean_frame()
+        for doubt in () if quiet else doubts_of_data(base_frame, base_frame, calibration):
+            console.print(f"  doubt: {doubt}", soft_wrap=True, markup=False)
         with naming_options({"rate": "--rate"}), Steps(console, quiet=quiet) as step:
             step("image")
             frame_counter = FrameCounter(step, num_frames)

@@ -35,6 +35,8 @@ from jeit_solvers.engines import (
 
 # Approximate number of cells used to find the channels with proportional columns in the reconstruction matrix.
 _NUM_SAMPLED_CELLS = 4000
+# Number of rows of the matrix for which the noise of the image is computed at once.
+_ROWS_AT_ONCE = 32
 
 
 @functools.partial(
@@ -188,6 +190,21 @@ class LinearReconstruction:
         first, second, ratio, mixing, weights = self._numpy_arrays
         combined = _combine_channels(voltages, first, second, ratio, mixing)
         return on_device(combined @ weights) if is_forked() else product_for_jax(combined, weights)
+
+    def image_noise(self, noise: Float[Array | np.ndarray, " M"]) -> Float[np.ndarray, " m"]:
+        """Standard deviation (m,) of the image in every cell, S/m (2-D: S), due to independent errors of the channels
+        with the standard deviations `noise` (M,), volts. Raises `ValueError` for the wrong number of channels."""
+        deviations = np.asarray(noise)
+        if deviations.shape != (self.num_measurements,):
+            raise ValueError(f"noise has shape {deviations.shape}; give a voltage for each of {self.num_measurements}.")
+        first, second, ratio, mixing, weights = self._numpy_arrays
+        combined_noise = np.hypot(deviations[first], ratio * deviations[second])
+        variance = np.zeros(weights.shape[1])
+        for start in range(0, len(combined_noise), _ROWS_AT_ONCE):
+            rows = slice(start, start + _ROWS_AT_ONCE)
+            gain = weights[rows] if mixing is None else mixing[rows] @ weights
+            variance += combined_noise[rows] ** 2 @ np.abs(gain) ** 2
+        return np.sqrt(variance)
 
     @functools.cached_property
     def _numpy_arrays(self) -> tuple[Any, ...]:
