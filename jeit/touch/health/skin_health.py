@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
@@ -26,6 +25,7 @@ from jeit.touch.health.event import (
 )
 from jeit.touch.health.finding import Finding, ImagedSkin, LastingChange, classify_change
 from jeit.touch.health.healthy import HealthyState, average_frames
+from jeit.touch.health.record import CHANNEL_KINDS, MIN_DISAPPEARED_FRACTION, HealthRecord
 
 # Patience, a time longer than any touch is held, in seconds.
 PATIENCE = 30.0
@@ -35,8 +35,6 @@ _PATIENCE_WINDOWS = 3
 _PATIENCE_PER_WINDOW = 3.0
 # Weight of the latest window in the update of the reference, every quarter of a window.
 _REFERENCE_WEIGHT = 0.1
-# Fraction of a change that must have disappeared for the change to count as gone.
-_MIN_DISAPPEARED_FRACTION = 0.6
 # Minimum fraction of channels with a reading, below which a frame is refused.
 _MIN_READ_FRACTION = 0.5
 # Multiple of the span of healthy changes beyond which a channel is faulty.
@@ -49,8 +47,6 @@ _FIRST_WINDOW_NOTE = (
     "The change is present from the first frame on: gains or contacts that changed since the healthy "
     "recording have the same effect."
 )
-
-_CHANNEL_KINDS = (EventKind.NOISY, EventKind.STUCK)
 
 
 class WatchStatus(StrEnum):
@@ -81,12 +77,10 @@ class SkinHealth:
     healthy touch is reported at once. A change that a touch may also cause is reported when it has lasted for
     `patience` seconds, because it may be a held press. The reference voltages follow drift.
 
-    **Fields**: `healthy`: healthy state; `reference`: present voltages of the untouched skin, volts; `trusted`: whether
-    each channel has readings and no open event excludes it; `patience`: time longer than any touch is held, seconds;
-    `skin`: model of the skin, or None; `touching` (electrodes, channels): whether each channel uses each electrode, or
-    None; `events`: events so far; `time`: time of the last frame; `frames`: number of frames so far, with refused
-    frames; `status`: status of the last frame; `usable`: whether each channel is trusted and has a plausible reading in
-    the last frame; `reason`: a sentence that explains the status.
+    **Fields**: `record`: what is known about the skin: reference voltages, trusted channels, events, and a model of the
+    skin, if given; `patience`: time longer than any touch is held, seconds; `time`: time of the last frame; `frames`:
+    number of frames so far, with refused frames; `status`: status of the last frame; `usable`: whether each channel is
+    trusted and has a plausible reading in the last frame; `reason`: a sentence that explains the status.
 
     Create a state with `SkinHealth.fit`.
 
@@ -98,13 +92,8 @@ class SkinHealth:
     ```
     """
 
-    healthy: HealthyState
-    reference: Float[np.ndarray, " M"]
-    trusted: Bool[np.ndarray, " M"]
+    record: HealthRecord
     patience: float
-    skin: ImagedSkin | None = None
-    touching: Bool[np.ndarray, "L M"] | None = None
-    events: tuple[HealthEvent, ...] = ()
     time: float = -np.inf
     frames: int = 0
     status: WatchStatus = WatchStatus.WATCHED
@@ -171,7 +160,32 @@ class SkinHealth:
                     "of one skin."
                 )
             touching = np.array([protocol.channels_touching(electrode) for electrode in range(protocol.num_electrodes)])
-        return cls(state, state.reference, state.used, wanted_patience, skin, touching)
+        return cls(HealthRecord(state, state.reference, state.used, skin, touching), wanted_patience)
+
+    @property
+    def healthy(self) -> HealthyState:
+        """Healthy state."""
+        return self.record.healthy
+
+    @property
+    def reference(self) -> Float[np.ndarray, " M"]:
+        """Present voltages (M,) of the untouched skin, volts."""
+        return self.record.reference
+
+    @property
+    def trusted(self) -> Bool[np.ndarray, " M"]:
+        """Whether each channel has readings and no open event excludes it, (M,)."""
+        return self.record.trusted
+
+    @property
+    def skin(self) -> ImagedSkin | None:
+        """Model of the skin with its cuts, or None."""
+        return self.record.skin
+
+    @property
+    def events(self) -> tuple[HealthEvent, ...]:
+        """Events so far."""
+        return self.record.events
 
     def follow(self, time: float, frame: ArrayLike) -> "SkinHealth":
         """Return the state after a frame (channels,) at `time`, seconds; NaN marks a channel without a reading.
@@ -202,10 +216,9 @@ class SkinHealth:
         Raises `ValueError` for an event of another skin.
         """
         if self._pending is not None and self.held is not None and event.number == self.held.number:
-            return replace(self, _pending=None)._add_events(
-                self._pending.change, [self._pending.finding], EventStatus.CONFIRMED
-            )
-        return self._with_status(event, EventStatus.CONFIRMED)
+            record = self.record.with_changes(self._pending.change, [self._pending.finding], EventStatus.CONFIRMED)
+            return replace(self, record=record, _pending=None)
+        return replace(self, record=self.record.with_status(event, EventStatus.CONFIRMED))
 
     def deny(self, event: HealthEvent) -> "SkinHealth":
         """Return the state after the user has denied an event because it was a held press, not damage.
@@ -215,9 +228,7 @@ class SkinHealth:
         """
         if self._pending is not None and self.held is not None and event.number == self.held.number:
             return replace(self, _pending=None)
-        state = self._with_status(event, EventStatus.DENIED)
-        reference = np.where(np.isfinite(event.change), self.reference - event.change, self.reference)
-        return replace(state, reference=reference, trusted=state._trusted_channels(), skin=state._current_skin())
+        return replace(self, record=self.record.denied(event))
 
     def repaired(self, frames: ArrayLike) -> "SkinHealth":
         """Return the state after the user has repaired the skin; the status of all open events becomes "mended".
@@ -234,29 +245,9 @@ class SkinHealth:
         has_reading = np.isfinite(new_reference) & self.healthy.used
         if has_reading.sum() < _MIN_READ_FRACTION * self.healthy.used.sum():
             raise ValueError("frames: fewer than half of the channels have a reading; that is no reference.")
-        mended_events = tuple(
-            _with_new_status(event, EventStatus.MENDED) if event.open else event for event in self.events
-        )
-        change = np.where(has_reading, new_reference - self.reference, 0.0)
-        strength = float(change_size(change / self.healthy.scale)) / self.healthy.limit
-        event = HealthEvent(
-            number=len(self.events),
-            kind=EventKind.REPAIRED,
-            status=EventStatus.CONFIRMED,
-            time=self.time,
-            noticed=self.time,
-            frame=self.frames,
-            channels=np.abs(change) > self.healthy.limit * self.healthy.scale,
-            change=change,
-            strength=strength,
-            reason="As the user says.",
-        )
         return replace(
             self,
-            events=(*mended_events, event),
-            reference=np.where(has_reading, new_reference, self.reference),
-            trusted=has_reading,
-            skin=None if self.skin is None else self.skin.without_cuts(),
+            record=self.record.repaired(new_reference, self.time, self.frames),
             _window=(),
             _part=(),
             _settled=True,
@@ -282,12 +273,12 @@ class SkinHealth:
         is pending."""
         if self._pending is None:
             return None
-        return self._create_event(self._pending.change, self._pending.finding, EventStatus.HELD, len(self.events))
+        return self.record.create_event(self._pending.change, self._pending.finding, EventStatus.HELD)
 
     @property
     def open_events(self) -> list[HealthEvent]:
         """The events that still apply: neither denied nor mended, and no repairs."""
-        return [event for event in self.events if event.open]
+        return self.record.open_events
 
     def _process(self, time: float, values: np.ndarray, has_reading: np.ndarray) -> "SkinHealth":
         healthy = self.healthy
@@ -337,9 +328,7 @@ class SkinHealth:
         deviations = np.where(self.trusted & np.isfinite(medians), medians - self.reference, 0.0)
         if next_state._pending is None and change_size(deviations / healthy.scale) < healthy.limit:
             updated_reference = self.reference + _REFERENCE_WEIGHT * (medians - self.reference)
-            next_state = replace(
-                next_state, reference=np.where(np.isfinite(medians), updated_reference, self.reference)
-            )
+            next_state = next_state._with_reference(np.where(np.isfinite(medians), updated_reference, self.reference))
         return next_state
 
     def _process_first_window(self, medians: np.ndarray) -> "SkinHealth":
@@ -361,20 +350,20 @@ class SkinHealth:
         projections = (
             np.nan_to_num(first_deviations / healthy.level_scale**2) @ change / max(direction @ change, 1e-300)
         )
-        state = replace(self, _settled=True, reference=np.where(np.isfinite(medians), medians, self.reference))
+        state = replace(self, _settled=True)._with_reference(np.where(np.isfinite(medians), medians, self.reference))
         if size <= healthy.level_limit or not is_distinct(projections, 0):
             return state
         time, frame, _ = self._window[0]
         change = LastingChange(change, size / healthy.level_limit * healthy.limit, time, frame, self.time)
         frames = np.array([step_frame for _, _, step_frame in self._window])
-        findings = classify_change(change.vector, frames, healthy.reference, healthy, self.touching, self.skin)
+        findings = classify_change(change.vector, frames, healthy.reference, healthy, self.record.touching, self.skin)
         findings = [
             finding
             if finding.channels is not None
             else replace(finding, reason=f"{finding.reason} {_FIRST_WINDOW_NOTE}")
             for finding in findings
         ]
-        return replace(state, reference=healthy.reference)._add_events(change, findings, EventStatus.LASTING)
+        return state._with_reference(healthy.reference)._with_changes(change, findings)
 
     def _update_pending(self, medians: np.ndarray) -> "SkinHealth":
         """Return the state after checking whether the pending change has disappeared or outlasted a touch."""
@@ -384,15 +373,13 @@ class SkinHealth:
         change, scale = np.nan_to_num(pending.change.vector), np.where(self.trusted, self.healthy.scale, np.inf)
         remainder = np.where(np.isfinite(medians), medians - self.reference, 0.0)
         remaining_fraction = (remainder / scale**2) @ change / max((change / scale**2) @ change, 1e-300)
-        if remaining_fraction < 1 - _MIN_DISAPPEARED_FRACTION:
+        if remaining_fraction < 1 - MIN_DISAPPEARED_FRACTION:
             return replace(self, _pending=None)
         if self.time - pending.change.time < self.patience:
             return self
         lasting_change = replace(pending.change, vector=np.where(self.trusted, remainder, 0.0), noticed=self.time)
         reason = f"{pending.finding.reason} It has lasted for {self.time - pending.change.time:.3g} s or frames."
-        return replace(self, _pending=None)._add_events(
-            lasting_change, [replace(pending.finding, reason=reason)], EventStatus.LASTING
-        )
+        return replace(self, _pending=None)._with_changes(lasting_change, [replace(pending.finding, reason=reason)])
 
     def _process_step(self, step: Step, frames: np.ndarray) -> "SkinHealth":
         """Return the state after a lasting step of the voltages was found."""
@@ -403,129 +390,37 @@ class SkinHealth:
         scale = np.where(self.trusted, self.healthy.scale, np.inf)
         if change_size(deviations / scale) <= self.healthy.limit:  # the skin is as before a touch
             return next_state
-        reversed_state = next_state._reverse_change(change)
-        if reversed_state is not None:
-            return reversed_state
+        reversed_record = self.record.reversed_by(change)
+        if reversed_record is not None:
+            return replace(next_state, record=reversed_record)
         frames_after = frames[step.first :]
-        findings = classify_change(step.change, frames_after, self.reference, self.healthy, self.touching, self.skin)
+        findings = classify_change(
+            step.change, frames_after, self.reference, self.healthy, self.record.touching, self.skin
+        )
         if findings[0].electrode is not None or (findings[0].is_certain and change.size > self.healthy.sudden_limit):
-            return next_state._add_events(change, findings, EventStatus.LASTING)
+            return next_state._with_changes(change, findings)
         if self._pending is not None:  # only one change is pending at a time: the first
             return next_state
         return replace(next_state, _pending=_PendingChange(change, findings[0]))
 
     def _check_channels(self, frames: np.ndarray) -> "SkinHealth":
         """Return the state after checking for single channels that are noisy or stuck."""
-        next_state, steadiness, checked_channels = self, self.healthy.steadiness, self.trusted.copy()
+        steadiness, checked_channels = self.healthy.steadiness, self.trusted.copy()
         for event in self.events:
-            if event.kind in _CHANNEL_KINDS and event.status == EventStatus.DENIED:
+            if event.kind in CHANNEL_KINDS and event.status == EventStatus.DENIED:
                 checked_channels &= ~event.channels
-        for kind, is_faulty in (
-            (EventKind.NOISY, steadiness.noisy_channels(frames, checked_channels)),
-            (EventKind.STUCK, steadiness.stuck_channels(frames, checked_channels)),
-        ):
-            for channel in np.flatnonzero(is_faulty):
-                is_channel = np.arange(self.reference.size) == channel
-                time, frame, _ = self._window[0]
-                change = LastingChange(np.zeros(is_channel.size), self.healthy.limit, time, frame, self.time)
-                fault = "is several times as noisy as it was, or jumps" if kind == EventKind.NOISY else "does not move"
-                finding = Finding(kind, f"Channel {channel} {fault}.", True, channels=is_channel)
-                event = next_state._create_event(change, finding, EventStatus.LASTING, len(next_state.events))
-                event = eqx.tree_at(lambda event: event.channels, event, is_channel)
-                next_state = replace(next_state, events=(*next_state.events, event))
-        return next_state if next_state is self else replace(next_state, trusted=next_state._trusted_channels())
+        time, frame, _ = self._window[0]
+        change = LastingChange(np.zeros(self.reference.size), self.healthy.limit, time, frame, self.time)
+        noisy_channels = steadiness.noisy_channels(frames, checked_channels)
+        stuck_channels = steadiness.stuck_channels(frames, checked_channels)
+        record = self.record.with_faulty_channels(EventKind.NOISY, noisy_channels, change)
+        return replace(self, record=record.with_faulty_channels(EventKind.STUCK, stuck_channels, change))
 
-    def _reverse_change(self, change: LastingChange) -> "SkinHealth | None":
-        """Return the state after a change that reverses the change of an earlier event; None without such an event."""
-        for earlier_event in self.open_events:
-            is_used = np.isfinite(earlier_event.change) & np.isfinite(change.vector) & self.trusted
-            earlier_change = (earlier_event.change[is_used] / self.healthy.scale[is_used]).clip(-1e9, 1e9)
-            new_change = (change.vector[is_used] / self.healthy.scale[is_used]).clip(-1e9, 1e9)
-            fraction = -(new_change @ earlier_change) / max(earlier_change @ earlier_change, 1e-300)
-            if fraction > _MIN_DISAPPEARED_FRACTION and np.linalg.norm(
-                new_change + earlier_change
-            ) < 0.6 * np.linalg.norm(earlier_change):
-                events = tuple(
-                    _with_new_status(event, EventStatus.MENDED) if event.number == earlier_event.number else event
-                    for event in self.events
-                )
-                reason = f"Event {earlier_event.number} is gone: it was mended, or a press that has been lifted."
-                finding = Finding(EventKind.REPAIRED, reason, True)
-                repair_event = self._create_event(change, finding, EventStatus.LASTING, len(events))
-                state = replace(self, events=(*events, repair_event))
-                reference = np.where(np.isfinite(change.vector), self.reference + change.vector, self.reference)
-                return replace(
-                    state, reference=reference, trusted=state._trusted_channels(), skin=state._current_skin()
-                )
-        return None
+    def _with_reference(self, reference: Float[np.ndarray, " M"]) -> "SkinHealth":
+        return replace(self, record=replace(self.record, reference=reference))
 
-    def _add_events(self, change: LastingChange, findings: list[Finding], status: EventStatus) -> "SkinHealth":
-        """Return the state with events added, and with their change added to the reference voltages."""
-        events = [
-            self._create_event(change, finding, status, len(self.events) + index)
-            for index, finding in enumerate(findings)
-        ]
-        # If electrodes fail, the reference changes only in their channels, since the skin may be touched meanwhile.
-        is_affected = np.logical_or.reduce(
-            [np.ones_like(self.trusted) if finding.channels is None else finding.channels for finding in findings]
-        )
-        new_reference = np.where(
-            is_affected & np.isfinite(change.vector), self.reference + change.vector, self.reference
-        )
-        skin = self.skin
-        for finding in findings:
-            if finding.loss is not None and skin is not None:
-                skin = skin.with_cut(finding.loss)
-        next_state = replace(self, events=(*self.events, *events), reference=new_reference, skin=skin)
-        return replace(next_state, trusted=next_state._trusted_channels())
-
-    def _create_event(self, change: LastingChange, finding: Finding, status: EventStatus, number: int) -> HealthEvent:
-        is_affected = np.ones(self.reference.size, bool) if finding.channels is None else finding.channels
-        is_large = np.abs(np.nan_to_num(change.vector)) > self.healthy.limit * self.healthy.scale
-        return HealthEvent(
-            number=number,
-            kind=finding.kind,
-            status=status,
-            time=change.time,
-            noticed=change.noticed,
-            frame=change.frame,
-            channels=is_large & is_affected,
-            change=np.where(is_affected, change.vector, 0.0),
-            strength=change.size / self.healthy.limit,
-            electrode=finding.electrode,
-            path=None if finding.loss is None else finding.loss.path,
-            deviation=0.0 if finding.loss is None else finding.loss.deviation,
-            through=None if finding.loss is None else finding.loss.through,
-            reason=finding.reason,
-        )
-
-    def _with_status(self, event: HealthEvent, status: EventStatus) -> "SkinHealth":
-        """Return the state after setting the status of an event. Raises `ValueError` for an event of a different
-        skin."""
-        check_kind("event", event, HealthEvent, "one of health.events, or health.held")
-        if not event.number < len(self.events):
-            raise ValueError(f"event {event.number} does not belong to this skin, which has {len(self.events)} events.")
-        events = [
-            _with_new_status(known_event, status) if known_event.number == event.number else known_event
-            for known_event in self.events
-        ]
-        return replace(self, events=tuple(events))
-
-    def _current_skin(self) -> ImagedSkin | None:
-        """Return the model of the skin, without cuts if no open event is a cut."""
-        has_cut = any(event.path is not None for event in self.open_events)
-        return self.skin if self.skin is None or has_cut else self.skin.without_cuts()
-
-    def _trusted_channels(self) -> Bool[np.ndarray, " M"]:
-        """Return whether each channel is trusted: the channel has readings, and no open event excludes it or its
-        electrodes."""
-        trusted = self.healthy.used.copy()
-        for event in self.open_events:
-            if event.electrode is not None and self.touching is not None:
-                trusted &= ~self.touching[event.electrode]
-            if event.kind in _CHANNEL_KINDS:
-                trusted &= ~event.channels
-        return trusted
+    def _with_changes(self, change: LastingChange, findings: list[Finding]) -> "SkinHealth":
+        return replace(self, record=self.record.with_changes(change, findings, EventStatus.LASTING))
 
 
 def watch(health: SkinHealth, frames: ArrayLike, times: ArrayLike | None = None) -> SkinHealth:
@@ -558,10 +453,6 @@ def watch(health: SkinHealth, frames: ArrayLike, times: ArrayLike | None = None)
     for time, frame in zip(seconds, checked_frames, strict=True):
         health = health.follow(float(time), frame)
     return health
-
-
-def _with_new_status(event: HealthEvent, status: EventStatus) -> HealthEvent:
-    return eqx.tree_at(lambda event_to_change: event_to_change.status, event, status)
 
 
 def _check_frames(name: str, values) -> Float[np.ndarray, "F M"]:
