@@ -146,7 +146,9 @@ def _shapes(
     shapes, edges = shapes_in(prepared, smooth, options), _edges(prepared)
     if not shapes.bodies:
         return None, f"; no body's {edges[:-1]} explains the voltages better than errors of the model do"
-    if (misfit := float(shapes.misfit)) > (max_misfit := max(1.0, _MAX_SHAPES_RATIO * float(smooth.misfit))):
+    # Where the noise is not known, it is estimated so that the smooth image has a misfit of at most 1.
+    smooth_misfit = float(smooth.misfit) if prepared.noise is not None else min(float(smooth.misfit), 1.0)
+    if (misfit := float(shapes.misfit)) > (max_misfit := max(1.0, _MAX_SHAPES_RATIO * smooth_misfit)):
         return (
             None,
             f"; {edges} of bodies miss the voltages by {misfit:.2g} standard deviations, {max_misfit:.2g} at most",

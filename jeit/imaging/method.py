@@ -270,8 +270,10 @@ def shapes_in(prepared: PreparedDifference, smooth: Reconstruction, options: Met
 
     The result contains a body only if the objective of the fit without it is larger by the factor `least_rise` and the
     Bayesian evidence favours the body. In a sheet, the factor allows for model errors and increases with their share in
-    the variance of the noise.
+    the variance of the noise. If the noise of the voltages is not known, it is estimated from what the smooth image
+    leaves unexplained.
     """
+    prepared = prepared.with_noise_from(float(smooth.misfit))
     model, background = prepared.model, prepared.calibration.conductivity
     is_solid = prepared.mesh.dimension == 3
     departure = as_array(np.log(np.asarray(smooth.conductivity) / float(background)))

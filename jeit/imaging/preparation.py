@@ -180,6 +180,15 @@ class PreparedDifference:
         bodies with sharp outlines, unlike smooth images, cannot adapt to model errors."""
         return self._noise_with_error_share(_SHARP_FACTOR * max(self._misfit, _MIN_MISFIT))
 
+    def with_noise_from(self, misfit: float) -> PreparedDifference:
+        """Copy of the difference with a noise estimated from the `misfit` of an image, in units of `modelled_noise`, if
+        the noise is not known and the misfit exceeds 1."""
+        if self.noise is not None or misfit <= 1:
+            return self
+        relative_noise, used = np.asarray(self.relative_noise), np.asarray(self.mask)
+        unexplained = misfit * np.sqrt(np.mean((np.asarray(self.modelled_noise) / relative_noise)[used] ** 2))
+        return replace(self, quality=replace(self.quality, trusted_noise=float(unexplained)))
+
     @functools.cached_property
     def accuracy(self) -> Accuracy:
         """Errors of the voltage difference, from which the intervals of fitted bodies are computed.

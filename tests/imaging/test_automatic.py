@@ -154,6 +154,22 @@ def test_sharp_outlines_are_fitted_less_closely_where_the_model_is_wrong():
     assert noisy.modelled_share < 0.5 < 0.95 < exact.modelled_share < 1
 
 
+def test_noise_that_is_not_known_is_estimated_from_what_an_image_leaves_unexplained():
+    """So the smooth image has a misfit of at most 1, and bodies that only noise supports are not fitted."""
+    known = prepare_difference(frame(20.0, seed=1), frame(), num_points=450)
+    assert known.with_noise_from(5.0) is known
+    unknown = replace(known, quality=replace(known.quality, trusted_noise=None))
+    assert unknown.with_noise_from(0.9) is unknown
+    scaled = unknown.with_noise_from(5.0)
+    relative_noise = np.asarray(known.relative_noise)
+    modelled, unexplained = (
+        np.sqrt(np.mean((np.asarray(noise) / relative_noise) ** 2))
+        for noise in (unknown.modelled_noise, scaled.noise * relative_noise)
+    )
+    assert unexplained == pytest.approx(5 * modelled)
+    assert (np.asarray(scaled.sharp_noise) > 4.9 * np.asarray(unknown.modelled_noise)).all()
+
+
 def test_shapes_can_be_requested():
     result = image(20.0, method="shapes")
     assert (result.settings.method, result.chosen_by) == ("shapes", "none")

@@ -112,6 +112,7 @@ def prepared(dimension, strongest, noise):
         calibration=SimpleNamespace(conductivity=BATH),
         mesh=SimpleNamespace(dimension=dimension),
         accuracy=None,
+        noise=noise,
     ), np.array([0.0, -strongest * BATH])
 
 
@@ -175,9 +176,10 @@ def test_settings_of_bodies_reach_their_search(monkeypatch, dimension):
     data.model, data.difference = SimpleNamespace(voltages=lambda background: np.zeros(2)), np.zeros(2)
     data.sharp_noise = data.mask = None
     data.modelled_share, data.accuracy = 0.5, None
+    data.with_noise_from = lambda misfit: data
     monkeypatch.setattr(method, "find_inclusions", lambda *_, **__: [])
     monkeypatch.setattr(method, "reconstruct_shapes", lambda *_, **searched: searched)
-    smooth: Any = SimpleNamespace(conductivity=np.ones(2))
+    smooth: Any = SimpleNamespace(conductivity=np.ones(2), misfit=1.0)
     searched: Any = method.shapes_in(data, smooth, method.MethodOptions("gaussian", kinds="columns", progress=print))
     assert searched["progress"] is print
     assert (searched["prior"] is None) if dimension == 2 else (searched["prior"].kinds == "columns")
