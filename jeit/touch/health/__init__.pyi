@@ -1,5 +1,5 @@
-from .event import EventKind, EventStatus, HealthEvent
-from .skin_health import SkinHealth, WatchStatus, watch
+from .event import EventKind, EventStatus, HealthEvent, WatchStatus
+from .skin_health import SkinHealth, watch
 
 __all__ = [
     "EventKind",

@@ -53,6 +53,16 @@ class EventStatus(StrEnum):
     """The change has disappeared: it was mended, or was a press held for an unusually long time."""
 
 
+class WatchStatus(StrEnum):
+    """How a frame of a monitored skin was processed. Each member equals its string value."""
+
+    WATCHED = "watched"
+    PARTIAL = "partial"
+    """Processed, but some of its channels are not usable."""
+    REFUSED = "refused"
+    """Not processed: it has too few readings, or its time is not after that of the last frame."""
+
+
 class HealthEvent(Module):
     """An event in the state of a monitored skin, such as a cut or a failing electrode.
 

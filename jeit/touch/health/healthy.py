@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jeit.arguments import real_array
 from jeit.touch.health.event import change_size, channel_medians, lasting_step, window_change
 from jeit.touch.health.steadiness import Steadiness
 
@@ -334,3 +335,19 @@ def _fraction_outside(scaled_changes: np.ndarray, directions: np.ndarray) -> np.
     energies = np.sum(scaled_changes**2, axis=1)
     energies_outside = energies - np.sum((scaled_changes @ directions) ** 2, axis=1)
     return np.clip(energies_outside / np.maximum(energies, 1e-300), 0.0, 1.0)
+
+
+def check_frames(name: str, values) -> Float[np.ndarray, "F M"]:
+    """Frames (F, M), volts, as an array. Raises `ValueError` for another number of dimensions, and without frames."""
+    frames = real_array(name, values, "frames (F, M), volts")
+    if frames.ndim != 2 or not frames.size:
+        raise ValueError(f"{name} must be frames (F, M), volts, one row each; it has shape {frames.shape}.")
+    return frames
+
+
+def check_times(values, num_frames: int) -> Float[np.ndarray, " F"]:
+    """Times (F,) of frames, seconds, as an array. Raises `ValueError` unless there is a finite time for each frame."""
+    seconds = real_array("times", values, "seconds (F,), one for each frame")
+    if seconds.shape != (num_frames,) or not np.isfinite(seconds).all():
+        raise ValueError(f"times: give one for each of the {num_frames} frames; they have shape {seconds.shape}.")
+    return seconds

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -18,13 +17,14 @@ from jeit.touch.health.event import (
     EventStatus,
     HealthEvent,
     Step,
+    WatchStatus,
     change_size,
     channel_medians,
     is_distinct,
     lasting_step,
 )
 from jeit.touch.health.finding import Finding, ImagedSkin, LastingChange, classify_change
-from jeit.touch.health.healthy import HealthyState, average_frames
+from jeit.touch.health.healthy import HealthyState, average_frames, check_frames, check_times
 from jeit.touch.health.record import CHANNEL_KINDS, MIN_DISAPPEARED_FRACTION, HealthRecord
 
 # Patience, a time longer than any touch is held, in seconds.
@@ -47,16 +47,6 @@ _FIRST_WINDOW_NOTE = (
     "The change is present from the first frame on: gains or contacts that changed since the healthy "
     "recording have the same effect."
 )
-
-
-class WatchStatus(StrEnum):
-    """How a frame of a monitored skin was processed. Each member equals its string value."""
-
-    WATCHED = "watched"
-    PARTIAL = "partial"
-    """Processed, but some of its channels are not usable."""
-    REFUSED = "refused"
-    """Not processed: it has too few readings, or its time is not after that of the last frame."""
 
 
 @dataclass(frozen=True)
@@ -127,10 +117,10 @@ class SkinHealth:
         `ValueError` for frames whose channels are not those of the protocol, fewer than 20 frames, times that do not
         rise, and a patience that is not positive.
         """
-        frames = _check_frames("healthy", healthy)
+        frames = check_frames("healthy", healthy)
         period = 1.0
         if times is not None:
-            seconds = _check_times(times, len(frames))
+            seconds = check_times(times, len(frames))
             if (np.diff(seconds) <= 0).any():
                 raise ValueError("times must increase from frame to frame, in seconds; some do not.")
             period = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
@@ -238,7 +228,7 @@ class SkinHealth:
         as of gains, are then not reported as events. Raises `ValueError` for a different number of channels, or
         readings in fewer than half of them.
         """
-        checked_frames = _check_frames("frames", np.atleast_2d(real_array("frames", frames, "(n, M) volts")))
+        checked_frames = check_frames("frames", np.atleast_2d(real_array("frames", frames, "(n, M) volts")))
         if checked_frames.shape[1] != self.reference.size:
             raise ValueError(f"frames have {checked_frames.shape[1]} channels, and this skin {self.reference.size}.")
         new_reference = channel_medians(np.where(np.isfinite(checked_frames), checked_frames, np.nan))
@@ -262,7 +252,7 @@ class SkinHealth:
         """
         if self.skin is None:
             raise ValueError("images need a forward model: give model and conductivity to SkinHealth.fit.")
-        checked_frames = _check_frames("frames", frames)
+        checked_frames = check_frames("frames", frames)
         if checked_frames.shape[1] != self.reference.size:
             raise ValueError(f"frames have {checked_frames.shape[1]} channels, and this skin {self.reference.size}.")
         return self.skin.images(checked_frames - self.reference, self.trusted)
@@ -449,21 +439,7 @@ def watch(health: SkinHealth, frames: ArrayLike, times: ArrayLike | None = None)
         first_time = health.time + 1 if np.isfinite(health.time) else 0.0
         seconds = first_time + np.arange(len(checked_frames))
     else:
-        seconds = _check_times(times, len(checked_frames))
+        seconds = check_times(times, len(checked_frames))
     for time, frame in zip(seconds, checked_frames, strict=True):
         health = health.follow(float(time), frame)
     return health
-
-
-def _check_frames(name: str, values) -> Float[np.ndarray, "F M"]:
-    frames = real_array(name, values, "frames (F, M), volts")
-    if frames.ndim != 2 or not frames.size:
-        raise ValueError(f"{name} must be frames (F, M), volts, one row each; it has shape {frames.shape}.")
-    return frames
-
-
-def _check_times(values, num_frames: int) -> Float[np.ndarray, " F"]:
-    seconds = real_array("times", values, "seconds (F,), one for each frame")
-    if seconds.shape != (num_frames,) or not np.isfinite(seconds).all():
-        raise ValueError(f"times: give one for each of the {num_frames} frames; they have shape {seconds.shape}.")
-    return seconds
