@@ -71,7 +71,7 @@ _RENAMED = (
     ("jeit.report", "jeit.touch", {"write_heard": "write_sound_labels"}),
     ("jeit.simulate", "jeit.acoustic", _SOUNDS),
     ("jeit.simulate", "jeit.touch", _INDENTERS),
-    ("jeit.touch.attributes", "jeit.touch.attributes", {"least_told": "least_detected"}),
+    ("jeit.touch.attributes", "jeit.touch.attributes", {"least_told": "detection_threshold"}),
     ("jeit.touch.kohonen", "jeit.touch", {"Schedule": "MapSchedule", "touches_told": "touches_reported"}),
     ("jeit.touch.listening", "jeit.touch", {"Heard": "SoundLabels"}),
     ("jeit.touch.networks", "jeit.touch", {"Preset": "NetworkPreset"}),

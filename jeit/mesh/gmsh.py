@@ -128,7 +128,7 @@ def _mesh_with_gmsh(
         raise ValueError(f"source: Gmsh could not mesh the geometry: {message}.") from error
 
 
-class _GmshPen:
+class _GmshDrawing:
     """Pen that draws an outline into Gmsh's geometry kernel: each circle or polygon becomes a curve loop."""
 
     def __init__(self, gmsh: ModuleType):
@@ -147,7 +147,7 @@ class _GmshPen:
 def _draw_outline(gmsh: ModuleType, domain: Domain) -> None:
     if not isinstance(domain, Domain):
         raise ValueError(f"source: expected a file, an outline or None, got {type(domain).__name__}")
-    kernel = _GmshPen(gmsh)
+    kernel = _GmshDrawing(gmsh)
     domain.draw(kernel)
     kernel.shape.addPlaneSurface(kernel.loops)
     kernel.shape.synchronize()

@@ -97,7 +97,7 @@ def point_localisation(place: ArrayLike, found: ArrayLike) -> Localisation:
     return Localisation(float(errors.mean()), float(errors.std()), float(errors.max()), float(1 - is_found.mean()))
 
 
-def least_detected(amount: ArrayLike, detected: ArrayLike) -> float:
+def detection_threshold(amount: ArrayLike, detected: ArrayLike) -> float:
     """Compute the smallest amount, such as a distance, that is detected in half of the trials.
 
     An amount may be the separation of two points that are distinguished, or the gap between two touches. `amount` (n,):
@@ -296,7 +296,7 @@ def touch_attributes(
     def find_in_frames(frames: np.ndarray) -> list[list[Contact]]:
         return [find_contacts(finder, image, noise) for image in np.asarray(linear.image(frames - reference))]
 
-    def press_and_find(touches: Sequence[Sequence[DiscTouch]]) -> list[list[Contact]]:
+    def detect_touches(touches: Sequence[Sequence[DiscTouch]]) -> list[list[Contact]]:
         return find_in_frames(_check_frames(press(touches), len(touches), linear))
 
     report("Weber ratio")
@@ -305,27 +305,27 @@ def touch_attributes(
         loads,
         [
             _strongest_peak(contacts)
-            for contacts in press_and_find([[DiscTouch(centre, disc_load, diameter)] for disc_load in loads])
+            for contacts in detect_touches([[DiscTouch(centre, disc_load, diameter)] for disc_load in loads])
         ],
     )
     report("localisation")
     places = centre + (within * np.sqrt(random.uniform(size=_NUM_PLACES)))[:, None] * _random_directions(
         random, _NUM_PLACES
     )
-    contacts_of_touches = press_and_find([[DiscTouch(place, load, diameter)] for place in places])
+    contacts_of_touches = detect_touches([[DiscTouch(place, load, diameter)] for place in places])
     localisation = point_localisation(
         places, np.array([_strongest_centroid(contacts) for contacts in contacts_of_touches])
     )
     report("two points")
     separations = np.repeat(_RELATIVE_SEPARATIONS * diameter, _NUM_TRIALS)
     half_separations = separations[:, None] / 2 * _random_directions(random, len(separations))
-    contacts_of_touches = press_and_find(
+    contacts_of_touches = detect_touches(
         [[DiscTouch(centre + sign * offset, load, diameter) for sign in (-1, 1)] for offset in half_separations]
     )
-    two_points = least_detected(separations, np.array([len(contacts) > 1 for contacts in contacts_of_touches]))
+    two_points = detection_threshold(separations, np.array([len(contacts) > 1 for contacts in contacts_of_touches]))
     report("contact area")
     relative_diameters = np.repeat(_RELATIVE_DIAMETERS, _NUM_REPETITIONS)
-    contacts_of_touches = press_and_find(
+    contacts_of_touches = detect_touches(
         [[DiscTouch(centre, load * ratio**2, ratio * diameter)] for ratio in relative_diameters]
     )
     area = contact_area(

@@ -71,13 +71,13 @@ def exclude_unusable(
     Returns the new fit, the mask of the usable microphones, the reasons why microphones are unusable ("" for usable
     microphones), and the fraction of the variance of each microphone's levels that its model explains.
     """
-    reasons, explained = _reasons_and_explained(fit, faults)
+    reasons, explained = _exclusions_and_explained_variance(fit, faults)
     is_unusable = np.array([bool(reason) for reason in reasons])
     # The disagreement of some microphones with their models may become apparent only after other microphones are
     # excluded.
     while is_unusable.any() and (~fit.dropped & ~is_unusable).sum() >= 3:
         fit = refit_without(fit, is_unusable)
-        new_reasons, explained = _reasons_and_explained(fit, ("",) * len(is_unusable), explained)
+        new_reasons, explained = _exclusions_and_explained_variance(fit, ("",) * len(is_unusable), explained)
         is_unusable = np.array([bool(reason) for reason in new_reasons]) & ~fit.dropped
         reasons = tuple(
             new_reason if is_new else old_reason
@@ -86,7 +86,9 @@ def exclude_unusable(
     return fit, ~fit.dropped & ~is_unusable, reasons, explained
 
 
-def _reasons_and_explained(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[np.ndarray, " M"]]:
+def _exclusions_and_explained_variance(
+    fit: TapFit, faults, explained=None
+) -> tuple[tuple[str, ...], Float[np.ndarray, " M"]]:
     """Return the reason why each microphone is unusable ("" if usable), and the fraction of the variance of its levels
     that its decay model explains. For excluded microphones this fraction is taken from `explained`."""
     expected, level, use = fit.predicted_level(), fit.level, fit.use

@@ -130,7 +130,7 @@ def _overlap_trace(grid: WindowGrid, lag: int) -> float:
     return float((squared * correlation).sum())
 
 
-def white_freedom(grid: WindowGrid) -> float:
+def white_noise_degrees_of_freedom(grid: WindowGrid) -> float:
     """Degrees of freedom ν of the band power of white noise in one window. The value is exact, except that the
     subtraction of the window's mean in bins 0 and 1 is neglected."""
     # tr A = Σ w² Σ W, where the weights W include the factor 2 / (N Σ w²).
@@ -252,7 +252,7 @@ def intensities(
     ]
     usable = np.stack([usable_windows for usable_windows, _ in fault_results], axis=1)
     power = band_power(samples, grid)
-    freedom = white_freedom(grid)
+    freedom = white_noise_degrees_of_freedom(grid)
     noise = noise_floor(power, usable, freedom) if floor is None else _check_floor(floor, samples.shape[0])
     times = (grid.hop * np.arange(len(power)) + grid.length / 2) / rate
     faults = tuple(reason for _, reason in fault_results)
@@ -314,7 +314,7 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     usable = np.stack(usable_masks, axis=-1)
     power = np.stack([band_power(tap, grid) for tap in samples])
     num_taps, num_windows, num_microphones = power.shape
-    freedom = white_freedom(grid)
+    freedom = white_noise_degrees_of_freedom(grid)
     floor = noise_floor(power.reshape(-1, num_microphones), usable.reshape(-1, num_microphones), freedom)
     # A minimum noise floor prevents a simulated channel without noise from dominating the loudness. Dead channels are
     # ignored.
@@ -389,7 +389,7 @@ def noise_floor(
 def degrees_of_freedom(settings: IntensitySettings, rate: float) -> float:
     """Degrees of freedom ν of the band power of white noise in one window, sampled at `rate` Hz. The variance of the
     power is 2 mean² / ν."""
-    return white_freedom(window_grid(settings, rate, None, "settings"))
+    return white_noise_degrees_of_freedom(window_grid(settings, rate, None, "settings"))
 
 
 def _check_floor(floor, num_microphones: int) -> Float[np.ndarray, " M"]:

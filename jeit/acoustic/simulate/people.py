@@ -34,7 +34,7 @@ WITHIN_PERSON_SPREAD, SLOPE_SPREAD = 0.25, 0.3
 
 
 @dataclass(frozen=True)
-class Trait:
+class TraitDistribution:
     """Distribution of a trait of touches among people.
 
     **Fields**: `median`: median of the trait in SI units; `spread`: standard deviation of the trait's logarithm, or of
@@ -45,31 +45,31 @@ class Trait:
     spread: float
 
 
-SOUND_MANNERS: dict[str, dict[str, Trait]] = {
+SOUND_MANNERS: dict[str, dict[str, TraitDistribution]] = {
     "pat": {
-        "strength": Trait(2.0, 0.4),
-        "length": Trait(0.08, 0.25),
-        "interval": Trait(0.3, 0.3),
-        "slope": Trait(1.5, SLOPE_SPREAD),
+        "strength": TraitDistribution(2.0, 0.4),
+        "length": TraitDistribution(0.08, 0.25),
+        "interval": TraitDistribution(0.3, 0.3),
+        "slope": TraitDistribution(1.5, SLOPE_SPREAD),
     },
     "tickle": {
-        "strength": Trait(0.7, 0.4),
-        "length": Trait(0.04, 0.25),
-        "interval": Trait(1 / 15, 0.3),
-        "radius": Trait(0.01, 0.3),
-        "slope": Trait(1.0, SLOPE_SPREAD),
+        "strength": TraitDistribution(0.7, 0.4),
+        "length": TraitDistribution(0.04, 0.25),
+        "interval": TraitDistribution(1 / 15, 0.3),
+        "radius": TraitDistribution(0.01, 0.3),
+        "slope": TraitDistribution(1.0, SLOPE_SPREAD),
     },
     "stroke": {
-        "strength": Trait(1.0, 0.4),
-        "speed": Trait(0.1, 0.35),
-        "path": Trait(0.12, 0.35),
-        "slope": Trait(0.7, SLOPE_SPREAD),
+        "strength": TraitDistribution(1.0, 0.4),
+        "speed": TraitDistribution(0.1, 0.35),
+        "path": TraitDistribution(0.12, 0.35),
+        "slope": TraitDistribution(0.7, SLOPE_SPREAD),
     },
     "wind": {
-        "strength": Trait(1.0, 0.4),
-        "radius": Trait(0.03, 0.3),
-        "gusts": Trait(0.15, 0.4),
-        "slope": Trait(TURBULENCE, SLOPE_SPREAD),
+        "strength": TraitDistribution(1.0, 0.4),
+        "radius": TraitDistribution(0.03, 0.3),
+        "gusts": TraitDistribution(0.15, 0.4),
+        "slope": TraitDistribution(TURBULENCE, SLOPE_SPREAD),
     },
     "none": {},
 }

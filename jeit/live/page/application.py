@@ -212,7 +212,7 @@ async def _send_pictures(hub: Hub, viewer: Viewer, websocket: WebSocket) -> None
     while True:
         await viewer.wake_event.wait()
         viewer.wake_event.clear()
-        if viewer.wants_state():
+        if viewer.is_state_due():
             await websocket.send_text(hub.state_message(viewer))
         newest = hub.newest()
         if newest is not None and viewer.is_ready_for(newest[0].frame.number):

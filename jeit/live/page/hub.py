@@ -58,7 +58,7 @@ class Viewer:
                 self._drawn_latencies.append((now, now - arrived))
         self.wake_event.set()
 
-    def wants_state(self) -> bool:
+    def is_state_due(self) -> bool:
         """Whether the state of the session is to be sent now: a new state is due, and the page has read the last
         state."""
         if not (self.state_due and self._state_read):

@@ -102,7 +102,7 @@ def channel_names(protocol: Protocol) -> list[str]:
 def electrode_curves(mesh: Mesh, electrodes: AbstractElectrodes) -> list[Float[np.ndarray, "n 2"]]:
     """Curve of n points (n, 2) around each electrode as seen from above, in metres; a single point for a point
     electrode."""
-    pen = _CurvePen()
+    pen = _CurveDrawing()
     electrodes.draw(mesh, pen)
     return pen.curves
 
@@ -136,7 +136,7 @@ def _slice_outline(grid: PixelGrid) -> list[np.ndarray]:
     return [np.asarray(line) for line in contour_generator(x, y, inside).lines(0.5)]
 
 
-class _CurvePen:
+class _CurveDrawing:
     """Pen that collects the electrodes it draws as curves; see `jeit.electrodes.electrodes.ElectrodePen`."""
 
     def __init__(self):

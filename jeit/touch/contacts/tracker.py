@@ -235,11 +235,11 @@ def without_side_lobes(touches: list[TouchPath], weakest: float) -> list[TouchPa
     A linear image of a contact has side lobes, which look like weaker contacts.
     """
 
-    def strongest_beside(touch: TouchPath) -> float:
+    def largest_simultaneous_peak(touch: TouchPath) -> float:
         beside = [one for one in touches if one.onset <= touch.offset and touch.onset <= one.offset]
         return max(float(np.abs(one.peak).max()) for one in beside)
 
-    return [touch for touch in touches if np.abs(touch.peak).max() >= weakest * strongest_beside(touch)]
+    return [touch for touch in touches if np.abs(touch.peak).max() >= weakest * largest_simultaneous_peak(touch)]
 
 
 def _update_touch(touch: _TrackedTouch, time: float, contact: Contact) -> _TrackedTouch:

@@ -27,7 +27,7 @@ from jeit.touch.gestures.segmentation import StreamTouch
 from jeit.touch.learnt.learn_from_presses import Standing
 from jeit.touch.learnt.methods import fit_sharpness, log_odds, probabilities
 from jeit.touch.learnt.resource_limits import apply_in_parts
-from jeit.touch.learnt.skin_file import read_plain, write_plain
+from jeit.touch.learnt.skin_file import read_fields, write_fields
 
 # Minimum ratio of the conductivities of two skins that are considered different, or to have different units.
 _MIN_CONDUCTIVITY_RATIO = 5.0
@@ -254,7 +254,7 @@ class GestureModel:
         for name in ("scale", "known_scale"):
             field_values[name] = {field.name: getattr(field_values[name], field.name) for field in fields(Scale)}
         field_values["reading"] = None if self.reading is None else vars(self.reading)
-        write_plain(path, _FILE_KIND, _FILE_VERSION, field_values, GESTURE_FILE)
+        write_fields(path, _FILE_KIND, _FILE_VERSION, field_values, GESTURE_FILE)
 
     @classmethod
     def read(cls, path: str | Path) -> "GestureModel":
@@ -275,7 +275,7 @@ class GestureModel:
             )
             return cls(**all_values)
 
-        return read_plain(path, _FILE_KIND, _FILE_VERSION, "gesture model", make)
+        return read_fields(path, _FILE_KIND, _FILE_VERSION, "gesture model", make)
 
 
 def _check_labels_and_people(touches, labels, people) -> tuple[np.ndarray, np.ndarray | None]:

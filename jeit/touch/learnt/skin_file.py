@@ -121,7 +121,7 @@ def write_skin(skin: LearntSkin, path: str | Path) -> None:
     ```
     """
     fields_by_name = {item.name: getattr(skin, item.name) for item in fields(skin) if item.name != "standing"}
-    write_plain(path, _FILE_KIND, _FILE_VERSION, fields_by_name, "skin.skops")
+    write_fields(path, _FILE_KIND, _FILE_VERSION, fields_by_name, "skin.skops")
 
 
 def read_skin(path: str | Path) -> LearntSkin:
@@ -148,10 +148,10 @@ def read_skin(path: str | Path) -> LearntSkin:
         path = path / "skin.skops"
     if not path.is_file():
         raise FileNotFoundError(f"'{path}': there is no such file; `jeit touch fit` makes one.")
-    return read_plain(path, _FILE_KIND, _FILE_VERSION, "learnt skin", lambda skin_fields: LearntSkin(**skin_fields))
+    return read_fields(path, _FILE_KIND, _FILE_VERSION, "learnt skin", lambda skin_fields: LearntSkin(**skin_fields))
 
 
-def write_plain(path: str | Path, kind: str, version: int, fields_by_name: dict[str, Any], example: str) -> None:
+def write_fields(path: str | Path, kind: str, version: int, fields_by_name: dict[str, Any], example: str) -> None:
     """Write the fields of an object to one file; the fields may be arrays, estimators, and objects of jeit's classes.
 
     `fields_by_name`: the fields, by name; `kind` and `version` identify the type of file; `example`: a file name that
@@ -164,8 +164,8 @@ def write_plain(path: str | Path, kind: str, version: int, fields_by_name: dict[
         write_with_checksum({"kind": kind, "version": version, "skin": _to_plain(fields_by_name)}, file)
 
 
-def read_plain(path: Path, kind: str, version: int, description: str, make: Callable[[dict[str, Any]], Any]) -> Any:
-    """Read a file that `write_plain` wrote, and return `make(fields)`, where `fields` are the written fields, by name.
+def read_fields(path: Path, kind: str, version: int, description: str, make: Callable[[dict[str, Any]], Any]) -> Any:
+    """Read a file that `write_fields` wrote, and return `make(fields)`, where `fields` are the written fields, by name.
 
     Nothing in the file is executed. `description`: the expected content of the file, as error messages name it. Raises
     `ValueError` if the file is of another `kind` or contains anything but arrays, estimators and objects of jeit's

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jeit.touch.attributes import contact_area, least_detected, point_localisation, response_times, weber_ratio
+from jeit.touch.attributes import contact_area, detection_threshold, point_localisation, response_times, weber_ratio
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -35,12 +35,12 @@ def test_localisation():
 def test_least_detected_amount_is_where_half_of_the_trials_detect():
     amount = np.repeat([0.01, 0.02, 0.03, 0.04], 10)
     result = np.concatenate([np.arange(10) < number for number in (0, 2, 8, 10)])
-    assert least_detected(amount, result) == pytest.approx(0.025)
-    assert least_detected(amount, np.ones(40, bool)) == 0.01
-    assert least_detected(amount, np.zeros(40, bool)) == np.inf
+    assert detection_threshold(amount, result) == pytest.approx(0.025)
+    assert detection_threshold(amount, np.ones(40, bool)) == 0.01
+    assert detection_threshold(amount, np.zeros(40, bool)) == np.inf
     # The fraction rises with the amount. One failed trial does not change that.
     odd = np.concatenate([np.arange(10) < number for number in (0, 2, 10, 9)])
-    assert 0.02 < least_detected(amount, odd) < 0.03
+    assert 0.02 < detection_threshold(amount, odd) < 0.03
 
 
 def test_areas_and_blur():
@@ -69,7 +69,7 @@ BAD = {
     "text": (lambda: weber_ratio("a", "b"), "load"),
     "places": (lambda: point_localisation(np.ones((3, 2)), np.ones((2, 2))), "shapes"),
     "nothing found": (lambda: point_localisation(np.ones((3, 2)), np.full((3, 2), np.nan)), "no touch was found"),
-    "numbers as detections": (lambda: least_detected([1.0, 2.0], [0, 2]), "true or false"),
+    "numbers as detections": (lambda: detection_threshold([1.0, 2.0], [0, 2]), "true or false"),
     "one area": (lambda: contact_area(np.ones(4), np.ones(4)), "two different areas"),
     "times": (lambda: response_times([0.0, 0.0, 1.0], np.ones(3)), "must increase"),
     "nothing touches": (lambda: response_times([0.0, 1.0, 2.0], np.zeros(3)), "nowhere positive"),
