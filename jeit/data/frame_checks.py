@@ -32,6 +32,9 @@ MOST_OPPOSITE_SIGNS = 0.75
 MOST_RECIPROCITY_ERROR = 0.63
 # Maximum of `FrameQuality.noise_share` that raises no doubt; it corresponds to that reciprocity error.
 MOST_NOISE = MOST_RECIPROCITY_ERROR / np.sqrt(2)
+# Share of a common factor in the power of the difference above which it is drift of the bath or of a gain. In simulated
+# tanks it was 0.82 to 0.99 with 3 to 100 % drift, and at most 0.55 without drift, even if half of the tank resists.
+_MOST_COMMON = 0.7
 # Maximum fraction of the noise that is left without the channels of an electrode that explains the noise.
 _MOST_LEFT = 0.5
 # Minimum evidence that a difference contains more than noise, in standard deviations (`signal_evidence`). Bodies are
@@ -62,6 +65,8 @@ class FrameQuality:
       factor that all voltages have in common; None if no channels are reciprocal.
     - `noisy_electrode`: the electrode, numbered from 0, whose channels contain most of the noise, if `noise_share` is
       large and a single electrode explains it; otherwise None.
+    - `common_factor`: relative change that all voltages have in common, if it is most of the difference; otherwise 0.
+    - `noise_source`: what `noise_share` was estimated from.
     - `impossible_signs`: fraction of voltages whose sign is impossible on a passive body (the larger of the fractions
       of frame and reference); None if no sign is known.
     - `usable_channels`: number of channels that are usable in both frame and reference.
@@ -85,13 +90,21 @@ class FrameQuality:
     rounding: float = 0.0
     noise_share: float | None = None
     noisy_electrode: int | None = None
+    common_factor: float = 0.0
+    noise_source: str = "reciprocity"
 
     @property
     def doubt(self) -> str:
         """A sentence about noise that exceeds half of the signal; otherwise empty."""
         if self.noise_share is None or self.noise_share <= MOST_NOISE:
             return ""
-        found = f"by reciprocity, noise is {percent(self.noise_share)} of the difference from the reference"
+        found = f"by {self.noise_source}, noise is {percent(self.noise_share)} of the difference from the reference"
+        if self.common_factor:
+            return (
+                f"all voltages have changed by {percent(self.common_factor)} alike, as when a bath's temperature or a "
+                f"gain changes. By {self.noise_source}, noise is {percent(self.noise_share)} of the rest of the "
+                "difference: bodies may be missed, or shown where none are."
+            )
         if self.noisy_electrode is not None:
             return (
                 f"{found}, most of it in the channels of electrode {self.noisy_electrode + 1}: check its contact and "
@@ -212,7 +225,8 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
             if num_usable and size > 0
             else (None, None)
         )
-        noise_share, noisy_electrode = (None, None) if error is None else _noise_in(change, mean, deviations)
+        factor, common_share = _common_factor(change, mean, deviations)
+        noise_share, noisy_electrode = (None, None) if error is None else _noise_in(change, mean, deviations, factor)
         own_errors = {f"the reference '{reference.name}'": reference_error, "the frame": reciprocity_error(frame)}
         impossible_share = max(signs) if signs else None
         rounding = float(np.linalg.norm(rounding_of_difference(frame, mean))) / size if size > 0 else 0.0
@@ -227,6 +241,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
                 rounding=rounding,
                 noise_share=noise_share,
                 noisy_electrode=noisy_electrode,
+                common_factor=float(np.real(factor)) if common_share > _MOST_COMMON else 0.0,
                 reason=_rejection_reason(
                     measurement.protocol.num_electrodes,
                     num_usable,
@@ -242,16 +257,26 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
     return results
 
 
-def _noise_in(
+def _common_factor(
     change: Measurement, mean: Measurement, deviations: Float[np.ndarray, " M"]
+) -> tuple[complex, float]:
+    """Relative change that the voltages of a `change` from the reference `mean` have in common, and its share of the
+    change's power. Channels are weighted by their `deviations` (M,)."""
+    weights = np.where(np.asarray(change.mask)[0], deviations**-2.0, 0.0)
+    voltages, levels = np.nan_to_num(np.asarray(change.voltages)[0]), np.nan_to_num(np.asarray(mean.voltages)[0])
+    power, change_power = (float(np.sum(weights * np.abs(values) ** 2)) for values in (levels, voltages))
+    factor = np.vdot(levels, weights * voltages) / power if power > 0 else 0.0
+    return factor, float(np.abs(factor) ** 2 * power / change_power) if change_power > 0 else 0.0
+
+
+def _noise_in(
+    change: Measurement, mean: Measurement, deviations: Float[np.ndarray, " M"], factor: complex
 ) -> tuple[float | None, int | None]:
     """`FrameQuality.noise_share` and `FrameQuality.noisy_electrode` of a `change` from the reference `mean`.
-    `deviations` (M,): expected errors of the channels, relative to each other."""
-    common_mask, protocol = np.asarray(change.mask)[0], change.protocol
+    `deviations` (M,): expected errors of the channels, relative to each other; `factor`: relative change that all
+    voltages have in common."""
+    protocol = change.protocol
     voltages, levels = np.nan_to_num(np.asarray(change.voltages)[0]), np.nan_to_num(np.asarray(mean.voltages)[0])
-    weights = np.where(common_mask, deviations**-2.0, 0.0)
-    power = float(np.sum(weights * np.abs(levels) ** 2))
-    factor = np.vdot(levels, weights * voltages) / power if power > 0 else 0.0
     rest = replace(change, voltages=as_array((voltages - factor * levels)[None]))
     if not (error := reciprocity_error(rest, deviations)):
         return error, None

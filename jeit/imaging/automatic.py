@@ -3,6 +3,7 @@ Gauss-Newton imaging and a fit of the shapes of bodies."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,10 +12,12 @@ from jaxtyping import Array, Float
 from jeit.arguments import percent
 from jeit.imaging.method import METHODS, Imaged, MethodOptions, of_shapes, shapes_in
 from jeit.imaging.preparation import PreparedDifference
+from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.prior.matern import MEASURED_DATA_PRIOR
 from jeit.inverse.shapes import ShapeReconstruction
 from jeit_solvers import results_on_cores
+from jeit_solvers.engines import as_array
 
 # Changes of conductivity relative to the background above which voltages are not linear in conductivity: in general,
 # and for noisy data, whose images show far less than the true change. Data are noisy if the share of noise in the
@@ -179,6 +182,34 @@ def linear_image_fault(prepared: PreparedDifference, change: Float[Array, " m"])
             "linear"
         )
     return ""
+
+
+def with_unexplained_noise(
+    prepared: PreparedDifference, reconstruction: LinearReconstruction, change: Float[Array, " m"]
+) -> PreparedDifference:
+    """Copy of the difference whose noise, if it is not known, is estimated from what its linear image, the `change` of
+    conductivity per cell in S/m (2-D: S), leaves unexplained.
+
+    An image explains a part of noise, too, which is estimated from the image of random noise, and leaves errors of the
+    linear model unexplained. The doubt allows for the first; inclusions have to exceed what is left unexplained only,
+    so that strong bodies are listed."""
+    if prepared.noise is not None:
+        return prepared
+    background, relative_noise = float(prepared.calibration.conductivity), np.asarray(prepared.relative_noise)
+    used, difference = np.asarray(prepared.mask), np.asarray(prepared.difference)
+    size, modelled = (
+        float(np.sqrt(np.mean((np.asarray(volts) / relative_noise)[used] ** 2)))
+        for volts in (difference, prepared.modelled_noise)
+    )
+    random = np.where(used, size * relative_noise * np.random.default_rng(0).standard_normal(used.size), 0)
+    unexplained, unexplained_noise = (
+        _unexplained_share(pair, background, np.asarray(image) / background, _DERIVATIVE_STEP)
+        for pair, image in (
+            (prepared, change),
+            (replace(prepared, difference=as_array(random)), reconstruction.image(random)),
+        )
+    )
+    return prepared.with_noise_from(unexplained * size / modelled, unexplained / unexplained_noise)
 
 
 def _unexplained_share(prepared: PreparedDifference, background: float, relative: np.ndarray, step: float) -> float:

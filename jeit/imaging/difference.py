@@ -18,9 +18,9 @@ from jeit.data.frame_checks import FrameQuality
 from jeit.electrodes import AbstractElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import Inclusion, Raster, SolidForm
-from jeit.image.inclusions import LEAST_SIGNIFICANCE, inclusion_regions
+from jeit.image.inclusions import inclusion_regions
 from jeit.image.rasters import CONDUCTIVE, RESISTIVE
-from jeit.imaging.automatic import image_automatically
+from jeit.imaging.automatic import image_automatically, with_unexplained_noise
 from jeit.imaging.calibration import Clock
 from jeit.imaging.doubts import doubts_of_data
 from jeit.imaging.method import AUTO, METHODS, ImagingSettings, MethodOptions, as_settings
@@ -58,7 +58,7 @@ class ImagedDifference:
       complex voltages, the complex change of admittivity σ + iωε.
     - `raster`: `change` on a grid, NaN outside the mesh; `extent`: (x_min, x_max, y_min, y_max) in metres.
     - `inclusions`: regions of changed conductivity, strongest first; the `shapes` if there are any. Inclusions must
-      exceed the noise of the image. In linear images they must also differ from a change common to all voltages. In
+      exceed the noise of the image. In linear images they are changes beside one common to all voltages. In
       iterative images they are found in the logarithm of conductivity, which weights both signs alike; in complex
       images in the real part.
     - `unlike_electrodes`: electrodes, numbered from 0, whose channels the model fits far worse than those of the other
@@ -160,6 +160,11 @@ class ImagedDifference:
         reconstruction = self.reconstruction
         doubts = doubts_of_data(self.measurement, self.reference, self.calibration, self.quality)
         if isinstance(reconstruction, LinearReconstruction):
+            if self.lowest < -1:
+                doubts.append(
+                    f"the linear image falls to {percent(self.lowest)} of the background, below -100 %: bodies may be "
+                    "out of place, missing, or shown where none are; leave out --method, or take gauss-newton."
+                )
             return tuple(doubts)
         if isinstance(reconstruction, Reconstruction) and reconstruction.status != Status.CONVERGED:
             doubts.append(
@@ -274,6 +279,8 @@ def image_difference(
                 f"The hyperparameter {float(reconstruction.hyperparameter):.3g} leaves nothing of the data: give "
                 "another, or a rule."
             )
+        if isinstance(reconstruction, LinearReconstruction) and not np.iscomplexobj(change):
+            prepared = with_unexplained_noise(prepared, reconstruction, change)
     with clock("raster and inclusions"):
         grid = Raster.create(_imaged_on(reconstruction, calibration).mesh, shape=settings.raster_shape)
         imaged = ImagedDifference(
@@ -303,7 +310,8 @@ def _inclusions(
     imaged: ImagedDifference, grid: Raster, prepared: PreparedDifference
 ) -> tuple[list[Inclusion], UInt8[np.ndarray, "rows columns"] | None]:
     """Inclusions of an image, with the change of conductivity as their peak; and labels of the pixels, if requested.
-    Inclusions of smooth images must exceed the noise of the image."""
+    Inclusions of smooth images must exceed the noise of the image. Those of linear images are found in the image of the
+    difference without a change common to all voltages."""
     settings, reconstruction, background = imaged.settings, imaged.reconstruction, imaged.calibration.conductivity
     if imaged.shapes is not None:
         bodies = imaged.shapes.bodies
@@ -314,22 +322,11 @@ def _inclusions(
         noise = as_array(image_noise(reconstruction))
     elif isinstance(reconstruction, LinearReconstruction):
         noise = as_array(reconstruction.image_noise(np.where(prepared.mask, prepared.modelled_noise, 0)))
+        if not imaged.is_complex:
+            departure = as_array(departure - np.asarray(reconstruction.image(prepared.common_change)))
     regions = inclusion_regions(imaged.mesh, departure, level=imaged.level, least_peak=settings.least_peak, noise=noise)
-    if isinstance(reconstruction, LinearReconstruction) and noise is not None:
-        apart = np.abs(departure - np.real(reconstruction.image(_common_change(prepared)))) - LEAST_SIGNIFICANCE * noise
-        regions = [(inclusion, region) for inclusion, region in regions if (apart[region] > 0).any()]
     inclusions = [_with_change(inclusion, background) if imaged.iterative else inclusion for inclusion, _ in regions]
     return inclusions, _region_labels(regions, grid) if settings.segment else None
-
-
-def _common_change(prepared: PreparedDifference) -> Inexact[np.ndarray, " M"]:
-    """The part of the voltage difference (M,), volts, that is a factor common to all voltages, as of a bath that has
-    become warmer or of a gain that has drifted. Channels are weighted by their noise."""
-    used, noise = np.asarray(prepared.mask), np.asarray(prepared.modelled_noise)
-    reference, difference = np.asarray(prepared.reference.voltages)[0], np.asarray(prepared.difference)
-    scaled_reference = np.where(used, reference / noise**2, 0)
-    factor = np.vdot(scaled_reference, difference) / np.vdot(scaled_reference, np.where(used, reference, 0))
-    return factor * np.where(used, reference, 0)
 
 
 def _body_inclusion(body: Star | Ellipsoid, background: float) -> Inclusion:

@@ -13,7 +13,12 @@ from jaxtyping import Array, Bool, Float
 
 from jeit.arguments import check_kind
 from jeit.data import Measurement
-from jeit.data.frame_checks import FrameQuality, assess, check_same_setup, rounding_of_difference
+from jeit.data.frame_checks import (
+    FrameQuality,
+    assess,
+    check_same_setup,
+    rounding_of_difference,
+)
 from jeit.data.screening import mask_spikes
 from jeit.data.transfer import as_driven
 from jeit.electrodes import AbstractElectrodes
@@ -180,14 +185,28 @@ class PreparedDifference:
         bodies with sharp outlines, unlike smooth images, cannot adapt to model errors."""
         return self._noise_with_error_share(_SHARP_FACTOR * max(self._misfit, _MIN_MISFIT))
 
-    def with_noise_from(self, misfit: float) -> PreparedDifference:
+    @property
+    def common_change(self) -> Float[np.ndarray, " M"]:
+        """The part of `difference` (M,), volts, that is a factor common to all voltages, as of a bath that has become
+        warmer or of a gain that has drifted; 0 if it is not most of the difference."""
+        return self.quality.common_factor * np.where(self.mask, np.asarray(self.reference.voltages)[0], 0)
+
+    def with_noise_from(self, misfit: float, noise_share: float | None = None) -> PreparedDifference:
         """Copy of the difference with a noise estimated from the `misfit` of an image, in units of `modelled_noise`, if
-        the noise is not known and the misfit exceeds 1."""
+        the noise is not known and the misfit exceeds 1. `noise_share`: see `FrameQuality`; default: from the misfit."""
         if self.noise is not None or misfit <= 1:
             return self
         relative_noise, used = np.asarray(self.relative_noise), np.asarray(self.mask)
         unexplained = misfit * np.sqrt(np.mean((np.asarray(self.modelled_noise) / relative_noise)[used] ** 2))
-        return replace(self, quality=replace(self.quality, trusted_noise=float(unexplained)))
+        change = np.asarray(self.difference) - self.common_change
+        size = float(np.sqrt(np.mean(np.abs(change / relative_noise)[used] ** 2)))
+        quality = replace(
+            self.quality,
+            trusted_noise=float(unexplained),
+            noise_share=min(1.0, float(unexplained) / size if noise_share is None else noise_share),
+            noise_source="what the image leaves unexplained",
+        )
+        return replace(self, quality=quality)
 
     @functools.cached_property
     def accuracy(self) -> Accuracy:

@@ -74,7 +74,7 @@ def test_a_linear_image_of_negative_conductivity_is_doubted(imaged, printed):
     change = np.asarray(imaged.change).copy()
     change[0] = -1.3 * background
     text, rows = printed(change=change, inclusions=())
-    assert rows == [*USUAL, "linear image"]
+    assert rows == [*USUAL, "doubt"]
     assert "falls to -130 % of the background" in text
     assert "no inclusion found" in text
     assert "peaks of the image" not in text
@@ -90,9 +90,28 @@ def test_noise_and_a_common_change_are_no_inclusions_and_a_body_beside_them_is()
     assert not found.inclusions
     assert found.quality.noise_share > 0.9
     warmer = EMPTY / 1.05 * (1 + 0.1 * signal * rng.normal(size=EMPTY.shape))
-    assert not image_difference(tank(warmer), tank(EMPTY), settings).inclusions
+    found = image_difference(tank(warmer), tank(EMPTY), settings)
+    assert not found.inclusions
+    assert "all voltages have changed by -4.6 % alike" in found.doubts[0]
+    body = image_difference(tank(FULL / 1.1), tank(EMPTY), settings).inclusions[0]
+    assert np.hypot(body.centroid[0] - 0.02, body.centroid[1] - 0.01) < 0.005
     (body,) = image_difference(tank(0.98 * FULL), tank(EMPTY), settings).inclusions
     assert np.hypot(body.centroid[0] - 0.02, body.centroid[1] - 0.01) < 0.005
+
+
+def test_noise_that_reciprocity_does_not_show_is_what_a_linear_image_leaves_unexplained():
+    """One channel of each reciprocal pair: noise alone is doubted; a body is found."""
+    settings, rng = ImagingSettings(method="one-step", num_points=300), np.random.default_rng(0)
+    one_of_each = np.ones(EMPTY.size, bool)
+    one_of_each[np.asarray(MODEL.protocol.reciprocal_pairs()[0])[:, 1]] = False
+    noisy, body, rest = (
+        tank(row).masked(one_of_each, "one of each pair")
+        for row in (EMPTY * (1 + 1e-3 * rng.normal(size=EMPTY.size)), FULL, EMPTY)
+    )
+    found = image_difference(noisy, rest, settings)
+    assert found.quality.noise_share > 0.5
+    assert "by what the image leaves unexplained" in found.doubts[-1]
+    assert [one.sign for one in image_difference(body, rest, settings).inclusions] == [1]
 
 
 def test_the_first_doubt_is_written_in_the_picture(imaged):

@@ -189,7 +189,7 @@ def show(console, result: "ImagedDifference", *, frame_given: bool = False) -> N
         f" and {with_unit(background.imag, unit)} of susceptivity" if isinstance(background, complex) else ""
     )
     noise_text = "not known" if noise is None else f"{percent(noise.relative)}, from {noise.method}"
-    noise_text = noise_text if share is None else f"{percent(share)}, from reciprocity"
+    noise_text = noise_text if share is None else f"{percent(share)}, from {result.quality.noise_source}"
     rows = [
         ("background", f"{background_text}, misfit {percent(float(calibration.misfit))}"),
         ("difference", f"{percent(result.quality.difference)} of the reference"),
@@ -209,12 +209,6 @@ def show(console, result: "ImagedDifference", *, frame_given: bool = False) -> N
         misfit = f"misfit {float(reconstruction.misfit):.2g} standard deviations"
         iterations = counted(int(reconstruction.iterations), "iteration")
         rows.append(("iteration", f"{reconstruction.status}, {iterations}, {misfit}"))
-    elif result.lowest < -1:
-        explanation = (
-            f"falls to {percent(result.lowest)} of the background, below -100 %: bodies may be out of place, missing, "
-            "or shown where none are; leave out --method, or take gauss-newton"
-        )
-        rows.append(("linear image", explanation))
     rows += [("doubt", doubt) for doubt in result.doubts]
     if result.shapes is not None:
         rows.append(("bodies", bodies_text(result.shapes, result.mesh.dimension)))
