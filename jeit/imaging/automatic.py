@@ -197,9 +197,9 @@ def with_unexplained_noise(
         return prepared
     background, relative_noise = float(prepared.calibration.conductivity), np.asarray(prepared.relative_noise)
     used, difference = np.asarray(prepared.mask), np.asarray(prepared.difference)
-    size, modelled = (
+    size, rest, modelled = (
         float(np.sqrt(np.mean((np.asarray(volts) / relative_noise)[used] ** 2)))
-        for volts in (difference, prepared.modelled_noise)
+        for volts in (difference, difference - prepared.common_change, prepared.modelled_noise)
     )
     random = np.where(used, size * relative_noise * np.random.default_rng(0).standard_normal(used.size), 0)
     unexplained, unexplained_noise = (
@@ -209,7 +209,7 @@ def with_unexplained_noise(
             (replace(prepared, difference=as_array(random)), reconstruction.image(random)),
         )
     )
-    return prepared.with_noise_from(unexplained * size / modelled, unexplained / unexplained_noise)
+    return prepared.with_noise_from(unexplained * size / modelled, unexplained / unexplained_noise * size / rest)
 
 
 def _unexplained_share(prepared: PreparedDifference, background: float, relative: np.ndarray, step: float) -> float:

@@ -13,12 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from jeit.arguments import check_kind
 from jeit.data import Measurement
-from jeit.data.frame_checks import (
-    FrameQuality,
-    assess,
-    check_same_setup,
-    rounding_of_difference,
-)
+from jeit.data.frame_checks import FrameQuality, assess, check_same_setup, rounding_of_difference
 from jeit.data.screening import mask_spikes
 from jeit.data.transfer import as_driven
 from jeit.electrodes import AbstractElectrodes
