@@ -46,7 +46,10 @@ Contact = Annotated[
 Nodes = Annotated[int | None, typer.Option(help="Nodes of the mesh, about (default 2000; of a solid body 10000).")]
 AsIs = Annotated[
     bool,
-    typer.Option("--as-is", help="Go on though electrodes, channels or signs look wired otherwise than described."),
+    typer.Option(
+        "--as-is",
+        help="Go on though electrodes, channels or signs look wired otherwise than described; correct nothing.",
+    ),
 ]
 Model = Annotated[
     Path | None,

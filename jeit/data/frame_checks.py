@@ -66,7 +66,8 @@ class FrameQuality:
     - `noisy_electrode`: the electrode, numbered from 0, whose channels contain most of the noise, if `noise_share` is
       large and a single electrode explains it; otherwise None.
     - `common_factor`: relative change that all voltages have in common, if it is most of the difference; otherwise 0.
-    - `noise_source`: what `noise_share` was estimated from.
+    - `noise_source`: what `noise_share` was estimated from; `noise_apart_from`: the part of the difference that
+      `noise_share` does not count.
     - `impossible_signs`: fraction of voltages whose sign is impossible on a passive body (the larger of the fractions
       of frame and reference); None if no sign is known.
     - `usable_channels`: number of channels that are usable in both frame and reference.
@@ -92,6 +93,7 @@ class FrameQuality:
     noisy_electrode: int | None = None
     common_factor: float = 0.0
     noise_source: str = "reciprocity"
+    noise_apart_from: str = "a common factor"
 
     @property
     def doubt(self) -> str:
@@ -111,8 +113,18 @@ class FrameQuality:
                 "cable, or leave the channels out (NaN in the file)."
             )
         return (
-            f"{found} (apart from a common factor): bodies may be missed, or shown where none are. Average more "
-            "frames, or use more current."
+            f"{found} (apart from {self.noise_apart_from}): bodies may be missed, or shown where none are. Average "
+            "more frames, or use more current."
+        )
+
+    def of_rest(self, share: float) -> FrameQuality:
+        """Quality of the rest of the difference, a `share` of it, that moved electrodes do not explain."""
+        noise, noise_share = self.difference_noise, self.noise_share
+        return replace(
+            self,
+            difference_noise=noise and replace(noise, relative=noise.relative / share),
+            noise_share=noise_share and min(1.0, noise_share / share),
+            noise_apart_from="a common factor and moved electrodes",
         )
 
     @property

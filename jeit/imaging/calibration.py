@@ -1,5 +1,5 @@
-"""Calibration of a forward model on a frame of the undisturbed body, with timing of the steps. The last calibration is
-kept for the next frame."""
+"""Mesh of a body, and calibration of a forward model on a frame of the undisturbed body, with timing of the steps. The
+last calibration is kept for the next frame."""
 
 from __future__ import annotations
 
@@ -14,14 +14,20 @@ import jax
 import numpy as np
 
 from jeit.data import Measurement
+from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.electrodes import AbstractMovableElectrodes
+from jeit.electrodes.face_patches import body_mesh
 from jeit.forward import ForwardModel
 from jeit.inverse import calibrate, relative_noise
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.placement import Placement, Uncertainty, place_electrodes
+from jeit.mesh import Body, Mesh, OwnMesh, Solid
+from jeit.protocol import Protocol
 from jeit_solvers import one_thread_of_blas
 from jeit_solvers.engines import as_array
 
+# Default number of mesh nodes for a solid and for a sheet.
+SOLID_POINTS, SHEET_POINTS = 10_000, 2000
 # Misfit of the model to the reference up to which the described electrode positions are used. Above it, estimated
 # positions are used if the ratios of the misfit with estimated to the misfit with described positions are below these
 # limits: with each channel relative to its noise, and with equal weights.
@@ -76,6 +82,40 @@ class Clock:
         start = time.perf_counter()
         yield
         self.seconds[step] = time.perf_counter() - start
+
+
+def imaging_mesh(
+    domain: Body, electrodes: AbstractElectrodes, num_points: int | None, *, usual: int | None = None
+) -> Mesh:
+    """Mesh of a body, finer near the electrodes, where fields are steep.
+
+    **Arguments:**
+
+    - `domain`: the body.
+    - `electrodes`: the electrodes.
+    - `num_points`: number of nodes, approximately; None: `usual`, or, without it, 2,000 for a sheet and 10,000 for a
+      solid.
+    - `usual`: default of `num_points`.
+
+    Raises `ValueError` if `num_points` is given for a body that has its own mesh.
+
+    **Example:**
+
+    ```python
+    mesh = imaging_mesh(pressed.domain, pressed.electrodes, 300)
+    ```
+    """
+    if num_points is None and not isinstance(domain, OwnMesh):
+        num_points = usual or (SOLID_POINTS if isinstance(domain, Solid) else SHEET_POINTS)
+    return body_mesh(domain, electrodes, num_points)
+
+
+@keep_last_result
+def described_model(
+    domain: Body, electrodes: AbstractElectrodes, protocol: Protocol, num_points: int | None
+) -> ForwardModel:
+    """Forward model of the body as it is described."""
+    return ForwardModel(imaging_mesh(domain, electrodes, num_points), electrodes, protocol)
 
 
 def calibrated_model(

@@ -23,6 +23,7 @@ from jeit.image.rasters import CONDUCTIVE, RESISTIVE
 from jeit.imaging.automatic import image_automatically, with_unexplained_noise
 from jeit.imaging.calibration import Clock
 from jeit.imaging.doubts import doubts_of_data
+from jeit.imaging.electrode_changes import ElectrodeChange
 from jeit.imaging.method import AUTO, METHODS, ImagingSettings, MethodOptions, as_settings
 from jeit.imaging.preparation import PreparedDifference, prepare_difference
 from jeit.imaging.wiring import Wiring
@@ -67,6 +68,8 @@ class ImagedDifference:
     - `labels`: label of every pixel of the raster, if requested: 0 background, 1 resistive, 2 conductive.
     - `timings`: duration of each step in seconds.
     - `frame`: number of the imaged frame in its file, from 0; `num_frames`: number of frames in the file.
+    - `electrode_change`: the change of the electrodes since the reference, if it explains most of the difference; the
+      image shows the rest.
 
     **Example:**
 
@@ -94,6 +97,7 @@ class ImagedDifference:
     timings: dict[str, float] = field(default_factory=dict)
     frame: int = 0
     num_frames: int = 1
+    electrode_change: ElectrodeChange | None = None
 
     def __repr__(self) -> str:
         return object_text(
@@ -158,7 +162,8 @@ class ImagedDifference:
         """Reasons to doubt the image, in sentences: too few channels, noise, an implausible background, an iteration
         that did not converge, voltages not explained by the image, or bodies whose kind the data do not determine."""
         reconstruction = self.reconstruction
-        doubts = doubts_of_data(self.measurement, self.reference, self.calibration, self.quality)
+        data = self.measurement, self.reference, self.calibration, self.quality
+        doubts = doubts_of_data(*data, self.electrode_change)
         if isinstance(reconstruction, LinearReconstruction):
             if self.lowest < -1:
                 doubts.append(
@@ -301,6 +306,7 @@ def image_difference(
             timings=clock.seconds,
             frame=prepared.frame,
             num_frames=prepared.num_frames,
+            electrode_change=prepared.electrode_change,
         )
         inclusions, labels = _inclusions(imaged, grid, prepared)
     return replace(imaged, inclusions=tuple(inclusions), labels=labels)

@@ -9,6 +9,7 @@ from jeit.arguments import percent
 from jeit.data import Measurement
 from jeit.data.frame_checks import FrameQuality
 from jeit.electrodes import BoundaryElectrodes
+from jeit.imaging.electrode_changes import ElectrodeChange
 from jeit.inverse.calibration import Calibration
 from jeit.mesh import Domain
 
@@ -28,10 +29,14 @@ _SMALLER_UNITS = (("mV", 1e3), ("uV", 1e6))
 
 
 def doubts_of_data(
-    measurement: Measurement, reference: Measurement, calibration: Calibration, quality: FrameQuality | None = None
+    measurement: Measurement,
+    reference: Measurement,
+    calibration: Calibration,
+    quality: FrameQuality | None = None,
+    electrode_change: ElectrodeChange | None = None,
 ) -> list[str]:
     """Reasons to doubt the data: few usable voltages, an implausible level of the voltages, implausible lengths, a
-    frame that may be the reference, or, with the frame's `quality`, noise."""
+    frame that may be the reference, an `electrode_change`, or, with the frame's `quality`, noise."""
     used, doubts = np.asarray(measurement.mask)[0], []
     if (usable_share := np.mean(used)) < _MIN_USABLE_SHARE:
         doubts.append(
@@ -39,8 +44,10 @@ def doubts_of_data(
             "little of what is where."
         )
     level, lengths = _doubt_of_units(measurement, reference, calibration), _doubt_of_lengths(measurement)
+    order = _doubt_of_order(measurement, reference, calibration)
+    movement = "" if electrode_change is None else electrode_change.doubt
     noise = "" if quality is None else quality.doubt
-    return [*doubts, *filter(None, (level, lengths, _doubt_of_order(measurement, reference, calibration), noise))]
+    return [*doubts, *filter(None, (level, lengths, order, movement, noise))]
 
 
 def _doubt_of_lengths(measurement: Measurement) -> str:

@@ -54,7 +54,8 @@ class ImagingSettings:
     - `num_points`: approximate number of mesh nodes; default: 2,000 for a sheet, 10,000 for a solid.
     - `raster_shape`: (rows, columns) of the raster.
     - `level`, `least_peak`: see `jeit.image.find_inclusions`.
-    - `as_is`: whether to image even if the wiring seems to differ from its description, see `jeit.imaging.wiring`.
+    - `as_is`: whether to image the data unchanged, without corrections for spikes and moved electrodes, and even if the
+      wiring seems to differ from its description, see `jeit.imaging.wiring`.
     - `segment`: whether to label background, resistive and conductive pixels: by the outlines of fitted bodies if there
       are any, otherwise at half of each inclusion's peak. With "auto", images without outlines are then computed by
       total variation.

@@ -17,18 +17,18 @@ from jeit.data.frame_checks import FrameQuality, assess, check_same_setup, round
 from jeit.data.screening import mask_spikes
 from jeit.data.transfer import as_driven
 from jeit.electrodes import AbstractElectrodes
-from jeit.electrodes.face_patches import body_mesh
+from jeit.electrodes.electrodes import AbstractMovableElectrodes
 from jeit.forward import ForwardModel
-from jeit.imaging.calibration import Clock, calibrated_model, estimated_positions, keep_last_result, relative_misfit
+from jeit.imaging.calibration import Clock, calibrated_model, described_model, estimated_positions, relative_misfit
 from jeit.imaging.doubts import doubts_of_data
-from jeit.imaging.wiring import Wiring, exchanges_message, find_wiring
+from jeit.imaging.electrode_changes import ElectrodeChange, ElectrodeChanges
+from jeit.imaging.wiring import Wiring, check_wiring, exchanges_message, find_wiring
 from jeit.inverse import relative_noise
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.channels import electrode_misfits
 from jeit.inverse.placement import Uncertainty
 from jeit.inverse.shapes.quantities import Accuracy
-from jeit.mesh import Body, Mesh, OwnMesh, Solid
-from jeit.protocol import Protocol
+from jeit.mesh import Body, Mesh
 from jeit_solvers.engines import as_array
 
 
@@ -54,8 +54,6 @@ def naming_frame(measurement: Measurement, number: int) -> Iterator[None]:
         raise ValueError(named.sub(lambda _: f"{name}, frame {number}", str(error), count=1)) from error
 
 
-# Default number of mesh nodes for a solid and for a sheet.
-SOLID_POINTS, SHEET_POINTS = 10_000, 2000
 # Minimum share of a voltage difference that is assumed to remain unexplained by any model.
 _MIN_MISFIT = 0.03
 # Factor by which the share of the voltage difference that the model does not explain is larger for images with sharp
@@ -81,8 +79,10 @@ class PreparedDifference:
     - `contact`: calibration of the contact impedance: "each", "common" or "fixed".
     - `wiring`: the estimated connection of electrodes and channels.
     - `calibration`: the forward model fitted to the reference, with its mesh.
-    - `difference`: difference of the voltages (M,) in volts, zero in masked channels.
+    - `difference`: difference of the voltages (M,) in volts, zero in masked channels, without the part due to the
+      `electrode_change`.
     - `mask`: (M,), True for channels that are usable in both frames.
+    - `electrode_change`: the change of the electrodes, if it explains most of the measured difference.
     - `frame`: number of the frame in its file, from 0; `num_frames`: number of frames in the file.
 
     **Example:**
@@ -104,6 +104,7 @@ class PreparedDifference:
     mask: Bool[Array, " M"]
     frame: int = 0
     num_frames: int = 1
+    electrode_change: ElectrodeChange | None = None
 
     @property
     def model(self) -> ForwardModel:
@@ -119,7 +120,8 @@ class PreparedDifference:
     def doubts(self) -> tuple[str, ...]:
         """Reasons to doubt the data, in sentences: too few channels, noise, an implausible background, exchanged
         frames."""
-        return tuple(doubts_of_data(self.measurement, self.reference, self.calibration, self.quality))
+        data = self.measurement, self.reference, self.calibration, self.quality
+        return tuple(doubts_of_data(*data, self.electrode_change))
 
     @property
     def uncertainty(self) -> Uncertainty:
@@ -204,6 +206,25 @@ class PreparedDifference:
         return replace(self, quality=quality)
 
     @functools.cached_property
+    def electrode_changes(self) -> ElectrodeChanges | None:
+        """Estimator of changes of the electrodes; None for electrodes that cannot move, and complex voltages."""
+        deviation = self.uncertainty.position_on(self.mesh)
+        is_movable = isinstance(self.model.electrodes, AbstractMovableElectrodes)
+        if not is_movable or np.iscomplexobj(self.difference) or deviation == 0:
+            return None
+        noise, background = np.asarray(self.relative_noise), float(self.calibration.conductivity)
+        return ElectrodeChanges(self.model, background, noise, np.asarray(self.mask), deviation)
+
+    def without_electrode_change(self) -> PreparedDifference:
+        """Copy of the difference without the part that a change of the electrodes explains, if that is most of it."""
+        estimator, difference = self.electrode_changes, np.asarray(self.difference)
+        if estimator is None or (change := estimator.find(difference)) is None:
+            return self
+        rest = as_array(difference - change.voltages)
+        quality = self.quality.of_rest(change.unexplained)
+        return replace(self, difference=rest, quality=quality, electrode_change=change)
+
+    @functools.cached_property
     def accuracy(self) -> Accuracy:
         """Errors of the voltage difference, from which the intervals of fitted bodies are computed.
 
@@ -231,9 +252,11 @@ class PreparedDifference:
         return 1 - (0 if self.noise is None else self.noise**2 / float(np.mean(relative_sharp_noise**2)))
 
     def _noise_with_error_share(self, share: float) -> Float[Array, " M"]:
-        """Root of the sum of squares of noise, rounding, and an error that is a `share` of the difference, volts."""
+        """Root of the sum of squares of noise, rounding, and an error that is a `share` of the measured difference,
+        volts."""
         relative_noise, used = np.asarray(self.relative_noise), np.asarray(self.mask)
-        relative_size = np.sqrt(np.mean(np.abs(np.asarray(self.difference)[used] / relative_noise[used]) ** 2))
+        measured = np.asarray(self.difference) + (0 if (change := self.electrode_change) is None else change.voltages)
+        relative_size = np.sqrt(np.mean(np.abs(measured[used] / relative_noise[used]) ** 2))
         noise = min(1.0, 0.1 * relative_size) if self.noise is None else self.quality.trusted_noise
         return as_array(np.hypot(relative_noise * np.hypot(noise, share * relative_size), self._rounding))
 
@@ -274,7 +297,8 @@ def prepare_difference(
 
     - `measurement`, `reference`, `frame`: as in `image_difference`.
     - `contact`, `num_points`: as in `ImagingSettings`.
-    - `as_is`: image even if the wiring seems to differ from its description, and leave spikes in place.
+    - `as_is`: image even if the wiring seems to differ from its description, and leave spikes and the effects of moved
+      electrodes in place.
     - `clock`: timer that measures the duration of each step.
 
     Raises `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`) or lack the positions of the
@@ -303,7 +327,7 @@ def prepare_difference(
         if not as_is and (exchange_message := exchanges_message(frame_data, base)):
             raise ValueError(f"'{frame_data.name}' does not fit its reference: {exchange_message}")
     with clock("mesh"):
-        model = _described_model(domain, electrodes, base.protocol, num_points)
+        model = described_model(domain, electrodes, base.protocol, num_points)
     with clock("wiring"):
         wiring = find_wiring(model, base)
         # For data that cannot be imaged, a wiring error is reported only if a different wiring explains the data: pure
@@ -314,7 +338,7 @@ def prepare_difference(
             with naming_frame(measurement, number):
                 raise ValueError(f"'{frame_data.name}' cannot be imaged: {quality.reason}")
     calibration, contact_method = calibrated_model(model, base, contact=contact, clock=clock)
-    return PreparedDifference(
+    prepared = PreparedDifference(
         frame_data,
         base,
         quality,
@@ -327,26 +351,7 @@ def prepare_difference(
         number,
         measurement.num_frames,
     )
-
-
-@keep_last_result
-def _described_model(
-    domain: Body, electrodes: AbstractElectrodes, protocol: Protocol, num_points: int | None
-) -> ForwardModel:
-    """Forward model of the body as it is described."""
-    return ForwardModel(imaging_mesh(domain, electrodes, num_points), electrodes, protocol)
-
-
-def check_wiring(wiring: Wiring, reference: Measurement, as_is: bool) -> None:
-    """Check the `wiring` estimated from `reference`. Raises `ValueError` if it differs from the description or explains
-    the reference too poorly (see `Wiring.fault`), unless `as_is`."""
-    if wiring.fault and not as_is:
-        # Voltages of the opposite sign cannot be calibrated, even with `as_is`.
-        advice = "" if wiring.reversed_signs else "; or go on as it is (as_is=True, --as-is)"
-        raise ValueError(
-            f"'{reference.name}' does not fit its description: {wiring.fault} Mend the wires or the description"
-            f"{advice}."
-        )
+    return prepared if as_is else prepared.without_electrode_change()
 
 
 def select_frames(
@@ -384,32 +389,6 @@ def select_frames(
 def check_measurement(name: str, given: Measurement) -> None:
     """Raise `ValueError` if the argument `name` is not a `Measurement` but, for example, a path."""
     check_kind(name, given, Measurement, "a Measurement, as of jeit.read(path)")
-
-
-def imaging_mesh(
-    domain: Body, electrodes: AbstractElectrodes, num_points: int | None, *, usual: int | None = None
-) -> Mesh:
-    """Mesh of a body, finer near the electrodes, where fields are steep.
-
-    **Arguments:**
-
-    - `domain`: the body.
-    - `electrodes`: the electrodes.
-    - `num_points`: number of nodes, approximately; None: `usual`, or, without it, 2,000 for a sheet and 10,000 for a
-      solid.
-    - `usual`: default of `num_points`.
-
-    Raises `ValueError` if `num_points` is given for a body that has its own mesh.
-
-    **Example:**
-
-    ```python
-    mesh = imaging_mesh(pressed.domain, pressed.electrodes, 300)
-    ```
-    """
-    if num_points is None and not isinstance(domain, OwnMesh):
-        num_points = usual or (SOLID_POINTS if isinstance(domain, Solid) else SHEET_POINTS)
-    return body_mesh(domain, electrodes, num_points)
 
 
 def check_real(measurement: Measurement) -> None:

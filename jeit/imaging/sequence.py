@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool
 
+from jeit.arguments import counted
 from jeit.data import Measurement
 from jeit.data.frame_checks import assess, check_same_setup
 from jeit.data.screening import mask_spikes
@@ -54,6 +55,7 @@ class ImagedSequence:
     - `reconstruction`: the reconstruction matrix, the same for all images.
     - `refused`: (F,), True for frames without an image because they lack channels.
     - `regions`: cells of each requested region, (m,) booleans, by name.
+    - `moved`: (F,), True for frames most of whose difference moved electrodes explain; their images show the rest.
 
     **Example:**
 
@@ -68,12 +70,20 @@ class ImagedSequence:
     reconstruction: LinearReconstruction
     refused: Bool[np.ndarray, " F"]
     regions: Mapping[str, Bool[np.ndarray, " m"]] = field(default_factory=dict)
+    moved: Bool[np.ndarray, " F"] = field(default_factory=lambda: np.zeros(0, bool))
 
     @property
     def doubts(self) -> tuple[str, ...]:
         """Reasons to doubt the images, in sentences, from the frame for which λ was chosen: the one that differs most
-        from the reference."""
-        return self.prepared.doubts
+        from the reference; and the number of frames with moved electrodes."""
+        if not self.moved.any():
+            return self.prepared.doubts
+        num_moved, num_imaged = int(self.moved.sum()), int((~self.refused).sum())
+        return (
+            *self.prepared.doubts,
+            f"electrodes have moved since the reference in {num_moved} of {counted(num_imaged, 'frame')}: they explain "
+            "most of the difference there, and the images show the rest. Measure a new reference.",
+        )
 
 
 def image_sequence(
@@ -165,15 +175,20 @@ def image_sequence(
             raise ValueError(
                 f"method: {settings.method} images frame by frame; take a linear one, or `jeit.inverse.stream`."
             )
-        changes = np.full((num_frames, num_cells), np.nan, np.float32)
+        changes, moved = np.full((num_frames, num_cells), np.nan, np.float32), np.zeros(num_frames, bool)
+        estimator = None if settings.as_is else prepared.electrode_changes
         imaged_frames = np.flatnonzero(~refused)
         for start in range(0, len(imaged_frames), _BATCH):
             batch = imaged_frames[start : start + _BATCH]
-            difference = as_array(np.where(is_common, voltages[batch] - expected, 0))
-            changes[batch] = np.asarray(reconstruction.image(difference))
+            difference = np.where(is_common, voltages[batch] - expected, 0)
+            if estimator is not None:
+                due_to_electrodes = estimator.voltages(difference)
+                moved[batch] = due_to_electrodes.any(axis=1)
+                difference = difference - due_to_electrodes
+            changes[batch] = np.asarray(reconstruction.image(as_array(difference)))
     background = float(np.real(prepared.calibration.conductivity))
     series = ImageSeries(prepared.mesh, changes, times, background, timed=measurement.times is not None)
-    return ImagedSequence(series, prepared, reconstruction, refused, region_masks)
+    return ImagedSequence(series, prepared, reconstruction, refused, region_masks, moved)
 
 
 @dataclass(frozen=True)

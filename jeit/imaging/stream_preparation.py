@@ -12,17 +12,15 @@ from jeit.arguments import check_kind
 from jeit.data import Measurement, screen
 from jeit.data.description import Description
 from jeit.forward import ForwardModel
-from jeit.imaging.calibration import Clock, calibrated_model
+from jeit.imaging.calibration import Clock, calibrated_model, imaging_mesh
 from jeit.imaging.method import NamedPrior, check_body, check_hyperparameter, check_prior, prior_for
 from jeit.imaging.preparation import (
     body_of,
     check_measurement,
     check_real,
-    check_wiring,
-    imaging_mesh,
     select_frames,
 )
-from jeit.imaging.wiring import find_wiring
+from jeit.imaging.wiring import check_wiring, find_wiring
 from jeit.inverse import Imager
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.nonlinear import GaussNewton

@@ -353,3 +353,15 @@ def _exchange_text(places: tuple[int, ...], cycles: list[list[int]]) -> str:
         if len(cycle) > 2
     ]
     return ", and ".join(descriptions)
+
+
+def check_wiring(wiring: Wiring, reference: Measurement, as_is: bool) -> None:
+    """Check the `wiring` estimated from `reference`. Raises `ValueError` if it differs from the description or explains
+    the reference too poorly (see `Wiring.fault`), unless `as_is`."""
+    if wiring.fault and not as_is:
+        # Voltages of the opposite sign cannot be calibrated, even with `as_is`.
+        advice = "" if wiring.reversed_signs else "; or go on as it is (as_is=True, --as-is)"
+        raise ValueError(
+            f"'{reference.name}' does not fit its description: {wiring.fault} Mend the wires or the description"
+            f"{advice}."
+        )

@@ -12,6 +12,7 @@ import numpy as np
 
 from jeit.image import Inclusion
 from jeit.imaging.difference import ImagedDifference
+from jeit.imaging.electrode_changes import ElectrodeChange
 from jeit.imaging.method import METHODS, ImagingSettings
 from jeit.inverse import Uncertainty
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
@@ -212,6 +213,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
             "method": noise.method,
         },
         "unlike_electrodes": {electrode + 1: ratio for electrode, ratio in result.unlike_electrodes.items()},
+        "electrode_change": _electrode_change_report(result.electrode_change),
         "wiring": {"fault": result.wiring.fault or None, "misfit": result.wiring.described},
         "quality": {
             "relative_difference": quality.difference,
@@ -252,6 +254,13 @@ def _uncertainty_report(uncertainty: Uncertainty, mesh: Mesh) -> dict[str, Any]:
         "size": uncertainty.size,
         "other": uncertainty.other,
     }
+
+
+def _electrode_change_report(change: ElectrodeChange | None) -> dict[str, Any] | None:
+    """Report of the movement of the electrodes since the reference, if it explains most of the difference."""
+    if change is None:
+        return None
+    return {"shift": change.shift.tolist(), "shift_unit": "m", "unexplained_relative_to_difference": change.unexplained}
 
 
 def _frame_report(result: ImagedDifference) -> dict[str, Any]:

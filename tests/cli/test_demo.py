@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jeit
-from jeit.imaging.preparation import SHEET_POINTS, SOLID_POINTS
+from jeit.imaging.calibration import SHEET_POINTS, SOLID_POINTS
 from jeit.inverse.prior.matern import PRIORS
 
 

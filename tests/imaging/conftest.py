@@ -4,7 +4,7 @@ import pickle
 
 import pytest
 
-from jeit.imaging import describe, preparation
+from jeit.imaging import calibration, describe
 
 MADE = {}
 
@@ -12,7 +12,7 @@ MADE = {}
 @pytest.fixture(scope="module", autouse=True)
 def meshes_made_once():
     """No test changes a mesh: they are immutable."""
-    make = preparation.body_mesh
+    make = calibration.body_mesh
 
     def made_once(*described, **named):
         key = pickle.dumps((described, named))
@@ -21,6 +21,6 @@ def meshes_made_once():
         return MADE[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (describe, preparation):
+        for module in (describe, calibration):
             patch.setattr(module, "body_mesh", made_once)
         yield

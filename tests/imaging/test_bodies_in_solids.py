@@ -238,7 +238,12 @@ def test_where_electrodes_do_not_distinguish_the_kind_of_a_body_it_is_doubted_an
     whole = SimpleNamespace(measurement=frame, reference=frame)
     quality = SimpleNamespace(doubt="")
     image: Any = SimpleNamespace(
-        shapes=shapes, reconstruction=shapes, calibration=calibration, quality=quality, **vars(whole)
+        shapes=shapes,
+        reconstruction=shapes,
+        calibration=calibration,
+        quality=quality,
+        electrode_change=None,
+        **vars(whole),
     )
     own = Quantities(2.0, (1.7, 2.3), 3e-5, (2e-5, None), 1.5e-5, (1.4e-5, 1.6e-5), 1e-3)
     elsewhere = replace(body(False, np.log(6)), centroid=BALL + np.array([0.0, 0.0, 0.005]))

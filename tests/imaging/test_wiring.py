@@ -12,7 +12,7 @@ from jeit.data import Measurement, read
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.imaging import ImagingSettings, image_difference, prepare_difference
-from jeit.imaging.preparation import imaging_mesh
+from jeit.imaging.calibration import imaging_mesh
 from jeit.imaging.wiring import channel_orders, find_wiring, uniform_impedances
 from jeit.layout import perimeter, ring
 from jeit.mesh import Disk, Polygon, centroids

@@ -12,7 +12,7 @@ from jeit.data import Measurement, impossible_signs, write_table
 from jeit.design.plots.travel import outline_path
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
-from jeit.imaging.preparation import imaging_mesh
+from jeit.imaging.calibration import imaging_mesh
 from jeit.layout import Layout, perimeter, quasi_uniform, read_layout, write_layout
 from jeit.mesh import Domain, Rectangle, quality
 from jeit.mesh.generate.curve import smooth

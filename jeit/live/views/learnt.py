@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.data.description import Description
-from jeit.imaging.preparation import imaging_mesh
+from jeit.imaging.calibration import imaging_mesh
 from jeit.inverse.streaming.stream import FrameStatus
 from jeit.live.pictures import AbstractView, LiveFrame, Marker, Picture, Scene
 from jeit.live.views.conductivity import closed_outline, electrode_curves, mean_frame

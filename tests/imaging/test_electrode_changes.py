@@ -1,0 +1,103 @@
+"""Electrodes that move between a reference and a frame are estimated against the movement of a simulated disk, reported
+and left out of the image; bodies are not taken for moved electrodes."""
+
+import functools
+
+import numpy as np
+import pytest
+
+from jeit import image_difference
+from jeit.data import Measurement
+from jeit.electrodes import BoundaryElectrodes
+from jeit.forward import ForwardModel
+from jeit.imaging import ImagingSettings, image_sequence
+from jeit.layout import ring
+from jeit.mesh import Disk, centroids
+from jeit.protocol import adjacent
+from jeit.report.image import report_image
+
+RADIUS, NOISE = 0.1, 3e-4
+SETTINGS = ImagingSettings("one-step", num_points=600, raster_shape=(64, 64))
+TRUTH = ForwardModel(Disk(RADIUS).mesh(num_points=2000), BoundaryElectrodes(ring(RADIUS, 16), 0.01, 0.01), adjacent(16))
+CENTRES = np.asarray(centroids(TRUTH.mesh))
+SHIFT = 1e-3 * np.random.default_rng(3).normal(size=16)
+CENTRE, DEPTH = np.array([-0.05, 0.03]), 0.2
+
+
+def body(x: float, y: float, radius: float, factor: float) -> np.ndarray:
+    return np.where(np.hypot(*(CENTRES - [x, y]).T) < radius, 0.02 * factor, 0.02)
+
+
+BODIES = {
+    "none": np.full(len(CENTRES), 0.02),
+    "weak": body(*CENTRE, 0.02, 1 + DEPTH),
+    "at an electrode": body(0, 0.09, 0.008, 0.1),
+}
+
+
+@functools.cache
+def frame(name: str, share: float = 0.0, seed: int = 1) -> Measurement:
+    """Frame of a disk with a body, whose electrodes have moved by a `share` of SHIFT."""
+    angles = np.arctan2(*np.asarray(ring(RADIUS, 16)).T[::-1]) + share * SHIFT / RADIUS
+    position = RADIUS * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    moved = TRUTH.with_electrodes(BoundaryElectrodes(position, 0.01, 0.01))
+    voltages = np.asarray(moved.voltages(BODIES[name]))
+    voltages = voltages * (1 + NOISE * np.random.default_rng(seed).normal(size=voltages.shape))
+    used = np.ones(voltages.shape, bool)
+    return Measurement(voltages, used, TRUTH.protocol, electrodes=TRUTH.electrodes, domain=Disk(RADIUS), name=name)
+
+
+@functools.cache
+def image(name: str, share: float = 0.0):
+    return image_difference(frame(name, share), frame("none", 0.0, seed=2), SETTINGS)
+
+
+def test_moved_electrodes_are_estimated_and_show_no_bodies():
+    result = image("none", 1.0)
+    assert result.inclusions == ()
+    # Voltages do not determine what a conformal map of the disk to itself does: a rotation and two more patterns.
+    undetermined = np.stack([np.ones(16), *np.asarray(ring(RADIUS, 16)).T / RADIUS], axis=1)
+    shift, expected = (
+        values - undetermined @ np.linalg.lstsq(undetermined, values)[0]
+        for values in (result.electrode_change.shift[:, 0], SHIFT)
+    )
+    assert np.linalg.norm(shift - expected) < 0.15 * np.linalg.norm(expected)
+    assert result.electrode_change.unexplained < 0.05
+    assert any(f"electrode {np.argmax(np.abs(SHIFT)) + 1} by about" in doubt for doubt in result.doubts)
+    report = report_image(result)
+    assert report["electrode_change"]["shift_unit"] == "m"
+    assert np.shape(report["electrode_change"]["shift"]) == (16, 1)
+
+
+def test_a_weak_body_is_found_beside_moved_electrodes():
+    result = image("weak", 1.0)
+    assert result.electrode_change is not None
+    assert np.linalg.norm(np.asarray(result.inclusions[0].centroid) - CENTRE) < 0.1 * RADIUS
+    assert result.inclusions[0].sign > 0
+
+
+@pytest.mark.parametrize("name", ["weak", "at an electrode"])
+def test_a_body_is_not_taken_for_moved_electrodes(name):
+    result = image(name)
+    assert result.electrode_change is None
+    assert report_image(result)["electrode_change"] is None
+    assert len(result.inclusions) == 1
+
+
+def test_an_image_as_is_leaves_their_effects_in_place():
+    settings = ImagingSettings("one-step", num_points=600, raster_shape=(64, 64), as_is=True)
+    result = image_difference(frame("none", 1.0), frame("none", 0.0, seed=2), settings)
+    assert result.electrode_change is None
+    assert np.abs(result.change).max() > 3 * np.abs(image("none", 1.0).change).max()
+
+
+def test_frames_of_a_series_with_moved_electrodes_are_named():
+    frames = [frame("none", 0.0, seed=5), frame("none", 1.0), frame("weak"), frame("none", 0.8)]
+    voltages = np.concatenate([np.asarray(one.voltages) for one in frames])
+    used = np.ones(voltages.shape, bool)
+    series = Measurement(voltages, used, TRUTH.protocol, electrodes=TRUTH.electrodes, domain=Disk(RADIUS))
+    imaged = image_sequence(series, frame("none", 0.0, seed=2), SETTINGS)
+    np.testing.assert_array_equal(imaged.moved, [False, True, False, True])
+    assert any("2 of 4 frames" in doubt for doubt in imaged.doubts)
+    peaks = np.abs(np.asarray(imaged.series.changes)).max(axis=1)
+    assert (peaks[[1, 3]] < peaks[2]).all()
