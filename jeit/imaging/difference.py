@@ -68,7 +68,7 @@ class ImagedDifference:
     - `labels`: label of every pixel of the raster, if requested: 0 background, 1 resistive, 2 conductive.
     - `timings`: duration of each step in seconds.
     - `frame`: number of the imaged frame in its file, from 0; `num_frames`: number of frames in the file.
-    - `electrode_change`: the change of the electrodes since the reference, if it explains most of the difference; the
+    - `electrode_change`: the change of the electrodes since the reference, if it explains much of the difference; the
       image shows the rest.
 
     **Example:**

@@ -1,56 +1,71 @@
 """Changes of electrodes between a reference and a frame: displacements and changes of contact impedance, estimated from
-the voltage difference.
+the voltage difference together with the change of conductivity.
 
-Displacements t of the electrodes along the directions in which they can move, and changes ζ of the logarithms of their
-contact impedances, change the voltages by J (t, ζ), to first order. These are a few patterns, most of which no body
-causes. A small body that explains a difference is therefore not mistaken for moved electrodes. The estimate minimises
+To first order the difference, divided by the noise of its channels, is
 
-    ½ ‖(d - c v - J (t, ζ)) / κn‖² + ½ ‖t / s‖² + ½ ‖ζ‖²,
+    d = J x + B t + c v + e,
 
-where d is the voltage difference, v are the voltages of the reference, c is a change common to all voltages, n is the
-`relative_noise`, s the standard deviation of electrode positions, and κn 3 % of the difference. If t and ζ explain most
-of the difference, the displaced electrodes are estimated without the linear approximation by
-`jeit.inverse.placement.place_electrodes`.
+where x is the change of conductivity, t are displacements of the electrodes along the directions in which they can move
+and changes of the logarithms of their contact impedances, c is a factor common to all voltages v of the reference, and
+e are errors. All are Gaussian: x with the prior of images, t with the standard deviation of electrode positions, e with
+a part that breaks reciprocity, as noise does, and a part that does not, as errors of the model do. The standard
+deviations of all but c maximise the evidence p(d). Electrodes are taken to have changed if the evidence with t exceeds
+that without t by far, and if t displaces many electrodes and explains much of the difference. The change of the
+voltages is then computed from t without the linear approximation, and t is corrected for what the approximation missed.
+A single displaced electrode is not distinguished from a small body beside it, and stays in the image.
 
 Soleimani, Gómez-Laberge and Adler, Physiological Measurement 27 (2006) S103, on electrode movement in difference
-imaging.
+imaging; Gómez-Laberge and Adler, Physiological Measurement 29 (2008) S89.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.optimize
 from jaxtyping import Bool, Float
 
 from jeit.arguments import percent
 from jeit.forward import ForwardModel
-from jeit.forward.changes import PlacementSensitivity
+from jeit.forward.changes import PlacementSensitivity, shift_electrodes
 from jeit.forward.model import select_channels
 from jeit.imaging.calibration import keep_last_result
-from jeit.inverse.channels import IndependentChannels
-from jeit.inverse.placement import place_electrodes
+from jeit.inverse.linearisation import Linearisation
+from jeit.inverse.prior.priors import AbstractPrior
 from jeit_solvers.engines import as_array, on_host
 
-# Minimum share of the variance of the difference, corrected for the number of unknowns, that changes of electrodes
-# explain, and their maximum size in standard deviations. In 75 simulated and measured tanks with bodies and without
-# movement the share was at most 0.49, in tanks whose electrodes moved 0.9 to 1.
-_MIN_SHARE, _MAX_SIZE = 0.7, 4.0
-# Error of the linear approximation, as a share of the difference.
-_LINEAR_ERROR = 0.03
+# Minimum rise of the logarithm of the evidence, maximum share of the difference that is left, and minimum effective
+# number of displaced electrodes, at most a quarter of all. In simulated disks, rectangles and polygons whose electrodes
+# moved by 0.3 to 1°, with weak bodies or none, these were 41 to 1,000, 0 to 0.7, and 3 to 17. With electrodes at rest,
+# the rise exceeded 30 only for bodies smaller than an electrode beside it, with a number of at most 2.7; in measured
+# tanks it was 8 at most.
+_MIN_RISE, _MAX_REST, _MIN_NUMBER = 30.0, 0.95, 3.0
+# A change is looked for if the electrodes alone, at plausible displacements, explain this share of the difference where
+# errors are `_ASSUMED_ERROR` of it. The share was 0.1 to 0.7 at rest, and 0.87 to 1 after movements by 0.3° or more.
+_MIN_SUSPICIOUS_SHARE, _ASSUMED_ERROR = 0.6, 0.3
+# Standard deviation of the logarithms of contact impedances, and largest common factor, in units of the difference.
+_CONTACT_DEVIATION, _MAX_FACTOR = 1.0, 100.0
+# Initial logarithms of the standard deviations, of conductivity, of errors that break reciprocity and of those that do
+# not, relative to the difference, and of changes of electrodes; width of the prior about the first three.
+_INITIAL_LOGARITHMS, _LOGARITHMS_WIDTH = np.array([-0.3, -3.0, -3.0, -2.0]), 3.0
+# Eigenvalues below this share of the largest one belong to errors alone.
+_RANK_TOLERANCE = 1e-10
+# Number of corrections of the linear approximation.
+_NUM_CORRECTIONS = 3
 
 
 class ElectrodeChange(NamedTuple):
     """Change of the electrodes between a reference and a frame, estimated by `ElectrodeChanges.find`.
 
     **Fields**: `shift` (L, a): displacements along the a directions in which each electrode can move, metres;
-    `voltages` (M,): change of the voltages due to the change of the electrodes, volts; `unexplained`: root mean square
-    of the remaining difference, as a share of the difference without a factor common to all voltages.
+    `voltages` (M,): change of the voltages due to the change of the electrodes, volts; `rest`: root mean square of the
+    remaining difference, as a share of the difference.
     """
 
     shift: Float[np.ndarray, "L a"]
     voltages: Float[np.ndarray, " M"]
-    unexplained: float
+    rest: float
 
     @property
     def doubt(self) -> str:
@@ -58,18 +73,18 @@ class ElectrodeChange(NamedTuple):
         distances = 1e3 * np.linalg.norm(self.shift, axis=1)
         largest = int(np.argmax(distances))
         return (
-            f"electrodes that have moved by about {np.sqrt(np.mean(distances**2)):.2g} mm since the reference (root "
-            f"mean square; electrode {largest + 1} by about {distances[largest]:.2g} mm) explain all but "
-            f"{percent(self.unexplained)} of the difference; the image shows the rest. Measure a new reference."
+            f"electrodes have moved by about {np.sqrt(np.mean(distances**2)):.2g} mm since the reference (root mean "
+            f"square; electrode {largest + 1} by about {distances[largest]:.2g} mm). The image shows the rest of the "
+            f"difference, {percent(self.rest)} of it: measure a new reference."
         )
 
 
 class ElectrodeChanges:
-    """Estimates changes of the electrodes from voltage differences, see the module's docstring.
+    """Estimates changes of the electrodes from voltage differences.
 
     `model`, `background`: the model of the reference and its conductivity, S/m (2-D: S); `noise` (M,): errors of the
     channels relative to each other; `mask` (M,): True for the channels to use; `deviation`: standard deviation of
-    electrode positions, metres.
+    electrode positions, metres; `prior`: the prior of the change of conductivity.
     """
 
     def __init__(
@@ -79,55 +94,158 @@ class ElectrodeChanges:
         noise: Float[np.ndarray, " M"],
         mask: Bool[np.ndarray, " M"],
         deviation: float,
+        prior: AbstractPrior,
     ):
-        self.model, self.background, self.mask, self.deviation = model, background, mask, deviation
-        self.reference, self._derivatives = _voltages_and_derivatives(model, background)
+        self.model, self.background, self.mask, self.prior = model, background, mask, prior
+        self._reference, derivatives = _voltages_and_derivatives(model, background)
         num_contacts = _num_contacts(model)
-        num_shifts = self._derivatives.shape[1] - num_contacts
-        self._spread = np.concatenate([np.full(num_shifts, deviation), np.ones(num_contacts)])
-        self._weights = mask / noise
-        level = self.reference * self._weights
-        self._level = level / np.linalg.norm(level)
-        self._rows = self._without_common_factor((self._derivatives * self._spread).T).T
-        self._eigenvalues, self._eigenvectors = np.linalg.eigh(self._rows.T @ self._rows)
-        num_independent = min(len(IndependentChannels.create(model.protocol).index), int(mask.sum())) - 1
-        # Ratio of the numbers of independent channels and of those that are left after the fit.
-        self._num_ratio = num_independent / max(num_independent - len(self._spread), 1e-9)
-
-    def voltages(self, differences: Float[np.ndarray, "N M"]) -> Float[np.ndarray, "N M"]:
-        """Changes of the voltages (N, M) due to changes of the electrodes, in a linear approximation; zero for
-        differences (N, M) that are not mostly explained by them. All are in volts."""
-        weighted = self._without_common_factor(differences)
-        size = np.linalg.norm(weighted, axis=1, keepdims=True)
-        error = _LINEAR_ERROR * size / np.sqrt(max(np.count_nonzero(self.mask), 1))
-        projected = weighted @ self._rows @ self._eigenvectors
-        coefficients = projected / (np.maximum(self._eigenvalues, 0) + np.where(size > 0, error, 1) ** 2)
-        coefficients = coefficients @ self._eigenvectors.T
-        unexplained = np.linalg.norm(weighted - coefficients @ self._rows.T, axis=1, keepdims=True)
-        is_explained = (unexplained / np.where(size > 0, size, 1)) ** 2 * self._num_ratio < 1 - _MIN_SHARE
-        is_plausible = np.sqrt(np.mean(coefficients**2, axis=1, keepdims=True)) < _MAX_SIZE
-        is_change = (size > 0) & is_explained & is_plausible
-        return np.where(is_change, (coefficients * self._spread) @ self._derivatives.T, 0.0)
+        self._num_shifts = derivatives.shape[1] - num_contacts
+        self._spread = np.repeat([deviation, _CONTACT_DEVIATION], [self._num_shifts, num_contacts])
+        self._noise, self._weights = noise, mask / noise
+        self._patterns = derivatives * self._spread
 
     def find(self, difference: Float[np.ndarray, " M"]) -> ElectrodeChange | None:
-        """Estimate the change of the electrodes that explains most of a voltage `difference` (M,), volts; None if no
-        plausible change does."""
-        if not self.voltages(difference[None]).any():
+        """Estimate the change of the electrodes from a voltage `difference` (M,), volts; None if they have not
+        changed, or if they explain little of the difference."""
+        if (estimator := self.estimator(difference)) is None:
             return None
-        try:
-            measured = as_array(self.reference + difference)
-            placement = place_electrodes(self.model, measured, deviation=self.deviation, mask=as_array(self.mask))
-        except ValueError:
+        coefficients, change = estimator @ difference, np.zeros(len(difference))
+        for _ in range(_NUM_CORRECTIONS):
+            try:
+                change = self._change_of_voltages(coefficients)
+            except ValueError:  # electrodes would overlap or leave the body
+                return None
+            coefficients = estimator @ (difference - change + self._patterns @ coefficients)
+        rest = float(self._size(difference - change) / self._size(difference))
+        return ElectrodeChange(self._shift(coefficients), change, rest) if rest < _MAX_REST else None
+
+    def voltages(
+        self, differences: Float[np.ndarray, "N M"], estimator: Float[np.ndarray, "p M"]
+    ) -> Float[np.ndarray, "N M"]:
+        """Changes of the voltages (N, M) due to changes of the electrodes, in the linear approximation with an
+        `estimator`; zero for differences (N, M) of which they explain little. All are in volts."""
+        coefficients = differences @ estimator.T
+        changes = coefficients @ self._patterns.T
+        is_large = self._size(differences - changes) < _MAX_REST * self._size(differences)
+        # If n electrodes are displaced equally, the square of the sum of squares is n times the sum of fourth powers.
+        squares = (coefficients**2)[:, : self._num_shifts]
+        num_electrodes = self.model.electrodes.num_electrodes
+        square = squares.reshape(len(squares), num_electrodes, -1).sum(axis=2)
+        effective_number = square.sum(axis=1) ** 2 / np.maximum((square**2).sum(axis=1), np.finfo(float).tiny)
+        is_spread = effective_number > min(_MIN_NUMBER, num_electrodes / 4)
+        is_change = self._are_suspicious(differences) & is_large & is_spread
+        return np.where(is_change[:, None], changes, 0.0)
+
+    def estimator(self, difference: Float[np.ndarray, " M"]) -> Float[np.ndarray, "p M"] | None:
+        """Matrix (p, M) that estimates changes of the electrodes, in units of their standard deviations, from a
+        difference in volts. Its standard deviations are those that best explain the `difference` (M,). None if the
+        evidence is not for changes of the electrodes, or if they explain little of the difference."""
+        if not self._are_suspicious(difference[None])[0]:
             return None
-        change = np.where(self.mask, np.asarray(placement.model.voltages(self.background)) - self.reference, 0)
-        rest, whole = self._without_common_factor(np.stack([difference - change, difference]))
-        unexplained = float(np.linalg.norm(rest) / np.linalg.norm(whole))
-        return ElectrodeChange(placement.shift, change, unexplained) if unexplained**2 < 1 - _MIN_SHARE else None
+        noise, mask = as_array(self._noise), as_array(self.mask)
+        linearisation = Linearisation.create(self.model, self.background, prior=self.prior, noise=noise, mask=mask)
+        estimator = _WhitenedProblem(linearisation, difference, self._patterns, self._reference).estimator()
+        if estimator is None or not self.voltages(difference[None], estimator).any():
+            return None
+        return estimator
+
+    def _are_suspicious(self, differences: Float[np.ndarray, "N M"]) -> Bool[np.ndarray, " N"]:
+        """Whether plausible changes of the electrodes alone, beside a common factor, explain enough of differences
+        (N, M) to be looked for."""
+        weighted, rows = self._without_common_factor(differences), self._without_common_factor(self._patterns.T)
+        size = self._size(differences)
+        error = _ASSUMED_ERROR * size / np.sqrt(np.count_nonzero(self.mask))
+        values, vectors = np.linalg.eigh(rows @ rows.T)
+        damped = (weighted @ rows.T @ vectors) / (np.maximum(values, 0) + np.where(size > 0, error, 1)[:, None] ** 2)
+        explained = np.linalg.norm(damped @ vectors.T @ rows, axis=1)
+        return explained > _MIN_SUSPICIOUS_SHARE * size
+
+    def _change_of_voltages(self, coefficients: Float[np.ndarray, " p"]) -> Float[np.ndarray, " M"]:
+        """Change of the voltages (M,) due to changes of the electrodes. Raises `ValueError` if they would overlap or
+        leave the body."""
+        described: Any = self.model.electrodes
+        shift = self._shift(coefficients)
+        electrodes = shift_electrodes(described, np.asarray(described.directions(self.model.mesh)), shift)
+        log_contact = (self._spread * coefficients)[shift.size :]
+        if log_contact.size:
+            impedance = np.asarray(described.contact_impedance) * np.exp(log_contact)
+            electrodes = electrodes.with_contact_impedance(impedance)
+        moved = self.model.with_electrodes(electrodes)
+        return np.where(self.mask, np.asarray(moved.voltages(self.background)) - self._reference, 0.0)
+
+    def _shift(self, coefficients: Float[np.ndarray, " p"]) -> Float[np.ndarray, "L a"]:
+        return (self._spread * coefficients)[: self._num_shifts].reshape(self.model.electrodes.num_electrodes, -1)
 
     def _without_common_factor(self, voltages: Float[np.ndarray, "N M"]) -> Float[np.ndarray, "N M"]:
         """Voltages divided by the noise of their channels, without the part that is a factor common to all."""
-        weighted = voltages * self._weights
-        return weighted - np.outer(weighted @ self._level, self._level)
+        weighted, level = voltages * self._weights, self._reference * self._weights
+        return weighted - np.outer(weighted @ level, level) / (level @ level)
+
+    def _size(self, voltages: Float[np.ndarray, "*N M"]) -> Float[np.ndarray, "*N"]:
+        """Norm of voltages that are divided by the noise of their channels, without the part that is a factor common
+        to all."""
+        return np.linalg.norm(self._without_common_factor(np.atleast_2d(voltages)), axis=-1).reshape(
+            voltages.shape[:-1]
+        )
+
+
+class _WhitenedProblem:
+    """Difference, divided by the noise of its channels, in the eigenbasis of JΓJᵀ, where all covariances but those of
+    the electrodes and of the common factor are diagonal."""
+
+    def __init__(self, linearisation: Linearisation, difference, patterns, reference):
+        spectrum: Any = linearisation.spectrum
+        self._channels, self._num_channels = linearisation.channels, len(difference)
+        self._root_weight = np.asarray(linearisation.root_weight)
+        data, *columns = (self._root_weight * one[self._channels] for one in (difference, reference, *patterns.T))
+        eigenvalues = np.asarray(spectrum.eigenvalues)
+        is_reciprocal = eigenvalues > _RANK_TOLERANCE * eigenvalues.max()
+        self._basis = np.asarray(spectrum.basis)[:, is_reciprocal]
+        self._size = float(np.sqrt(np.mean(data**2)))
+        self._data = self._basis.T @ data
+        self._num_others = len(data) - len(self._data)
+        self._others = max(float(data @ data - self._data @ self._data), 0.0)
+        self._eigenvalues = eigenvalues[is_reciprocal] * (len(data) / eigenvalues.sum())
+        level, *patterns = (self._basis.T @ column for column in columns)
+        self._level = level * (_MAX_FACTOR * self._size * np.sqrt(len(data)) / np.linalg.norm(level))
+        self._patterns = np.stack(patterns, axis=1)
+
+    def estimator(self) -> Float[np.ndarray, "p M"] | None:
+        """See `ElectrodeChanges.estimator`; None if the evidence is not for changes of the electrodes."""
+        options = {"maxiter": 400, "xatol": 0.02, "fatol": 0.05}
+        at_rest, changed = (
+            scipy.optimize.minimize(self._cost, _INITIAL_LOGARITHMS[:number], method="Nelder-Mead", options=options)
+            for number in (3, 4)
+        )
+        if at_rest.fun - changed.fun < _MIN_RISE:
+            return None
+        variance, columns, inner = self._covariance(changed.x)
+        rows = np.exp(changed.x[3]) * np.linalg.solve(inner, (columns / variance[:, None]).T)[:-1] @ self._basis.T
+        estimator = np.zeros((len(rows), self._num_channels))
+        estimator[:, self._channels] = rows * self._root_weight
+        return estimator
+
+    def _covariance(self, logarithms):
+        """Variances (r,), columns (r, q) and the inner matrix (q, q) of the covariance D + C Cᵀ of the data, whose
+        inverse is D⁻¹ - D⁻¹ C (I + Cᵀ D⁻¹ C)⁻¹ Cᵀ D⁻¹."""
+        conductivity, noise, error = np.exp(2 * logarithms[:3]) * self._size**2
+        variance = conductivity * self._eigenvalues + noise + error
+        columns = self._level[:, None]
+        if len(logarithms) > 3:
+            columns = np.column_stack([np.exp(logarithms[3]) * self._patterns, self._level])
+        return variance, columns, np.eye(columns.shape[1]) + (columns.T / variance) @ columns
+
+    def _cost(self, logarithms) -> float:
+        """Negative logarithm of the evidence and of the prior of the `logarithms` of the standard deviations."""
+        variance, columns, inner = self._covariance(logarithms)
+        projected = (columns.T / variance) @ self._data
+        square = self._data**2 @ (1 / variance) - projected @ np.linalg.solve(inner, projected)
+        noise = np.exp(2 * logarithms[1]) * self._size**2
+        square += self._others / noise
+        determinant = np.log(variance).sum() + np.linalg.slogdet(inner)[1] + self._num_others * np.log(noise)
+        departure = (logarithms[:3] - _INITIAL_LOGARITHMS[:3]) / _LOGARITHMS_WIDTH
+        excess = 2 * max(logarithms[3], 0) if len(logarithms) > 3 else 0.0  # beyond the stated standard deviation
+        return 0.5 * (square + determinant + departure @ departure + excess**2)
 
 
 @keep_last_result

@@ -27,6 +27,7 @@ from jeit.inverse import relative_noise
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.channels import electrode_misfits
 from jeit.inverse.placement import Uncertainty
+from jeit.inverse.prior.matern import MEASURED_DATA_PRIOR, PRIORS
 from jeit.inverse.shapes.quantities import Accuracy
 from jeit.mesh import Body, Mesh
 from jeit_solvers.engines import as_array
@@ -82,7 +83,7 @@ class PreparedDifference:
     - `difference`: difference of the voltages (M,) in volts, zero in masked channels, without the part due to the
       `electrode_change`.
     - `mask`: (M,), True for channels that are usable in both frames.
-    - `electrode_change`: the change of the electrodes, if it explains most of the measured difference.
+    - `electrode_change`: the change of the electrodes, if it explains much of the measured difference.
     - `frame`: number of the frame in its file, from 0; `num_frames`: number of frames in the file.
 
     **Example:**
@@ -207,21 +208,24 @@ class PreparedDifference:
 
     @functools.cached_property
     def electrode_changes(self) -> ElectrodeChanges | None:
-        """Estimator of changes of the electrodes; None for electrodes that cannot move, and complex voltages."""
+        """Estimator of changes of the electrodes; None for electrodes that cannot move, complex voltages, and solids,
+        where displacements in two directions explain most of what bodies do."""
         deviation = self.uncertainty.position_on(self.mesh)
-        is_movable = isinstance(self.model.electrodes, AbstractMovableElectrodes)
-        if not is_movable or np.iscomplexobj(self.difference) or deviation == 0:
+        is_movable_on_sheet = isinstance(self.model.electrodes, AbstractMovableElectrodes) and self.mesh.dimension == 2
+        if not is_movable_on_sheet or np.iscomplexobj(self.difference) or deviation == 0:
             return None
         noise, background = np.asarray(self.relative_noise), float(self.calibration.conductivity)
-        return ElectrodeChanges(self.model, background, noise, np.asarray(self.mask), deviation)
+        x_min, x_max, y_min, y_max = self.domain.extent
+        prior = PRIORS[MEASURED_DATA_PRIOR](max(x_max - x_min, y_max - y_min))
+        return ElectrodeChanges(self.model, background, noise, np.asarray(self.mask), deviation, prior)
 
     def without_electrode_change(self) -> PreparedDifference:
-        """Copy of the difference without the part that a change of the electrodes explains, if that is most of it."""
+        """Copy of the difference without the part that a change of the electrodes explains, if that is a large part."""
         estimator, difference = self.electrode_changes, np.asarray(self.difference)
         if estimator is None or (change := estimator.find(difference)) is None:
             return self
         rest = as_array(difference - change.voltages)
-        quality = self.quality.of_rest(change.unexplained)
+        quality = self.quality.of_rest(change.rest)
         return replace(self, difference=rest, quality=quality, electrode_change=change)
 
     @functools.cached_property

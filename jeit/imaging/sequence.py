@@ -55,7 +55,7 @@ class ImagedSequence:
     - `reconstruction`: the reconstruction matrix, the same for all images.
     - `refused`: (F,), True for frames without an image because they lack channels.
     - `regions`: cells of each requested region, (m,) booleans, by name.
-    - `moved`: (F,), True for frames most of whose difference moved electrodes explain; their images show the rest.
+    - `moved`: (F,), True for frames much of whose difference moved electrodes explain; their images show the rest.
 
     **Example:**
 
@@ -82,7 +82,7 @@ class ImagedSequence:
         return (
             *self.prepared.doubts,
             f"electrodes have moved since the reference in {num_moved} of {counted(num_imaged, 'frame')}: they explain "
-            "most of the difference there, and the images show the rest. Measure a new reference.",
+            "much of the difference there, and the images show the rest. Measure a new reference.",
         )
 
 
@@ -176,13 +176,15 @@ def image_sequence(
                 f"method: {settings.method} images frame by frame; take a linear one, or `jeit.inverse.stream`."
             )
         changes, moved = np.full((num_frames, num_cells), np.nan, np.float32), np.zeros(num_frames, bool)
-        estimator = None if settings.as_is else prepared.electrode_changes
+        changes_of_electrodes = None if settings.as_is else prepared.electrode_changes
+        raw_difference = np.where(is_common, voltages[strongest] - expected, 0)
+        estimator = changes_of_electrodes and changes_of_electrodes.estimator(raw_difference)
         imaged_frames = np.flatnonzero(~refused)
         for start in range(0, len(imaged_frames), _BATCH):
             batch = imaged_frames[start : start + _BATCH]
             difference = np.where(is_common, voltages[batch] - expected, 0)
-            if estimator is not None:
-                due_to_electrodes = estimator.voltages(difference)
+            if changes_of_electrodes is not None and estimator is not None:
+                due_to_electrodes = changes_of_electrodes.voltages(difference, estimator)
                 moved[batch] = due_to_electrodes.any(axis=1)
                 difference = difference - due_to_electrodes
             changes[batch] = np.asarray(reconstruction.image(as_array(difference)))
