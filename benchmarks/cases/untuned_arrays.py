@@ -75,7 +75,8 @@ def steep_table(lengths, seeds) -> Table:
 
 def run(options: Options) -> Result:
     """Compute both tables, and check the required figures."""
-    number, lengths, seeds = (1, LENGTHS[1:2], (0,)) if options.quick else (ARRAYS, LENGTHS, (0, 1))
+    # Of a quick run, a test locates a steep array.
+    number, lengths, seeds = (1, (), (0,)) if options.quick else (ARRAYS, LENGTHS, (0, 1))
     found = []
     for k in range(number):
         found.append(locate_by_each(draw_array(REPORTED, SEED + k)))

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Inexact
 
 from jeit.arguments import percent
 from jeit.imaging.method import METHODS, Imaged, MethodOptions, of_shapes, shapes_in
@@ -210,6 +210,18 @@ def with_unexplained_noise(
         )
     )
     return prepared.with_noise_from(unexplained * size / modelled, unexplained / unexplained_noise * size / rest)
+
+
+def change_and_noise(
+    prepared: PreparedDifference, reconstruction: LinearReconstruction, change: Inexact[Array, " m"]
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Values per cell (m,) of a linear image in which inclusions are found, and their noise, S/m (2-D: S): the real
+    part of the `change` of conductivity without a change common to all voltages."""
+    noise = reconstruction.image_noise(np.where(prepared.mask, prepared.modelled_noise, 0))
+    departure = np.real(change)
+    if not np.iscomplexobj(change):
+        departure = departure - np.asarray(reconstruction.image(prepared.common_change))
+    return as_array(departure), as_array(noise)
 
 
 def _unexplained_share(prepared: PreparedDifference, background: float, relative: np.ndarray, step: float) -> float:

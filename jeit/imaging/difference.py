@@ -20,7 +20,7 @@ from jeit.forward import ForwardModel
 from jeit.image import Inclusion, Raster, SolidForm
 from jeit.image.inclusions import inclusion_regions
 from jeit.image.rasters import CONDUCTIVE, RESISTIVE
-from jeit.imaging.automatic import image_automatically, with_unexplained_noise
+from jeit.imaging.automatic import change_and_noise, image_automatically, with_unexplained_noise
 from jeit.imaging.calibration import Clock
 from jeit.imaging.doubts import doubts_of_data
 from jeit.imaging.electrode_changes import ElectrodeChange
@@ -327,9 +327,7 @@ def _inclusions(
     if isinstance(reconstruction, Reconstruction) and reconstruction.inversion.penalty.is_standard_normal:
         noise = as_array(image_noise(reconstruction))
     elif isinstance(reconstruction, LinearReconstruction):
-        noise = as_array(reconstruction.image_noise(np.where(prepared.mask, prepared.modelled_noise, 0)))
-        if not imaged.is_complex:
-            departure = as_array(departure - np.asarray(reconstruction.image(prepared.common_change)))
+        departure, noise = change_and_noise(prepared, reconstruction, imaged.change)
     regions = inclusion_regions(imaged.mesh, departure, level=imaged.level, least_peak=settings.least_peak, noise=noise)
     inclusions = [_with_change(inclusion, background) if imaged.iterative else inclusion for inclusion, _ in regions]
     return inclusions, _region_labels(regions, grid) if settings.segment else None

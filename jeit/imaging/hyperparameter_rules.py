@@ -15,13 +15,16 @@ from jaxtyping import Array, Float
 
 from jeit.arguments import check_name
 from jeit.data import Measurement
-from jeit.image import Inclusion, find_inclusions
+from jeit.image import Inclusion
+from jeit.image.inclusions import inclusion_regions
+from jeit.imaging.automatic import change_and_noise, with_unexplained_noise
 from jeit.imaging.calibration import Clock
 from jeit.imaging.method import ImagingSettings, as_settings, prior_for, rule_for
 from jeit.imaging.preparation import PreparedDifference, check_real, prepare_difference
 from jeit.inverse import RULES
-from jeit.inverse.hyperparameter.choice import Choice
+from jeit.inverse.hyperparameter.choice import DEFAULT_RULE, Choice
 from jeit.inverse.hyperparameter.rules import choose
+from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.linearisation import Linearisation
 
 
@@ -36,7 +39,7 @@ class RuleOutcome:
       the Jacobian, w are the weights of the channels.
     - `noise_figure`: signal-to-noise ratio of the data divided by that of the image (see `jeit.inverse.RULES`).
     - `change`: the image, change of conductivity per cell (m,), S/m (2-D: S).
-    - `inclusions`: inclusions found in the image, strongest first.
+    - `inclusions`: inclusions that exceed the noise of the image, as of `image_difference`, strongest first.
 
     **Example:**
 
@@ -59,7 +62,7 @@ class ComparedRules:
 
     **Fields**
 
-    - `prepared`: the imaged difference.
+    - `prepared`: the imaged difference; a noise that was not known is estimated from the image of the default rule.
     - `settings`: the settings used, among them the prior.
     - `outcomes`: the result of each rule, by name.
     - `refused`: the reason why a rule could not choose λ, by name of the rule.
@@ -135,7 +138,7 @@ def compare_on_data(
         )
         data = linearisation.whiten(prepared.difference)
         jax.block_until_ready(linearisation.spectrum)
-    outcomes, refused = {}, {}
+    outcomes, refused, prepared_with_noise = {}, {}, prepared
     with clock("choose"):
         noise_figure_choice = choose(linearisation.spectrum, "noise-figure", data, mesh)
         for name in names:
@@ -147,13 +150,22 @@ def compare_on_data(
                     raise
                 refused[name] = str(error)
                 continue
-            change = linearisation.spectrum.image(data, choice.hyperparameter)
-            inclusions = find_inclusions(mesh, change, level=settings.level, least_peak=settings.least_peak)
+            factors = linearisation.factors(choice.hyperparameter)
+            fields = choice.hyperparameter, choice.rule, "one-step", choice
+            reconstruction = LinearReconstruction.of_factors(prepared.model, factors, *fields)
+            change = reconstruction.image(prepared.difference)
+            with_noise = with_unexplained_noise(prepared, reconstruction, change)
+            departure, noise = change_and_noise(with_noise, reconstruction, change)
+            regions = inclusion_regions(
+                mesh, departure, level=settings.level, least_peak=settings.least_peak, noise=noise
+            )
             outcomes[name] = RuleOutcome(
                 choice,
                 choice.read(choice.residual) / float(jnp.linalg.norm(data)),
                 noise_figure_choice.read(noise_figure_choice.criterion, choice.hyperparameter),
                 change,
-                tuple(inclusions),
+                tuple(inclusion for inclusion, _ in regions),
             )
-    return ComparedRules(prepared, settings, outcomes, refused)
+            if name == DEFAULT_RULE or len(outcomes) == 1:
+                prepared_with_noise = with_noise
+    return ComparedRules(prepared_with_noise, settings, outcomes, refused)

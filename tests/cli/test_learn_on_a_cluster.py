@@ -36,7 +36,7 @@ def test_command_and_workers_killed(tmp_path):
 
     def start(name, *options):
         command = [sys.executable, "-c", QUICK, "learn", "image", str(skin), "--output", str(tmp_path / name)]
-        command += ["--preset", "quick", "--touches", "1500", "--quiet", *options]
+        command += ["--preset", "quick", "--touches", "1000", "--quiet", *options]
         return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
 
     def wait(name, process, number):
@@ -55,9 +55,9 @@ def test_command_and_workers_killed(tmp_path):
         wait("killed", process, 1)
         process.send_signal(signal.SIGKILL)
         process.communicate()
-        assert 1 <= finished(tmp_path / "killed") < 6
+        assert 1 <= finished(tmp_path / "killed") < 4
         process = start("killed", *scheduler)
-        wait("killed", process, 3)
+        wait("killed", process, 2)
         os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
         assert (process.communicate()[1], process.returncode) == ("", 0)
     assert (tmp_path / "killed" / "network.jeit").read_bytes() == (tmp_path / "whole" / "network.jeit").read_bytes()

@@ -228,7 +228,11 @@ LONG = (
     "jeit reconstruct datamat_3_4.mat",
 )
 # Options that leave less to do of what takes long as it is written.
-LESS = {"jeit choose data1.mat": "--num-points 800", "jeit layout compare": "--cell-mm 8 --places 16"}
+LESS = {
+    "jeit touch fit presses.npz": "--channels 24",
+    "jeit choose data1.mat": "--num-points 800",
+    "jeit layout compare": "--cell-mm 8 --places 16",
+}
 READ = [page for page in PAGES if blocks(page, "python") and not any(name_of(page) in one for one in TYPED.values())]
 
 

@@ -14,7 +14,7 @@ from jeit.data import Measurement
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import find_inclusions
-from jeit.imaging import ImagingSettings, automatic, calibration, difference, prepare_difference
+from jeit.imaging import ImagingSettings, automatic, calibration, compare_on_data, difference, prepare_difference
 from jeit.imaging.automatic import linear_image_fault
 from jeit.imaging.method import METHODS
 from jeit.inverse import Gaussian, calibrate, reconstruct
@@ -296,6 +296,19 @@ def test_artefacts_of_noise_are_not_listed():
     assert len(find_inclusions(mesh, shown, noise=np.full(len(shown), 0.08))) == 2
     with pytest.raises(ValueError, match="noise"):
         find_inclusions(mesh, shown, noise=np.ones(3))
+
+
+def test_noise_without_reciprocal_channels_is_listed_neither_by_an_image_nor_by_the_rules_for_its_hyperparameter():
+    pairs, _ = TRUTH.protocol.reciprocal_pairs()
+    usable = np.ones(TRUTH.protocol.num_measurements, bool)
+    usable[np.asarray(pairs)[:, 1]] = False
+    noise, rest = (frame(noise=0.1, seed=seed).masked(usable, "half") for seed in (3, 4))
+    result = image_difference(noise, rest, ImagingSettings("one-step", **FEW))
+    outcome = compare_on_data(noise, rest, ImagingSettings(**FEW), rules=["noise-figure"])
+    assert len(find_inclusions(result.mesh, result.change)) > 5
+    assert result.inclusions == outcome.outcomes["noise-figure"].inclusions == ()
+    for doubts in (result.doubts, outcome.prepared.doubts):
+        assert any("leaves unexplained" in doubt for doubt in doubts)
 
 
 def test_model_errors_are_noise_to_nonlinear_solvers():

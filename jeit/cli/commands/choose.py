@@ -106,7 +106,7 @@ def show(console, result: "ComparedRules") -> None:
         if outcome.choice.edge:
             console.print(f"  * {outcome.choice.note}", soft_wrap=True)
     for reason in result.refused.values():
-        console.print(f"  {reason}", soft_wrap=True)
+        console.print(f"  {reason.removeprefix('hyperparameter: ')}", soft_wrap=True)
     for doubt in result.prepared.doubts:
         console.print(f"  doubt: {doubt}", soft_wrap=True)
     console.print()
