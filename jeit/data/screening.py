@@ -101,7 +101,8 @@ def screen(
             raise ValueError(f"mask is {given_mask.dtype}; give booleans, True where a voltage is usable.")
         exclude(~given_mask, "excluded by the mask given.")
     values = measurable_values(values)
-    exclude(np.isnan(values), "NaN, infinite or beyond any instrument (an electrode missing or not connected).")
+    is_missing = np.isnan(values)
+    exclude(is_missing, f"NaN, infinite or beyond any instrument{_of_electrodes(is_missing, protocol)}.")
     is_dead = ~np.any(np.where(usable, values, 0) != 0, axis=1)
     if is_dead.all():
         raise ValueError(
@@ -146,6 +147,17 @@ def _hint_of_number(number: int, channels: int) -> str:
     return (
         f" {number} numbers are what {electrodes} electrodes give with {pair_text}: is the number of electrodes right?"
     )
+
+
+def _of_electrodes(is_missing: Bool[np.ndarray, "F M"], protocol: Protocol) -> str:
+    """Clause that names the electrodes without any usable channel in some frame, unless they are all; otherwise
+    empty."""
+    touching = np.array([protocol.channels_touching(electrode) for electrode in range(protocol.num_electrodes)])
+    lost = [bool(channels.any()) and bool(is_missing[:, channels].all(axis=1).any()) for channels in touching]
+    if not any(lost) or all(lost):
+        return ""
+    numbers = ", ".join(str(electrode + 1) for electrode in np.flatnonzero(lost))
+    return f", among them all of electrode{'s' * (sum(lost) > 1)} {numbers}: check the connection"
 
 
 def _as_frames(voltages, protocol: Protocol, name: str) -> np.ndarray:

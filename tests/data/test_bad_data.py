@@ -234,3 +234,14 @@ def test_setups_that_cannot_be_described_are_not_written(tmp_path):
     measurement = data.screen(ONES, ADJACENT, electrodes=NodeElectrodes(np.arange(8)))
     with pytest.raises(ValueError, match="NodeElectrodes"):
         data.write_table(measurement, tmp_path / "a.npz")
+
+
+def test_electrodes_without_any_voltage_are_named_but_none_where_half_of_all_are_missing():
+    voltages = np.random.default_rng(0).uniform(1, 2, 40)
+    touching = np.asarray(ADJACENT.channels_touching(2))
+    (note,) = data.screen(np.where(touching, np.nan, voltages), ADJACENT).notes
+    assert "all of electrode 3: check the connection" in note
+    pairs, _ = ADJACENT.reciprocal_pairs()
+    second = np.isin(np.arange(40), np.asarray(pairs)[:, 1])
+    (note,) = data.screen(np.where(second, np.nan, voltages), ADJACENT).notes
+    assert note.endswith("NaN, infinite or beyond any instrument.")

@@ -33,6 +33,9 @@ _EQUAL_EXPECTED = 1e-6
 # Minimum evidence that a frame differs from an undisturbed frame by more than noise, in standard deviations; minimum
 # number of pairs; relative change below which a frame counts as equal to an undisturbed frame.
 _MIN_EVIDENCE, _MIN_PAIRS, _EQUAL_TOLERANCE = 3.0, 10, 1e-12
+# Noise, as a share of the voltages, above which a noisy electrode is searched for, and a frame without a change that
+# exceeds the noise is refused. Instruments have less than 0.01, skins up to 0.08.
+_LARGEST_NOISE = 0.1
 
 
 class FrameStatus(StrEnum):
@@ -86,28 +89,44 @@ class FrameCheck:
         """Check a raw frame. Returns its voltages (M,), the mask (M,) of usable channels, the status, and the reason
         for the status as a sentence."""
         values, usable, status, reason = self._inspect(frame)
-        if status != FrameStatus.REFUSED and (noise := self._reason_unchanged(values, usable)):
-            return values, usable, FrameStatus.UNCHANGED, f"{reason} {noise}".lstrip()
-        return values, usable, status, reason
-
-    def _reason_unchanged(self, values, usable) -> str:
-        """Sentence that says that a frame differs from an undisturbed frame by noise only; empty otherwise."""
+        if status == FrameStatus.REFUSED:
+            return values, usable, status, reason
         change = np.where(usable, values - self.expected, 0)
         if np.linalg.norm(change) <= _EQUAL_TOLERANCE * self.expected_norm:
-            return "It equals an undisturbed frame."
-        pair_is_usable = usable[self.first] & usable[self.second]
-        if np.count_nonzero(pair_is_usable) < _MIN_PAIRS:
-            return ""
-        first_changes, second_changes = (
-            (self.pair_weights * change[self.first])[pair_is_usable],
-            (self.pair_weights * change[self.second] / self.ratio)[pair_is_usable],
-        )
+            return values, usable, FrameStatus.UNCHANGED, f"{reason} It equals an undisturbed frame.".lstrip()
+        usable, noise_status, noise = self._judge_noise(change, usable)
+        return values, usable, noise_status or status, f"{reason} {noise}".strip()
+
+    def _judge_noise(self, change, usable) -> tuple[Bool[np.ndarray, " M"], FrameStatus | None, str]:
+        """Compare the changes of reciprocal channels, which noise alone makes unequal. Returns the usable channels, and
+        a status and a sentence if a noisy electrode is left out, if noise hides every change, or if there is none."""
+        is_pair = usable[self.first] & usable[self.second]
+        if np.count_nonzero(is_pair) < _MIN_PAIRS:
+            return usable, None, ""
+        first, second = self.pair_weights * change[self.first], self.pair_weights * change[self.second] / self.ratio
         # As in `jeit.data.quality.signal_evidence`: differences of reciprocal channels contain noise, sums also signal.
-        noise_power = np.sum((first_changes - second_changes) ** 2)
-        power = np.sum((first_changes + second_changes) ** 2)
-        if (power - noise_power) * np.sqrt(len(first_changes)) > 2 * _MIN_EVIDENCE * noise_power:
-            return ""
-        return "Nothing but noise: reciprocal channels change alike as by chance."
+        noise, power = np.where(is_pair, (first - second) ** 2, 0), np.sum((first + second)[is_pair] ** 2)
+        noise_power, num_pairs = noise.sum(), np.count_nonzero(is_pair)
+        has_signal = (power - noise_power) * np.sqrt(num_pairs) > 2 * _MIN_EVIDENCE * noise_power
+        level = 2 * np.sum((self.pair_weights * self.expected[self.first])[is_pair] ** 2)
+        if noise_power > _LARGEST_NOISE**2 * level:
+            share = np.sqrt(noise_power / level)
+            num_others = np.maximum((is_pair & ~self.touching[:, self.first]).sum(axis=1), 1)
+            others = (noise * ~self.touching[:, self.first]).sum(axis=1) / num_others
+            electrode = int(np.argmin(others))
+            remaining = usable & ~self.touching[electrode]
+            if others[electrode] < _MAX_REMAINING_SHARE**2 * noise_power / num_pairs and np.count_nonzero(
+                remaining
+            ) >= _MIN_CHANNELS * np.count_nonzero(self.mask):
+                reason = f"Electrode {electrode + 1} breaks reciprocity: its contact is bad. Its channels are left out."
+                return remaining, FrameStatus.PARTIAL, reason
+            if not has_signal:
+                reason = f"Noise is {share:.0%} of the voltages, by reciprocity, and hides every change."
+                return usable, FrameStatus.REFUSED, reason
+        if has_signal:
+            return usable, None, ""
+        reason = "Nothing but noise: reciprocal channels change alike as by chance."
+        return usable, FrameStatus.UNCHANGED, reason
 
     def _inspect(self, frame):
         no_channels = np.zeros_like(self.mask)
