@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from jeit.arguments import counted
 from jeit.data import Measurement
@@ -32,7 +32,9 @@ from jeit.imaging.preparation import (
     prepare_difference,
     select_frames,
 )
+from jeit.inverse import relative_noise
 from jeit.inverse.linear.one_step import LinearReconstruction
+from jeit.inverse.streaming.stream import FrameCheck, FrameStatus
 from jeit.mesh import Mesh
 from jeit_solvers.engines import as_array
 
@@ -53,7 +55,7 @@ class ImagedSequence:
     - `series`: the images.
     - `prepared`: the prepared difference, with the model of the body.
     - `reconstruction`: the reconstruction matrix, the same for all images.
-    - `refused`: (F,), True for frames without an image because they lack channels.
+    - `refused`: (F,), True for frames without an image; `reasons`: why, by the number of the frame, from 0.
     - `regions`: cells of each requested region, (m,) booleans, by name.
     - `moved`: (F,), True for frames much of whose difference moved electrodes explain; their images show the rest.
 
@@ -71,6 +73,7 @@ class ImagedSequence:
     refused: Bool[np.ndarray, " F"]
     regions: Mapping[str, Bool[np.ndarray, " m"]] = field(default_factory=dict)
     moved: Bool[np.ndarray, " F"] = field(default_factory=lambda: np.zeros(0, bool))
+    reasons: Mapping[int, str] = field(default_factory=dict)
 
     @property
     def doubts(self) -> tuple[str, ...]:
@@ -110,11 +113,11 @@ def image_sequence(
     - `progress`: function called with the name of each step when the step begins.
 
     Spikes in single channels are replaced by values that other channels determine (`jeit.data.mask_spikes`). Channels
-    missing in more than half of the frames are not used; frames that lack any of the used channels are refused. Frames
-    that cannot be imaged (`jeit.data.check_imageable`), such as frames of noise, are refused if they differ more from
-    the reference than all frames that can be imaged. The images need four bytes per cell and frame. Raises `ValueError`
-    in the same cases as `image_difference`, for a measurement with one frame, for an iterative method, and for images
-    that would not fit in memory.
+    missing in more than half of the frames are not used; frames that lack any of the used channels are refused. So are
+    frames whose noise hides every change or is that of one electrode, as by `jeit.inverse.stream`, and frames that
+    cannot be imaged (`jeit.data.check_imageable`) and differ more from the reference than all that can. The images need
+    four bytes per cell and frame. Raises `ValueError` in the same cases as `image_difference`, for a measurement with
+    one frame, for an iterative method, and for images that would not fit in memory.
 
     **Example:**
 
@@ -141,17 +144,26 @@ def image_sequence(
     expected = np.asarray(base.voltages)[0]
     is_common = (mask.mean(axis=0) >= _MIN_FRAME_SHARE) & np.asarray(base.mask)[0]
     refused = np.asarray(~mask[:, is_common].all(axis=1))
+    reasons = dict.fromkeys(map(int, np.flatnonzero(refused)), "It lacks channels that most frames have.")
+    if not settings.as_is:
+        noisy = _noisy_frames(voltages - expected, is_common & mask, base)
+        if len(reasons | noisy) < measurement.num_frames:  # otherwise the error of the strongest frame is raised
+            reasons |= noisy
+            refused[list(reasons)] = True
     if not is_common.any() or refused.all():
         raise ValueError(f"'{measurement.name}': no channel is usable in most frames, or none has all of them.")
     total_change = np.abs(np.where(is_common, voltages - expected, 0)).sum(axis=1)
     if not is_common.all():
         measurement = measurement.masked(is_common, "they are missing in most frames, or in the reference.")
     strongest_first = np.argsort(np.where(refused, 1.0, -total_change), kind="stable")[: (~refused).sum()]
-    for number, index in enumerate(strongest_first[:_NUM_CANDIDATES]):
-        if assess(measurement.frame(int(index)), base)[0].imageable:
-            refused[strongest_first[:number]] = True
+    noisy = {}
+    for number, index in enumerate(map(int, strongest_first[:_NUM_CANDIDATES])):
+        if not (reason := assess(measurement.frame(index), base)[0].reason):
+            refused[list(noisy)] = True
+            reasons |= noisy
             strongest_first = strongest_first[number:]
             break
+        noisy[index] = f"{reason[0].upper()}{reason[1:]}"
     strongest = int(strongest_first[0])
     prepared = prepare_difference(
         measurement,
@@ -190,7 +202,27 @@ def image_sequence(
             changes[batch] = np.asarray(reconstruction.image(as_array(difference)))
     background = float(np.real(prepared.calibration.conductivity))
     series = ImageSeries(prepared.mesh, changes, times, background, timed=measurement.times is not None)
-    return ImagedSequence(series, prepared, reconstruction, refused, region_masks, moved)
+    return ImagedSequence(series, prepared, reconstruction, refused, region_masks, moved, reasons)
+
+
+def _noisy_frames(
+    changes: Float[np.ndarray, "F M"], usable: Bool[np.ndarray, "F M"], reference: Measurement
+) -> dict[int, str]:
+    """Numbers of the frames, from their changes (F, M) in volts, whose noise hides every change or is that of one
+    electrode, each with the reason to refuse it."""
+    protocol, expected = reference.protocol, np.asarray(reference.voltages)[0]
+    touching = np.array([protocol.channels_touching(electrode) for electrode in range(protocol.num_electrodes)])
+    pairs, ratios = map(np.asarray, protocol.reciprocal_pairs())
+    used = usable.any(axis=0)
+    noise = np.asarray(relative_noise(expected, as_array(used)))
+    check = FrameCheck(used, expected, touching, (pairs.reshape(-1, 2), ratios), noise)
+    judged = (check.judge_noise(np.where(used, change, 0), used) for change, used in zip(changes, usable, strict=True))
+    faulty = FrameStatus.REFUSED, FrameStatus.PARTIAL
+    return {
+        number: reason.removesuffix(" Its channels are left out.")
+        for number, (_, status, reason) in enumerate(judged)
+        if status in faulty
+    }
 
 
 @dataclass(frozen=True)

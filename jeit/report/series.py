@@ -194,6 +194,7 @@ def _report(sequence: ImagedSequence, curves: Mapping[str, np.ndarray], oscillat
             "measurement": describe_measurement(sequence.prepared.measurement),
             "frames": len(series.times),
             "refused": int(sequence.refused.sum()),
+            "refused_frames": [{"frame": number, "reason": why} for number, why in sorted(sequence.reasons.items())],
             "frame_rate": series.frame_rate,
             "frame_rate_unit": "Hz",
             "background": series.background,

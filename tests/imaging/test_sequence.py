@@ -89,7 +89,7 @@ def test_frames_with_missing_channels_are_refused_and_channels_missing_in_most_a
     mask = np.ones(few.mask.shape, bool)
     mask[5, 17], mask[:20, 40] = False, False
     found = image_sequence(replace(few, mask=mask), chest.mean_frame(), ImagingSettings(num_points=500))
-    assert np.flatnonzero(found.refused).tolist() == [5]
+    assert np.flatnonzero(found.refused).tolist() == list(found.reasons) == [5]
     assert np.isnan(found.series.changes[5]).all()
     assert not np.asarray(found.reconstruction.matrix)[:, 40].any()
 
@@ -98,6 +98,7 @@ def test_a_frame_of_noise_does_not_refuse_the_others():
     noise = EMPTY * (1 + 0.2 * np.random.default_rng(0).normal(size=EMPTY.shape))
     found = image_sequence(tank(FULL, noise, EMPTY), tank(EMPTY), SETTINGS)
     assert found.refused.tolist() == [False, True, False]
+    assert "hides every change" in found.reasons[1]
     assert np.isnan(found.series.changes[1]).all()
     expected = image_difference(tank(FULL), tank(EMPTY), SETTINGS).change
     np.testing.assert_allclose(found.series.changes[0], expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())

@@ -29,6 +29,9 @@ from jeit.cli.options import (
 if TYPE_CHECKING:
     from jeit.mesh import Mesh
 
+# Maximum number of refused frames that are printed.
+_MAX_NAMED = 8
+
 
 def series(
     data: Data,
@@ -136,6 +139,10 @@ def series(
     rate_text = "" if report["frame_rate"] is None else f", {report['frame_rate']:.4g} a second"
     untimed = "" if measured.times is not None else "; no times are known (--rate gives them), frames are numbered"
     console.print(f"\n{frames}{rate_text}, {report['refused']} refused{untimed}")
+    for number, reason in sorted(sequence.reasons.items())[:_MAX_NAMED]:
+        console.print(f"  frame {number}: refused. {reason}", soft_wrap=True, markup=False)
+    if (num_more := len(sequence.reasons) - _MAX_NAMED) > 0:
+        console.print(f"  {num_more} more are in report.json.")
     for note in dict.fromkeys(
         (*sequence.prepared.measurement.notes, *(() if reference_measurement is None else reference_measurement.notes))
     ):

@@ -94,10 +94,10 @@ class FrameCheck:
         change = np.where(usable, values - self.expected, 0)
         if np.linalg.norm(change) <= _EQUAL_TOLERANCE * self.expected_norm:
             return values, usable, FrameStatus.UNCHANGED, f"{reason} It equals an undisturbed frame.".lstrip()
-        usable, noise_status, noise = self._judge_noise(change, usable)
+        usable, noise_status, noise = self.judge_noise(change, usable)
         return values, usable, noise_status or status, f"{reason} {noise}".strip()
 
-    def _judge_noise(self, change, usable) -> tuple[Bool[np.ndarray, " M"], FrameStatus | None, str]:
+    def judge_noise(self, change, usable) -> tuple[Bool[np.ndarray, " M"], FrameStatus | None, str]:
         """Compare the changes of reciprocal channels, which noise alone makes unequal. Returns the usable channels, and
         a status and a sentence if a noisy electrode is left out, if noise hides every change, or if there is none."""
         is_pair = usable[self.first] & usable[self.second]
