@@ -166,9 +166,13 @@ def main() -> int:
     every = [*PYTHONS, f"least-{PYTHONS[0]}"]
     parser.add_argument("names", nargs="*", default=every, help="such as 3.12, or least-3.11")
     parser.add_argument("--whole", action="store_true", help="all quick tests, not those of tests/selection.txt alone")
-    parser.add_argument("--tested", nargs="*", default=[], metavar="NAME", help="those whose tests run elsewhere")
+    parser.add_argument("--tested", nargs="*", default=[], metavar="NAME", help="those whose tests are not run here")
     parser.add_argument("--find", choices=("newest", "oldest"), help="print the path of such a Python here, and end")
+    parser.add_argument("--list", action="store_true", help="print the supported versions of Python, and end")
     asked = parser.parse_args()
+    if asked.list:
+        print(*PYTHONS)
+        return 0
     if asked.find:
         found = first(PYTHONS[::-1] if asked.find == "newest" else PYTHONS)
         print(found or f"no Python of {', '.join(PYTHONS)} here", file=sys.stdout if found else sys.stderr)
