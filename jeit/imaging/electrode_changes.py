@@ -53,6 +53,8 @@ _INITIAL_LOGARITHMS, _LOGARITHMS_WIDTH = np.array([-0.3, -3.0, -3.0, -2.0]), 3.0
 _RANK_TOLERANCE = 1e-10
 # Number of corrections of the linear approximation.
 _NUM_CORRECTIONS = 3
+# Number of frames of a series among which one with changed electrodes is searched.
+_NUM_CANDIDATES = 5
 
 
 class ElectrodeChange(NamedTuple):
@@ -73,9 +75,10 @@ class ElectrodeChange(NamedTuple):
         distances = 1e3 * np.linalg.norm(self.shift, axis=1)
         largest = int(np.argmax(distances))
         return (
-            f"electrodes have moved by about {np.sqrt(np.mean(distances**2)):.2g} mm since the reference (root mean "
-            f"square; electrode {largest + 1} by about {distances[largest]:.2g} mm). The image shows the rest of the "
-            f"difference, {percent(self.rest)} of it: measure a new reference."
+            "the voltages have changed as if electrodes had moved since the reference, by about "
+            f"{np.sqrt(np.mean(distances**2)):.2g} mm (root mean square; electrode {largest + 1} by about "
+            f"{distances[largest]:.2g} mm), or as if a layer along the wall had changed. The image shows the rest of "
+            f"the difference, {percent(self.rest)} of it (as_is=True, --as-is: all of it). Measure a new reference."
         )
 
 
@@ -135,6 +138,13 @@ class ElectrodeChanges:
         is_spread = effective_number > min(_MIN_NUMBER, num_electrodes / 4)
         is_change = self._are_suspicious(differences) & is_large & is_spread
         return np.where(is_change[:, None], changes, 0.0)
+
+    def estimator_for(self, differences: Float[np.ndarray, "N M"]) -> Float[np.ndarray, "p M"] | None:
+        """`estimator` for the largest of several differences (N, M) that shows changes of the electrodes; None if none
+        of the `_NUM_CANDIDATES` largest suspicious ones does."""
+        suspicious = np.flatnonzero(self._are_suspicious(differences))
+        largest = suspicious[np.argsort(-self._size(differences[suspicious]), kind="stable")[:_NUM_CANDIDATES]]
+        return next((found for one in largest if (found := self.estimator(differences[one])) is not None), None)
 
     def estimator(self, difference: Float[np.ndarray, " M"]) -> Float[np.ndarray, "p M"] | None:
         """Matrix (p, M) that estimates changes of the electrodes, in units of their standard deviations, from a

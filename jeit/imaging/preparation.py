@@ -209,10 +209,11 @@ class PreparedDifference:
     @functools.cached_property
     def electrode_changes(self) -> ElectrodeChanges | None:
         """Estimator of changes of the electrodes; None for electrodes that cannot move, complex voltages, and solids,
-        where displacements in two directions explain most of what bodies do."""
-        deviation = self.uncertainty.position_on(self.mesh)
+        where displacements in two directions explain most of what bodies do. How far electrodes move does not depend
+        on how well their positions in the reference are known."""
+        deviation = Uncertainty().position_on(self.mesh)
         is_movable_on_sheet = isinstance(self.model.electrodes, AbstractMovableElectrodes) and self.mesh.dimension == 2
-        if not is_movable_on_sheet or np.iscomplexobj(self.difference) or deviation == 0:
+        if not is_movable_on_sheet or np.iscomplexobj(self.difference):
             return None
         noise, background = np.asarray(self.relative_noise), float(self.calibration.conductivity)
         x_min, x_max, y_min, y_max = self.domain.extent

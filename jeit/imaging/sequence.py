@@ -44,6 +44,8 @@ _BATCH, _VALUE_BYTES = 256, 4
 _MIN_FRAME_SHARE = 0.5
 # Number of frames, those that differ most from the reference, among which one that can be imaged is searched.
 _NUM_CANDIDATES = 10
+# Number of frames, those that differ most from the reference, among which moved electrodes are searched for.
+_NUM_SEARCHED = 1000
 
 
 @dataclass(frozen=True)
@@ -79,13 +81,15 @@ class ImagedSequence:
     def doubts(self) -> tuple[str, ...]:
         """Reasons to doubt the images, in sentences, from the frame for which λ was chosen: the one that differs most
         from the reference; and the number of frames with moved electrodes."""
+        doubts = replace(self.prepared, electrode_change=None).doubts
         if not self.moved.any():
-            return self.prepared.doubts
+            return doubts
         num_moved, num_imaged = int(self.moved.sum()), int((~self.refused).sum())
         return (
-            *self.prepared.doubts,
-            f"electrodes have moved since the reference in {num_moved} of {counted(num_imaged, 'frame')}: they explain "
-            "much of the difference there, and the images show the rest. Measure a new reference.",
+            *doubts,
+            f"in {num_moved} of {counted(num_imaged, 'frame')} the voltages have changed as if electrodes had moved "
+            "since the reference. Their images show the rest of the difference (as_is=True, --as-is: all of it). "
+            "Measure a new reference.",
         )
 
 
@@ -189,8 +193,8 @@ def image_sequence(
             )
         changes, moved = np.full((num_frames, num_cells), np.nan, np.float32), np.zeros(num_frames, bool)
         changes_of_electrodes = None if settings.as_is else prepared.electrode_changes
-        raw_difference = np.where(is_common, voltages[strongest] - expected, 0)
-        estimator = changes_of_electrodes and changes_of_electrodes.estimator(raw_difference)
+        raw_differences = np.where(is_common, voltages[strongest_first[:_NUM_SEARCHED]] - expected, 0)
+        estimator = changes_of_electrodes and changes_of_electrodes.estimator_for(raw_differences)
         imaged_frames = np.flatnonzero(~refused)
         for start in range(0, len(imaged_frames), _BATCH):
             batch = imaged_frames[start : start + _BATCH]

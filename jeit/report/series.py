@@ -195,6 +195,7 @@ def _report(sequence: ImagedSequence, curves: Mapping[str, np.ndarray], oscillat
             "frames": len(series.times),
             "refused": int(sequence.refused.sum()),
             "refused_frames": [{"frame": number, "reason": why} for number, why in sorted(sequence.reasons.items())],
+            "frames_with_moved_electrodes": np.flatnonzero(sequence.moved).tolist(),
             "frame_rate": series.frame_rate,
             "frame_rate_unit": "Hz",
             "background": series.background,

@@ -190,6 +190,7 @@ def show(console, result: "ImagedDifference", *, frame_given: bool = False) -> N
     )
     noise_text = "not known" if noise is None else f"{percent(noise.relative)}, from {noise.method}"
     noise_text = noise_text if share is None else f"{percent(share)}, from {result.quality.noise_source}"
+    noise_text += "" if result.electrode_change is None else "; of the rest that moved electrodes leave"
     rows = [
         ("background", f"{background_text}, misfit {percent(float(calibration.misfit))}"),
         ("difference", f"{percent(result.quality.difference)} of the reference"),
