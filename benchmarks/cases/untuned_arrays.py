@@ -75,7 +75,7 @@ def steep_table(lengths, seeds) -> Table:
 
 def run(options: Options) -> Result:
     """Compute both tables, and check the required figures."""
-    # Of a quick run, a test locates a steep array.
+    # A quick run leaves out steep arrays, which a test locates.
     number, lengths, seeds = (1, (), (0,)) if options.quick else (ARRAYS, LENGTHS, (0, 1))
     found = []
     for k in range(number):

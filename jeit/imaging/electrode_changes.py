@@ -1,5 +1,5 @@
-"""Changes of electrodes between a reference and a frame: displacements and changes of contact impedance, estimated from
-the voltage difference together with the change of conductivity.
+"""Changes of electrodes on the edge of a sheet between a reference and a frame: displacements and changes of contact
+impedance, estimated from the voltage difference together with the change of conductivity.
 
 To first order the difference, divided by the noise of its channels, is
 

@@ -149,13 +149,13 @@ def image_sequence(
     is_common = (mask.mean(axis=0) >= _MIN_FRAME_SHARE) & np.asarray(base.mask)[0]
     refused = np.asarray(~mask[:, is_common].all(axis=1))
     reasons = dict.fromkeys(map(int, np.flatnonzero(refused)), "It lacks channels that most frames have.")
+    if not is_common.any() or refused.all():
+        raise ValueError(f"'{measurement.name}': no channel is usable in most frames, or none has all of them.")
     if not settings.as_is:
         noisy = _noisy_frames(voltages - expected, is_common & mask, base)
         if len(reasons | noisy) < measurement.num_frames:  # otherwise the error of the strongest frame is raised
             reasons |= noisy
             refused[list(reasons)] = True
-    if not is_common.any() or refused.all():
-        raise ValueError(f"'{measurement.name}': no channel is usable in most frames, or none has all of them.")
     total_change = np.abs(np.where(is_common, voltages - expected, 0)).sum(axis=1)
     if not is_common.all():
         measurement = measurement.masked(is_common, "they are missing in most frames, or in the reference.")
