@@ -23,11 +23,14 @@ SHIFT = 1e-3 * np.random.default_rng(3).normal(size=16)
 CENTRE, DEPTH = np.array([-0.05, 0.03]), 0.2
 
 
+# Beside an electrode, and narrower: the evidence is for movement, but of one or two electrodes.
+NARROW = (0.094 * np.cos(0.15), 0.094 * np.sin(0.15), 0.005, 0.1)
 BODIES = {
     "none": (0, 0, 0, 1),
     "weak": (*CENTRE, 0.02, 1.2),
     "strong": (*CENTRE, 0.03, 10.0),
     "at an electrode": (0, 0.09, 0.008, 0.1),
+    "narrow": NARROW,
 }
 """Coordinates and radius in metres, and conductivity relative to the rest."""
 
@@ -85,6 +88,12 @@ def test_a_body_is_not_taken_for_moved_electrodes(name):
     assert result.electrode_change is None
     assert report_image(result)["electrode_change"] is None
     assert len(result.inclusions) == 1
+
+
+def test_a_body_narrower_than_the_electrode_beside_it_is_not_taken_for_its_movement():
+    result = image("narrow")
+    assert result.electrode_change is None
+    assert np.linalg.norm(np.asarray(result.inclusions[0].centroid) - NARROW[:2]) < 0.15 * RADIUS
 
 
 def test_an_image_as_is_leaves_their_effects_in_place():
