@@ -20,6 +20,7 @@ imaging; Gómez-Laberge and Adler, Physiological Measurement 29 (2008) S89.
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,11 +28,14 @@ import scipy.optimize
 from jaxtyping import Bool, Float
 
 from jeit.arguments import percent
+from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.forward.changes import PlacementSensitivity, shift_electrodes
 from jeit.forward.model import select_channels
 from jeit.imaging.calibration import keep_last_result
 from jeit.inverse.linearisation import Linearisation
+from jeit.inverse.placement import Uncertainty
+from jeit.inverse.prior.matern import MEASURED_DATA_PRIOR, PRIORS
 from jeit.inverse.prior.priors import AbstractPrior
 from jeit_solvers.engines import as_array, on_host
 
@@ -108,10 +112,25 @@ class ElectrodeChanges:
         self._noise, self._weights = noise, mask / noise
         self._patterns = derivatives * self._spread
 
-    def find(self, difference: Float[np.ndarray, " M"]) -> ElectrodeChange | None:
+    @classmethod
+    def on_edge(
+        cls, model: ForwardModel, background: float, noise: Float[np.ndarray, " M"], mask: Bool[np.ndarray, " M"]
+    ) -> ElectrodeChanges | None:
+        """Estimator for electrodes on the edge of a sheet; None for other electrodes, which move in two directions and
+        thereby explain most of what bodies do. How far electrodes move does not depend on how well their positions in
+        the reference are known."""
+        if not isinstance(model.electrodes, BoundaryElectrodes) or model.mesh.dimension != 2:
+            return None
+        prior = PRIORS[MEASURED_DATA_PRIOR](float(np.ptp(np.asarray(model.mesh.points), axis=0).max()))
+        return cls(model, background, noise, mask, Uncertainty().position_on(model.mesh), prior)
+
+    def find(
+        self, difference: Float[np.ndarray, " M"], estimator: Float[np.ndarray, "p M"] | None = None
+    ) -> ElectrodeChange | None:
         """Estimate the change of the electrodes from a voltage `difference` (M,), volts; None if they have not
-        changed, or if they explain little of the difference."""
-        if (estimator := self.estimator(difference)) is None:
+        changed, or if they explain little of the difference. `estimator`: that of the difference, if it is known."""
+        estimator = self.estimator(difference) if estimator is None else estimator
+        if estimator is None:
             return None
         coefficients, change = estimator @ difference, np.zeros(len(difference))
         for _ in range(_NUM_CORRECTIONS):
@@ -137,13 +156,13 @@ class ElectrodeChanges:
         square = squares.reshape(len(squares), num_electrodes, -1).sum(axis=2)
         effective_number = square.sum(axis=1) ** 2 / np.maximum((square**2).sum(axis=1), np.finfo(float).tiny)
         is_spread = effective_number > min(_MIN_NUMBER, num_electrodes / 4)
-        is_change = self._are_suspicious(differences) & is_large & is_spread
+        is_change = self.are_suspicious(differences) & is_large & is_spread
         return np.where(is_change[:, None], changes, 0.0)
 
     def estimator_for(self, differences: Float[np.ndarray, "N M"]) -> Float[np.ndarray, "p M"] | None:
         """`estimator` for the largest of several differences (N, M) that shows changes of the electrodes; None if none
         of the `_NUM_CANDIDATES` largest suspicious ones does."""
-        suspicious = np.flatnonzero(self._are_suspicious(differences))
+        suspicious = np.flatnonzero(self.are_suspicious(differences))
         largest = suspicious[np.argsort(-self._size(differences[suspicious]), kind="stable")[:_NUM_CANDIDATES]]
         return next((found for one in largest if (found := self.estimator(differences[one])) is not None), None)
 
@@ -151,7 +170,7 @@ class ElectrodeChanges:
         """Matrix (p, M) that estimates changes of the electrodes, in units of their standard deviations, from a
         difference in volts. Its standard deviations are those that best explain the `difference` (M,). None if the
         evidence is not for changes of the electrodes, or if they explain little of the difference."""
-        if not self._are_suspicious(difference[None])[0]:
+        if not self.are_suspicious(difference[None])[0]:
             return None
         noise, mask = as_array(self._noise), as_array(self.mask)
         linearisation = Linearisation.create(self.model, self.background, prior=self.prior, noise=noise, mask=mask)
@@ -160,16 +179,23 @@ class ElectrodeChanges:
             return None
         return estimator
 
-    def _are_suspicious(self, differences: Float[np.ndarray, "N M"]) -> Bool[np.ndarray, " N"]:
+    def are_suspicious(self, differences: Float[np.ndarray, "N M"]) -> Bool[np.ndarray, " N"]:
         """Whether plausible changes of the electrodes alone, beside a common factor, explain enough of differences
         (N, M) to be looked for."""
-        weighted, rows = self._without_common_factor(differences), self._without_common_factor(self._patterns.T)
-        size = self._size(differences)
+        (squares, modes), weighted = self._modes, self._without_common_factor(differences)
+        size = np.linalg.norm(weighted, axis=1)
         error = _ASSUMED_ERROR * size / np.sqrt(np.count_nonzero(self.mask))
-        values, vectors = np.linalg.eigh(rows @ rows.T)
-        damped = (weighted @ rows.T @ vectors) / (np.maximum(values, 0) + np.where(size > 0, error, 1)[:, None] ** 2)
-        explained = np.linalg.norm(damped @ vectors.T @ rows, axis=1)
+        damped = (weighted @ modes.T) / (squares + np.where(size > 0, error, 1)[:, None] ** 2)
+        explained = np.linalg.norm(damped @ modes, axis=1)
         return explained > _MIN_SUSPICIOUS_SHARE * size
+
+    @functools.cached_property
+    def _modes(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p M"]]:
+        """Orthogonal combinations (p, M) of the changes of the voltages due to plausible changes of the electrodes,
+        and the squares (p,) of their norms."""
+        rows = self._without_common_factor(self._patterns.T)
+        squares, vectors = np.linalg.eigh(rows @ rows.T)
+        return np.maximum(squares, 0), vectors.T @ rows
 
     def _change_of_voltages(self, coefficients: Float[np.ndarray, " p"]) -> Float[np.ndarray, " M"]:
         """Change of the voltages (M,) due to changes of the electrodes. Raises `ValueError` if they would overlap or

@@ -16,7 +16,7 @@ from jeit.data import Measurement
 from jeit.data.frame_checks import FrameQuality, assess, check_same_setup, rounding_of_difference
 from jeit.data.screening import mask_spikes
 from jeit.data.transfer import as_driven
-from jeit.electrodes import AbstractElectrodes, BoundaryElectrodes
+from jeit.electrodes import AbstractElectrodes
 from jeit.forward import ForwardModel
 from jeit.imaging.calibration import Clock, calibrated_model, described_model, estimated_positions, relative_misfit
 from jeit.imaging.doubts import doubts_of_data
@@ -26,7 +26,6 @@ from jeit.inverse import relative_noise
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.channels import electrode_misfits
 from jeit.inverse.placement import Uncertainty
-from jeit.inverse.prior.matern import MEASURED_DATA_PRIOR, PRIORS
 from jeit.inverse.shapes.quantities import Accuracy
 from jeit.mesh import Body, Mesh
 from jeit_solvers.engines import as_array
@@ -207,17 +206,11 @@ class PreparedDifference:
 
     @functools.cached_property
     def electrode_changes(self) -> ElectrodeChanges | None:
-        """Estimator of changes of electrodes on the edge of a sheet; None for other electrodes, which move in two
-        directions and thereby explain most of what bodies do, and for complex voltages. How far electrodes move does
-        not depend on how well their positions in the reference are known."""
-        is_on_edge = isinstance(self.model.electrodes, BoundaryElectrodes) and self.mesh.dimension == 2
-        if not is_on_edge or np.iscomplexobj(self.difference):
+        """Estimator of changes of electrodes on the edge of a sheet; None for other electrodes and complex voltages."""
+        if np.iscomplexobj(self.difference):
             return None
-        deviation = Uncertainty().position_on(self.mesh)
         noise, background = np.asarray(self.relative_noise), float(self.calibration.conductivity)
-        x_min, x_max, y_min, y_max = self.domain.extent
-        prior = PRIORS[MEASURED_DATA_PRIOR](max(x_max - x_min, y_max - y_min))
-        return ElectrodeChanges(self.model, background, noise, np.asarray(self.mask), deviation, prior)
+        return ElectrodeChanges.on_edge(self.model, background, noise, np.asarray(self.mask))
 
     def without_electrode_change(self) -> PreparedDifference:
         """Copy of the difference without the part that a change of the electrodes explains, if that is a large part."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -13,6 +14,7 @@ from jeit.data import Measurement, screen
 from jeit.data.description import Description
 from jeit.forward import ForwardModel
 from jeit.imaging.calibration import Clock, calibrated_model, imaging_mesh
+from jeit.imaging.electrode_changes import ElectrodeChange, ElectrodeChanges
 from jeit.imaging.method import NamedPrior, check_body, check_hyperparameter, check_prior, prior_for
 from jeit.imaging.preparation import (
     body_of,
@@ -27,6 +29,7 @@ from jeit.inverse.nonlinear import GaussNewton
 from jeit.inverse.nonlinear.solvers import AbstractSolver, as_solver
 from jeit.inverse.prior.matern import MEASURED_DATA_PRIOR
 from jeit.inverse.streaming.imager import check_memory
+from jeit.inverse.streaming.stream import FrameImage, FrameStatus, StreamState
 
 # Default number of mesh nodes for bodies without a mesh of their own.
 STREAM_POINTS = 1200
@@ -129,6 +132,51 @@ def prepare_imager(
             memory=settings.memory,
         )
     return imager, calibration
+
+
+def image_stream(
+    imager: Imager,
+    calibration: Calibration,
+    frames: Iterable,
+    found: Callable[[int, ElectrodeChange], None],
+) -> Iterator[FrameImage]:
+    """Yield the image of each frame as `jeit.inverse.stream` does, without the part of its difference from the
+    reference that moved electrodes explain.
+
+    Electrodes that moved are searched for in the first suspicious frame, in the second, the fourth, and so on, since a
+    search takes up to a second. Once they are found, their part is subtracted from every frame of which it explains
+    much, and `found` is called with the number of the frame and the change of the electrodes.
+
+    `imager`, `calibration`: see `prepare_imager`; `frames`: see `jeit.inverse.stream`.
+    """
+    state, estimator, num_suspicious = StreamState(imager), None, 0
+    noise, mask = np.asarray(imager.noise), np.asarray(imager.mask)
+    changes = ElectrodeChanges.on_edge(calibration.model, float(calibration.conductivity), noise, mask)
+    for number, frame in enumerate(frames):
+        start_time = time.perf_counter()
+        difference = None if changes is None else _ordinary_change(state, frame)
+        if changes is not None and difference is not None:
+            if estimator is None and changes.are_suspicious(difference[None])[0]:
+                num_suspicious += 1
+                if num_suspicious.bit_count() == 1:  # a power of two
+                    estimator = changes.estimator(difference)
+                change = None if estimator is None else changes.find(difference, estimator)
+                if change is None:
+                    estimator = None
+                else:
+                    found(number, change)
+            if estimator is not None:
+                frame = np.asarray(frame) - changes.voltages(difference[None], estimator)[0]
+        seconds = time.perf_counter() - start_time
+        image = state.image(number, frame)
+        yield replace(image, latency=image.latency + seconds)
+
+
+def _ordinary_change(state: StreamState, frame: object) -> Float[np.ndarray, " M"] | None:
+    """Change (M,) of a frame since the reference, volts, 0 in masked channels; None if the frame has a fault."""
+    values, usable, status, _ = state.check(frame)
+    is_ordinary = status == FrameStatus.IMAGED and usable is state.mask
+    return np.where(state.mask, values - state.expected, 0.0) if is_ordinary else None
 
 
 def described_reference(

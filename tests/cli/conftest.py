@@ -25,10 +25,12 @@ unit = "V"
 """
 
 
-def _voltages(bump: float) -> np.ndarray:
+def _voltages(bump: float, turns=0.0) -> np.ndarray:
     """Voltages of a disk of 1 mS with small electrodes (a logarithm), plus a symmetric term: a change that is not
-    noise."""
-    protocol, position = adjacent(8), ring(0.1, 8, clockwise=True)
+    noise. `turns`: angles (8,) in radians by which the electrodes have moved."""
+    protocol, position = adjacent(8), np.asarray(ring(0.1, 8, clockwise=True))
+    angle = np.arctan2(position[:, 1], position[:, 0]) + turns
+    position = 0.1 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     distance = np.linalg.norm(position[:, None] - position[None], axis=-1)
     np.fill_diagonal(distance, 1e-4)
     touched = np.exp(-((position - position[0]) ** 2).sum(axis=1) / 0.01)
@@ -46,6 +48,7 @@ def tank(tmp_path):
         description = DESCRIPTION
         rest = _voltages(0.0)
         touched = _voltages(100.0)
+        moved = _voltages(0.0, 0.02 * np.random.default_rng(0).normal(size=8))
 
         def write(self, name, values, description=DESCRIPTION):
             rows = np.atleast_2d(values)

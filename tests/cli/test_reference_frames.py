@@ -68,3 +68,14 @@ def test_a_stream_needs_a_reference_or_frames_of_it(tank, recording, run, tmp_pa
         status, _, error = run("stream", data, "--output", tmp_path)
         assert status == 1
         assert hint in error
+
+
+@pytest.mark.parametrize("as_is", [False, True])
+def test_a_stream_states_from_which_frame_on_electrodes_have_moved(tank, run, tmp_path, as_is):
+    data = tank.write("frames", [tank.rest, tank.moved, tank.touched, tank.moved])
+    given = ("--reference", tank.folder / "rest.csv", "--output", tmp_path / "out", "--film", "none")
+    asked = ("--method", "one-step", "--num-points", 250, *(("--as-is",) if as_is else ()))
+    status, output, error = run("stream", data, *given, *asked)
+    assert (status, error) == (0, "")
+    assert output.count("doubt: from frame 1 on, the voltages have changed as if electrodes had moved") == (not as_is)
+    assert "4 frames: 3 imaged, 1 unchanged" in output

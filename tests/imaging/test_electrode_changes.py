@@ -11,6 +11,8 @@ from jeit.data import Measurement
 from jeit.electrodes import BoundaryElectrodes, body_mesh
 from jeit.forward import ForwardModel
 from jeit.imaging import ImagingSettings, image_sequence
+from jeit.imaging.stream_preparation import StreamSettings, image_stream, prepare_imager
+from jeit.inverse import stream
 from jeit.layout import ring
 from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
@@ -112,3 +114,19 @@ def test_frames_of_a_series_with_moved_electrodes_are_named_although_another_fra
     assert any("2 of 4 frames" in doubt for doubt in imaged.doubts)
     peaks = np.abs(np.asarray(imaged.series.changes)).max(axis=1)
     assert (peaks[[1, 3]] < 0.1 * peaks[2]).all()
+
+
+@pytest.mark.parametrize("solver", ["one-step", pytest.param("gauss-newton", marks=pytest.mark.slow)])
+def test_a_stream_subtracts_movement_from_its_first_frame_on(solver):
+    frames = [frame("none", 0.0, seed=5), frame("none", 1.0), frame("strong"), frame("none", 0.8)]
+    voltages = [np.asarray(one.voltages)[0] for one in frames]
+    imager, calibration = prepare_imager(frame("none", 0.0, seed=2), StreamSettings(solver, num_points=600))
+    found = []
+    images = list(image_stream(imager, calibration, voltages, lambda number, change: found.append((number, change))))
+    assert [number for number, _ in found] == [1]
+    assert "electrodes had moved" in found[0][1].doubt
+    peaks = [np.abs(np.log(image.conductivity / calibration.conductivity)).max() for image in images]
+    plain = [np.abs(np.log(image.conductivity / calibration.conductivity)).max() for image in stream(imager, voltages)]
+    assert max(peaks[1], peaks[3]) < 0.3 * min(plain[1], plain[3])
+    assert peaks[2] > 0.9 * plain[2]
+    assert [image.number for image in images] == [0, 1, 2, 3]

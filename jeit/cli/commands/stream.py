@@ -89,6 +89,7 @@ def stream(
     quiet: Quiet = False,
 ) -> None:
     """Image every frame of DATA as it arrives; faulty frames are refused with a reason, and the stream continues.
+    If the voltages look as if electrodes on the edge of a sheet had moved, images show the rest of the difference.
 
     Writes frames.csv line by line (x, y: centroid in metres of the region around the strongest change; peak change in
     S), and at the end images.npz with `conductivity` (frames, cells), NaN for frames that were refused, `points`,
@@ -123,8 +124,8 @@ def stream(
     from jeit.data.formats.lines import LineParser, read_lines
     from jeit.data.screening import mask_spikes
     from jeit.imaging.doubts import doubts_of_data
-    from jeit.imaging.stream_preparation import StreamSettings, frames_of, prepare_imager
-    from jeit.inverse import stream as stream_images
+    from jeit.imaging.stream_preparation import StreamSettings, frames_of, image_stream, prepare_imager
+    from jeit.inverse import stream as stream_as_is
     from jeit.inverse.nonlinear.solvers import SOLVERS, frame_solvers
     from jeit.report import write_stream
     from jeit.report.series import check_film
@@ -197,8 +198,17 @@ def stream(
                         f"  frame {frame_image.number}: {frame_image.status}. {frame_image.reason}", soft_wrap=True
                     )
 
+            def show_movement(number: int, change) -> None:
+                if not quiet:
+                    console.print(f"  doubt: from frame {number} on, {change.doubt}", soft_wrap=True, markup=False)
+
             drawing = stopping.drawing_reporter(PICTURES, step)
-            images = stream_images(imager, stopping.until(frames))
+            arriving_frames = stopping.until(frames)
+            images = (
+                stream_as_is(imager, arriving_frames)
+                if settings.as_is
+                else image_stream(imager, calibration, arriving_frames, show_movement)
+            )
             with stopping.exit_after_signal(frame_counter, "frames.csv", "images.npz"):
                 written = write_stream(
                     images, calibration, output, name=data, film=film_name, rate=rate, progress=show, drawing=drawing
