@@ -5,144 +5,17 @@ strongest colour. Each button, key and field is tested by its effect. Skipped wh
 Playwright.
 """
 
-import os
-import shutil
-import signal
-import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
+from browser_page import IN_BROWSER, LOOK, drawn, place, shows, text, until
 from stand_in import StandIn
 
-playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright: pip install playwright")
+pytest.importorskip("playwright.sync_api", reason="needs Playwright: pip install playwright")
 pytest.importorskip("uvicorn", reason="the page needs the extra live")
 
-from jeit.live.server import serve  # noqa: E402, after its server was found
-
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: apt-get install chromium"),
-]
-
-# Where the image is strongest, and the box of the electrodes, which are dark, and of which one is at each end of both
-# axes: pixels of the canvas; and how many pixels have strong colours.
-LOOK = """() => {
-  const canvas = document.getElementById("image");
-  const { width, height } = canvas;
-  const copy = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
-  copy.drawImage(canvas, 0, 0);
-  const data = copy.getImageData(0, 0, width, height).data;
-  const right = width - (width < 520 ? 62 : 84);
-  const columns = new Int32Array(width), rows = new Int32Array(height);
-  let x = 0, y = 0, sum = 0, count = 0;
-  for (let row = 0; row < height; row += 1) {
-    for (let column = 0; column < right; column += 1) {
-      const at = 4 * (row * width + column);
-      const [red, green, blue] = [data[at], data[at + 1], data[at + 2]];
-      const dark = Math.max(red, green, blue) < 80 && row > 30 && row < height - 30;
-      columns[column] += dark;
-      rows[row] += dark;
-      const weight = Math.max(0, blue - red - 60);
-      x += weight * (column + 0.5); y += weight * (row + 0.5); sum += weight; count += weight > 0;
-    }
-  }
-  const ends = (counts) => [counts.findIndex((one) => one > 12), counts.findLastIndex((one) => one > 12) + 1];
-  const box = [...ends(columns), ...ends(rows)];
-  return { x: x / sum, y: y / sum, box, count };
-}"""
-
-
-@pytest.fixture
-def serving():
-    """Start a session and serve it. Returns the address. It ends after the pages are closed."""
-    running = []
-
-    def start(session, **options):
-        opened, addresses = threading.Event(), []
-        options |= {"opened": lambda address: (addresses.append(address), opened.set())}
-        thread = threading.Thread(target=serve, args=(session,), kwargs=options)
-        session.__enter__()
-        thread.start()
-        running.append((session, thread))
-        assert opened.wait(10)
-        return addresses[0]
-
-    yield start
-    for session, thread in running:
-        session.stop()
-        thread.join(10)
-        assert not thread.is_alive()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with playwright.sync_playwright() as driver:
-        program = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield program
-        program.close()
-
-
-@pytest.fixture
-def open_page(browser, serving):
-    """Open an address in a window of its own. Any error on the console fails the test."""
-    contexts, faults = [], []
-
-    def opened(address, width=1280, height=800, theme="light"):
-        context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=theme)
-        contexts.append(context)
-        page = context.new_page()
-        page.on(
-            "console", lambda message: faults.append(message.text) if message.type in ("error", "warning") else None
-        )
-        page.on("pageerror", lambda error: faults.append(str(error)))
-        page.goto(address)
-        return page
-
-    yield opened
-    for context in contexts:
-        context.close()
-    assert faults == []
-
-
-def until(condition, seconds=5.0):
-    """Wait for a condition, and return whether it was met."""
-    end = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.02)
-    return True
-
-
-def resident_memory():
-    """Memory of this process, bytes."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-
-def drawn(page):
-    """Number of the frame whose picture is drawn, or -1 before the first."""
-    return int(page.get_attribute("#image", "data-number") or -1)
-
-
-def shows(page, number):
-    """Wait until the picture of a frame is drawn."""
-    assert until(lambda: drawn(page) == number, 10), (number, drawn(page))
-
-
-def place(look, radius=0.1):
-    """Place of the strongest colour, metres, by the box of the electrodes."""
-    left, right, top, bottom = look["box"]
-    scale = 2 * radius / (right - left)
-    assert abs((bottom - top) - (right - left)) < 4
-    return np.array([look["x"] - (left + right) / 2, (top + bottom) / 2 - look["y"]]) * scale
-
-
-def text(page, name):
-    return page.inner_text(f"#{name}")
+pytestmark = IN_BROWSER
 
 
 @pytest.mark.parametrize("width", [400, 1280, 2000])
@@ -396,21 +269,6 @@ def test_straight_drags_and_clicks(serving, open_page):
     assert text(page, "pause") == "Go on"
 
 
-def test_a_failed_recording_is_reported_over_the_image(serving, open_page):
-    """A recording that cannot begin is named in the banner when it fails, and not again when the page is opened."""
-    session = StandIn()
-    address = serving(session)
-    page = open_page(address)
-    page.wait_for_selector("#image[data-number]")
-    assert until(lambda: text(page, "connection") == "connected")
-    failure = "The recording cannot begin: Read-only file system"
-    session.extra["messages"] = [{"second": 3.0, "text": failure}]
-    assert until(lambda: text(page, "banner") == failure)
-    other = open_page(address)
-    assert until(lambda: failure in text(other, "messages"))
-    assert other.locator("#banner").is_hidden()
-
-
 def test_numbers_have_no_caret(serving, open_page):
     """Small and large numbers have an exponent as programs write it, with the true minus sign."""
     page = open_page(serving(StandIn()))
@@ -422,101 +280,6 @@ def test_numbers_have_no_caret(serving, open_page):
     assert page.evaluate(read, numbers) == [
         "−6.97e−4", "−0.000697", "1.23e7", "12300000", "−0.500", "−0.5", "1.00e−7", "1e−7",
     ]  # fmt: skip
-
-
-def test_faults_are_shown(serving, open_page):
-    """Refused frames with reasons, dead electrodes in colour, a full disk, a disconnected device."""
-    session = StandIn(None)
-    warned = """() => {
-      const canvas = document.getElementById("image");
-      const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", { willReadFrequently: true });
-      copy.drawImage(canvas, 0, 0);
-      const data = copy.getImageData(0, 0, canvas.width - 84, canvas.height).data;
-      let count = 0;
-      for (let at = 0; at < data.length; at += 4) {
-        count += data[at] === 0xb3 && data[at + 1] === 0x40 && data[at + 2] === 0x0a;
-      }
-      return count;
-    }"""
-    address = serving(session)
-    page = open_page(address)
-    session.publish(0, 1.0)
-    shows(page, 0)
-    assert page.evaluate(warned) == 0
-    session.extra = {
-        "refused": 3,
-        "dropped": 17,
-        "reasons": {"half a line": 3},
-        "dead": ["4"],
-        "drifting": ["2", "7"],
-        "connection": "waiting: /dev/ttyUSB0 is unplugged",
-        "recording": {"folder": "one", "frames": 5, "bytes": 10, "problem": "The disk is full."},
-    }
-    assert until(lambda: text(page, "dead") == "4")
-    assert text(page, "drifting") == "2, 7"
-    assert (text(page, "refused"), text(page, "dropped"), text(page, "reasons")) == ("3", "17", "3 × half a line")
-    assert "unplugged" in text(page, "connection")
-    assert "The disk is full." in text(page, "recording")
-    assert until(lambda: page.evaluate(warned) > 50)
-    session.publish(1, 2.0, refused="41 channels, not 40")
-    assert until(lambda: text(page, "banner") == "Refused: 41 channels, not 40")
-    session.publish(2, 2.1)
-    assert until(lambda: page.locator("#banner").is_hidden())
-
-
-def test_two_browsers_and_a_sleeping_one(serving, open_page):
-    """Two pages each draw. One that is busy for seconds is sent nothing meanwhile, and continues with the newest."""
-    session = StandIn()
-    address = serving(session)
-    one, two = open_page(address), open_page(address, 400, 800)
-    for page in (one, two):
-        assert until(lambda page=page: drawn(page) > 30, 10)
-    two.evaluate("() => { const end = performance.now() + 3000; while (performance.now() < end); }")
-    newest = session.last
-    assert until(lambda: drawn(two) > newest, 2.0)
-    assert until(lambda: float(text(one, "drawn").removesuffix(" /s")) > 20, 10)
-
-
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads memory as Linux has it")
-def test_a_browser_suspended_for_1800_frames(browser, serving):
-    """A suspended browser costs the session nothing, and shows the newest frame within 3 s after it resumes."""
-    session, processes = StandIn(60.0), browser.new_browser_cdp_session()
-    page = browser.new_context().new_page()
-    page.goto(serving(session))
-    assert until(lambda: drawn(page) > 10, 10)
-    found = processes.send("SystemInfo.getProcessInfo")["processInfo"]
-    renderers = [process["id"] for process in found if process["type"] == "renderer"]
-    before = resident_memory()
-    for pid in renderers:
-        os.kill(pid, signal.SIGSTOP)
-    try:
-        time.sleep(30)
-    finally:
-        for pid in renderers:
-            os.kill(pid, signal.SIGCONT)
-    newest = session.last
-    assert newest > 1500
-    assert until(lambda: drawn(page) > newest, 3.0)
-    assert until(lambda: text(page, "connection") == "connected")
-    # The session itself keeps a picture of 64 × 64 for each frame.
-    assert resident_memory() - before < 60e6
-    page.context.close()
-
-
-def test_a_lost_server_is_found_again(browser, serving):
-    """When the server stops, the page says so, and it draws again when the server is back."""
-    session, context = StandIn(), browser.new_context()
-    page = context.new_page()
-    address = serving(session)
-    page.goto(address)
-    page.wait_for_selector("#image[data-number]")
-    session.stop()
-    assert until(lambda: "cannot be reached" in text(page, "banner"))
-    port = int(address.rstrip("/").rpartition(":")[2])
-    serving(StandIn(), port=port)
-    assert until(lambda: page.locator("#banner").is_hidden(), 10)
-    assert until(lambda: text(page, "connection") == "connected")
-    context.close()
 
 
 def test_no_page_scrolls_sideways(serving, open_page):
