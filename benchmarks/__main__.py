@@ -10,14 +10,15 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
 from benchmarks.cases import NAMES, load
 from benchmarks.harness import machine, report
 from benchmarks.harness.case import MISSED, Case, Options, Result
-from benchmarks.harness.run_case import CaseFailedError, run_apart
+from benchmarks.harness.run_case import CaseFailedError, run_apart, run_shared, shared_processes
 from benchmarks.harness.tables import duration
 from benchmarks.harness.timing import say
 
@@ -72,9 +73,12 @@ def list_cases() -> None:
         print(f"{name:20}{case.description} ({case.minutes:g} min)")
 
 
-def measure(name: str, options: argparse.Namespace, threads: int) -> tuple[Result, list[str]]:
-    """Run one case with `threads` threads of linear algebra; return its result, and the heading that names the machine.
-    Raises `CaseFailedError` if the case ends without a result."""
+Run = Callable[[str, Options], Result]
+
+
+def measure(name: str, options: argparse.Namespace, run: Run) -> tuple[Result, list[str]]:
+    """Run one case by the function `run`; return its result, and the heading that names the machine. Raises
+    `CaseFailedError` if the case ends without a result."""
     case = find(name)
     pictures = machine.ROOT / "docs" / "images" if options.write and case.pictures else None
     case_options = Options(
@@ -91,7 +95,7 @@ def measure(name: str, options: argparse.Namespace, threads: int) -> tuple[Resul
         case_options.output.mkdir(parents=True, exist_ok=True)
     say(f"== {name}: {case.description}")
     heading = machine.heading()
-    return run_apart(name, case_options, threads), heading
+    return run(name, case_options), heading
 
 
 def measure_all(names: Iterable[str], options: argparse.Namespace) -> Iterator[tuple[str, Callable]]:
@@ -99,7 +103,7 @@ def measure_all(names: Iterable[str], options: argparse.Namespace) -> Iterator[t
 
     Cases that measure times run first, one after the other. The other cases then run in parallel, as many as there are
     cores, with one thread each: more would wait for each other. In a quick run, times are not judged, so all cases run
-    in parallel.
+    in parallel, in processes that they share.
     """
     studies = []
     for name in names:
@@ -108,13 +112,23 @@ def measure_all(names: Iterable[str], options: argparse.Namespace) -> Iterator[t
         except CaseFailedError:
             timed = True
         if timed:
-            yield name, partial(measure, name, options, machine.CORES)
+            yield name, partial(measure, name, options, partial(run_apart, threads=machine.CORES))
         else:
             studies.append(name)
-    with ThreadPoolExecutor(machine.CORES) as pool:
-        futures = {pool.submit(measure, name, options, 1): name for name in studies}
+    processes = shared_processes(machine.CORES) if options.quick else nullcontext()
+    with processes as shared, ThreadPoolExecutor(machine.CORES) as pool:
+        run = partial(run_apart, threads=1) if shared is None else partial(run_in, shared)
+        futures = {pool.submit(measure, name, options, run): name for name in studies}
         for future in as_completed(futures):
             yield futures[future], future.result
+
+
+def run_in(processes: ProcessPoolExecutor, name: str, options: Options) -> Result:
+    """Run a case in one of several shared processes. Raises `CaseFailedError` if the case fails or crashes."""
+    try:
+        return processes.submit(run_shared, name, options).result()
+    except BrokenExecutor as error:
+        raise CaseFailedError(f"{name} was not run: a case has crashed its process; see the messages above.") from error
 
 
 def keep(name: str, result: Result, heading: list[str], options: argparse.Namespace) -> None:

@@ -23,13 +23,14 @@ def use_cores(count: int = CORES) -> None:
         os.sched_setaffinity(0, allowed[:count])
 
 
-def same_for_all(threads: int = CORES) -> dict[str, str]:
+def same_for_all(threads: int = CORES, *, compiled: bool = False) -> dict[str, str]:
     """The environment variables of every measured process: the same number of threads of linear algebra, and no cache
-    of compiled code."""
+    of compiled code, unless `compiled`."""
     environment = dict(os.environ)
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         environment[variable] = str(threads)
-    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    if not compiled:
+        environment.pop("JAX_COMPILATION_CACHE_DIR", None)
     return environment
 
 

@@ -1,16 +1,21 @@
 """Run one case in a separate process: `python -m benchmarks.harness.run_case NAME OPTIONS.pickle RESULT.json`.
 
-Each case thus has its own memory and no compiled code, and a case that crashes does not affect the others.
+Each case thus has its own memory and no compiled code, and a case that crashes does not affect the others. Quick cases,
+which are not judged, are run one after the other in a few processes, and share modules and compiled code.
 """
 
 from __future__ import annotations
 
 import json
+import multiprocessing
+import os
 import pickle
 import subprocess
 import sys
 import tempfile
 import time
+import traceback
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from benchmarks.harness.case import MET, MISSED, NOT_JUDGED, Options, Result
@@ -33,6 +38,21 @@ def run_apart(name: str, options: Options, threads: int) -> Result:
         if ended.returncode != 0 or not answer.is_file():
             raise CaseFailedError(f"{name} ended with exit code {ended.returncode}; see the messages above.")
         return Result.from_dict(json.loads(answer.read_text(encoding="utf-8")))
+
+
+def shared_processes(number: int) -> ProcessPoolExecutor:
+    """A `number` of processes for `run_shared`, with a thread of linear algebra each."""
+    os.environ |= same_for_all(1, compiled=True)
+    return ProcessPoolExecutor(number, mp_context=multiprocessing.get_context("spawn"))
+
+
+def run_shared(name: str, options: Options) -> Result:
+    """Run a case in one of the shared processes, and return the result. Raises `CaseFailedError`, with the traceback,
+    if the case fails."""
+    try:
+        return run_here(name, options)
+    except Exception:  # of any kind; the process goes on with the next case
+        raise CaseFailedError(f"{name} failed:\n{traceback.format_exc()}") from None
 
 
 def run_here(name: str, options: Options) -> Result:
