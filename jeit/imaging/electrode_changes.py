@@ -56,8 +56,11 @@ _CONTACT_DEVIATION, _MAX_FACTOR = 1.0, 100.0
 _INITIAL_LOGARITHMS, _LOGARITHMS_WIDTH = np.array([-0.3, -3.0, -3.0, -2.0]), 3.0
 # Eigenvalues below this share of the largest one belong to errors alone.
 _RANK_TOLERANCE = 1e-10
-# Number of corrections of the linear approximation.
-_NUM_CORRECTIONS = 3
+# Maximum number of steps by which the change of the voltages is computed without the linear approximation, and shares of a step
+# that are tried until less of the difference remains: contact impedances may have changed by factors.
+_NUM_CORRECTIONS, _STEP_SHARES = 8, (1.0, 0.5, 0.25, 0.125)
+# Factor by which contact impedances have usually changed, above which a doubt states it.
+_MIN_STATED_FACTOR = 1.1
 # Number of frames of a series among which one with changed electrodes is searched.
 _NUM_CANDIDATES = 5
 
@@ -66,11 +69,13 @@ class ElectrodeChange(NamedTuple):
     """Change of the electrodes between a reference and a frame, estimated by `ElectrodeChanges.find`.
 
     **Fields**: `shift` (L, a): displacements along the a directions in which each electrode can move, metres;
-    `voltages` (M,): change of the voltages due to the change of the electrodes, volts; `rest`: root mean square of the
-    remaining difference, as a share of the difference.
+    `contact_factor` (L,): factors by which the contact impedances have changed, 1 where voltages are not measured on
+    driven electrodes; `voltages` (M,): change of the voltages due to the change of the electrodes, volts; `rest`: root
+    mean square of the remaining difference, as a share of the difference.
     """
 
     shift: Float[np.ndarray, "L a"]
+    contact_factor: Float[np.ndarray, " L"]
     voltages: Float[np.ndarray, " M"]
     rest: float
 
@@ -79,11 +84,20 @@ class ElectrodeChange(NamedTuple):
         """Description of the change, in a sentence."""
         distances = 1e3 * np.linalg.norm(self.shift, axis=1)
         largest = int(np.argmax(distances))
+        logarithm = np.log(self.contact_factor)
+        contact, usual_factor = int(np.argmax(np.abs(logarithm))), float(np.exp(np.sqrt(np.mean(logarithm**2))))
+        contacts = (
+            ""
+            if usual_factor < _MIN_STATED_FACTOR
+            else f", and contact impedances had changed by a factor of about {usual_factor:.2g} (of electrode "
+            f"{contact + 1}, {self.contact_factor[contact]:.2g})"
+        )
         return (
             "the voltages have changed as if electrodes had moved since the reference, by about "
             f"{np.sqrt(np.mean(distances**2)):.2g} mm (root mean square; electrode {largest + 1} by about "
-            f"{distances[largest]:.2g} mm), or as if a layer along the wall had changed. The image shows the rest of "
-            f"the difference, {percent(self.rest)} of it (as_is=True, --as-is: all of it). Measure a new reference."
+            f"{distances[largest]:.2g} mm){contacts}, or as if a layer along the wall had changed. The image shows the "
+            f"rest of the difference, {percent(self.rest)} of it (as_is=True, --as-is: all of it). Measure a new "
+            "reference."
         )
 
 
@@ -132,15 +146,25 @@ class ElectrodeChanges:
         estimator = self.estimator(difference) if estimator is None else estimator
         if estimator is None:
             return None
-        coefficients, change = estimator @ difference, np.zeros(len(difference))
+        coefficients, change = np.zeros(len(estimator)), np.zeros(len(difference))
+        rest = 1.0
         for _ in range(_NUM_CORRECTIONS):
-            try:
-                change = self._change_of_voltages(coefficients)
-            except ValueError:  # electrodes would overlap or leave the body
-                return None
-            coefficients = estimator @ (difference - change + self._patterns @ coefficients)
-        rest = float(self._size(difference - change) / self._size(difference))
-        return ElectrodeChange(self._shift(coefficients), change, rest) if rest < _MAX_REST else None
+            step = estimator @ (difference - change + self._patterns @ coefficients) - coefficients
+            for share in _STEP_SHARES:
+                try:
+                    trial = self._change_of_voltages(coefficients + share * step)
+                except ValueError:  # electrodes would overlap or leave the body
+                    continue
+                trial_rest = float(self._size(difference - trial) / self._size(difference))
+                if trial_rest < rest:
+                    coefficients, change, rest = coefficients + share * step, trial, trial_rest
+                    break
+            else:
+                break
+        if rest >= _MAX_REST:
+            return None
+        contact_factor = np.exp(self._log_contact(coefficients))
+        return ElectrodeChange(self._shift(coefficients), contact_factor, change, rest)
 
     def voltages(
         self, differences: Float[np.ndarray, "N M"], estimator: Float[np.ndarray, "p M"]
@@ -203,15 +227,18 @@ class ElectrodeChanges:
         described: Any = self.model.electrodes
         shift = self._shift(coefficients)
         electrodes = shift_electrodes(described, np.asarray(described.directions(self.model.mesh)), shift)
-        log_contact = (self._spread * coefficients)[shift.size :]
-        if log_contact.size:
-            impedance = np.asarray(described.contact_impedance) * np.exp(log_contact)
-            electrodes = electrodes.with_contact_impedance(impedance)
+        impedance = np.asarray(described.contact_impedance) * np.exp(self._log_contact(coefficients))
+        electrodes = electrodes.with_contact_impedance(impedance)
         moved = self.model.with_electrodes(electrodes)
         return np.where(self.mask, np.asarray(moved.voltages(self.background)) - self._reference, 0.0)
 
     def _shift(self, coefficients: Float[np.ndarray, " p"]) -> Float[np.ndarray, "L a"]:
         return (self._spread * coefficients)[: self._num_shifts].reshape(self.model.electrodes.num_electrodes, -1)
+
+    def _log_contact(self, coefficients: Float[np.ndarray, " p"]) -> Float[np.ndarray, " L"]:
+        """Changes of the logarithms of the contact impedances."""
+        changes = (self._spread * coefficients)[self._num_shifts :]
+        return changes if changes.size else np.zeros(self.model.electrodes.num_electrodes)
 
     def _without_common_factor(self, voltages: Float[np.ndarray, "N M"]) -> Float[np.ndarray, "N M"]:
         """Voltages divided by the noise of their channels, without the part that is a factor common to all."""

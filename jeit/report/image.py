@@ -257,10 +257,15 @@ def _uncertainty_report(uncertainty: Uncertainty, mesh: Mesh) -> dict[str, Any]:
 
 
 def _electrode_change_report(change: ElectrodeChange | None) -> dict[str, Any] | None:
-    """Report of the movement of the electrodes since the reference, if it explains much of the difference."""
+    """Report of the change of the electrodes since the reference, if it explains much of the difference."""
     if change is None:
         return None
-    return {"shift": change.shift.tolist(), "shift_unit": "m", "rest_relative_to_difference": change.rest}
+    return {
+        "shift": change.shift.tolist(),
+        "shift_unit": "m",
+        "contact_factor": change.contact_factor.tolist(),
+        "rest_relative_to_difference": change.rest,
+    }
 
 
 def _frame_report(result: ImagedDifference) -> dict[str, Any]:

@@ -48,11 +48,11 @@ def frame(name: str, share: float = 0.0, seed: int = 1) -> Measurement:
     return recorded([np.asarray(truth.voltages(np.where(inside, 0.02 * factor, 0.02)))], seed)
 
 
-def recorded(frames, seed: int = 0, noise: float = NOISE) -> Measurement:
+def recorded(frames, seed: int = 0, noise: float = NOISE, protocol=PROTOCOL) -> Measurement:
     voltages = np.array(frames)
     voltages = voltages * (1 + noise * np.random.default_rng(seed).normal(size=voltages.shape))
     used = np.ones(voltages.shape, bool)
-    return Measurement(voltages, used, PROTOCOL, electrodes=ELECTRODES, domain=Disk(RADIUS), name="simulated")
+    return Measurement(voltages, used, protocol, electrodes=ELECTRODES, domain=Disk(RADIUS), name="simulated")
 
 
 @functools.cache
@@ -75,6 +75,25 @@ def test_moved_electrodes_are_estimated_and_show_no_bodies():
     report = report_image(result)
     assert report["electrode_change"]["shift_unit"] == "m"
     assert np.shape(report["electrode_change"]["shift"]) == (16, 1)
+    np.testing.assert_array_equal(report["electrode_change"]["contact_factor"], np.ones(16))
+
+
+def test_contacts_that_have_changed_by_factors_show_no_bodies():
+    """Contact impedances are seen where voltages are measured on driven electrodes. Steps of the linear approximation
+    alone would make the change of such contacts diverge."""
+    factor = np.exp(0.8 * np.random.default_rng(4).normal(size=16))
+    protocol = adjacent(16, driven_electrodes=True)
+    voltages = []
+    for contact in (np.full(16, 0.01), 0.01 * factor):
+        electrodes = BoundaryElectrodes(ring(RADIUS, 16), 0.01, contact)
+        truth = ForwardModel(body_mesh(Disk(RADIUS), electrodes, 1500), electrodes, protocol)
+        voltages.append(np.asarray(truth.voltages(0.02)))
+    reference, changed = (recorded([one], seed, protocol=protocol) for seed, one in enumerate(voltages))
+    result = image_difference(changed, reference, SETTINGS)
+    assert result.inclusions == ()
+    assert result.electrode_change.rest < 0.05
+    assert np.corrcoef(np.log(result.electrode_change.contact_factor), np.log(factor))[0, 1] > 0.95
+    assert f"(of electrode {np.argmax(np.abs(np.log(factor))) + 1}, " in result.electrode_change.doubt
 
 
 def test_a_weak_body_is_found_beside_moved_electrodes():
