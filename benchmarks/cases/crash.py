@@ -64,22 +64,20 @@ def run(options: Options) -> Result:
 
 
 def _survive_all(folder: Path, kills: int, random: np.random.Generator, *, quick: bool):
-    """Yield each command with its result."""
+    """Yield each command with its result. A quick run kills a study only: tests kill the other commands."""
     embedded = study(folder / "embedded", "study run")
     yield survive_resumed(embedded, kills, random), embedded
-    if not quick:
-        from distributed import Client, LocalCluster
+    if quick:
+        return
+    from distributed import Client, LocalCluster
 
-        with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster, Client(cluster):
-            command = study(folder / "cluster", "study run --scheduler", cluster.scheduler_address)
-            yield survive_resumed(command, kills, random), command
-    kills = min(kills, FEWER)
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster, Client(cluster):
+        command = study(folder / "cluster", "study run --scheduler", cluster.scheduler_address)
+        yield survive_resumed(command, kills, random), command
     commands = tank(folder / "tank")
-    for one in ("reconstruct",) if quick else ("stream", "reconstruct", "compiling"):
-        yield survive_anew(commands[one], kills, random), commands[one]
-    if not quick:
-        watched = watch(folder / "sheet")
-        yield survive_anew(watched, kills, random), watched
+    others = [commands["stream"], commands["reconstruct"], commands["compiling"], watch(folder / "sheet")]
+    for command in others:
+        yield survive_anew(command, min(kills, FEWER), random), command
 
 
 def survive_resumed(command: Command, kills: int, random: np.random.Generator) -> Survived:

@@ -230,7 +230,7 @@ LONG = (
 # Options that leave less to do of what takes long as it is written.
 LESS = {
     "jeit touch fit presses.npz": "--channels 24",
-    "jeit choose data1.mat": "--num-points 800",
+    "jeit choose datamat_3_4.mat": "--num-points 600",
     "jeit layout compare": "--cell-mm 8 --places 16",
 }
 READ = [page for page in PAGES if blocks(page, "python") and not any(name_of(page) in one for one in TYPED.values())]
