@@ -179,6 +179,7 @@ EDITED = {
         r"surface\.outline must be .*; it has nan in it",
     ),
     "outline in millimetres": (put("surface", "outline", [[0, 0], [100, 0], [0, 100]]), "are these metres"),
+    "a strip too long": (put("surface", "outline", [[0, 0], [5.1, 0], [0, 0.2]]), r"over 5\.1: are these metres"),
     "hole of text": (put("surface", "holes", ["round"]), r"surface\.holes\[0\] must be .*; it is 'round'"),
     "position of one more": (
         put("microphones", 3, "position", [0.0, 0.0, 0.0]),

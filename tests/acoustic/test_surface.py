@@ -113,6 +113,16 @@ def test_a_curved_surface_passes_through_its_points():
     assert np.linalg.norm(again - known, axis=1).max() < 1e-6
 
 
+def test_a_place_that_is_tapped_twice_is_no_fold():
+    """Two taps at one place, and two at places 10 µm apart."""
+    rim, taps = cylinder(5)
+    close = on_cylinder(np.array([[0.02, 0.01], [0.02, 0.01 + 1e-5]]))
+    known = np.vstack([rim, taps, taps[:1], close])
+    skin = make_surface(rim, known[len(rim) :])
+    again = np.asarray(skin.place(skin.project(np.asarray(known.T)))).T
+    assert np.linalg.norm(again - known, axis=1).max() < 1e-6
+
+
 def test_an_inclined_surface():
     """It is steep on one side only, so that it deviates from the plane of best fit, and still passes through its
     points.

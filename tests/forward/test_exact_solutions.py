@@ -68,6 +68,17 @@ def test_resistive_contacts_carry_uniform_current():
     assert relative(arc_transfer_impedance(ConductingDisk(), ANGLES, widths, impedance, order=8), layers) < 1e-5  # 1/z
 
 
+def test_uniform_currents_of_wide_arcs():
+    """Without the voltage drop at the contacts, the mean potentials are a Fourier series."""
+    widths, impedance = np.array([0.7, 0.8, 1.2, 1.3, 1.2]), np.full(5, 1e4)
+    found = arc_transfer_impedance(ConductingDisk(1.0, 2.0), ANGLES, widths, impedance, order=8)
+    modes = np.arange(1, 3000)[:, None, None]
+    means = np.sinc(modes * widths / (2 * np.pi))
+    series = np.cos(modes * (ANGLES[:, None] - ANGLES)) * means * means.transpose(0, 2, 1) / (2.0 * np.pi * modes)
+    expected = CENTRED @ series.sum(axis=0) @ CENTRED
+    assert relative(found - CENTRED @ np.diag(impedance / widths) @ CENTRED, expected) < 1e-4  # 1/z
+
+
 def test_inclusion_of_equal_conductivity_and_insulating_inclusion():
     assert np.abs(point_inclusion_effect(ConductingDisk(1.0, 2.0, 0.5, 2.0), ANGLES)).max() < 1e-15
     # An insulating core leaves an annulus: modes k have ND eigenvalue (1 + ρ^{2k})/(1 − ρ^{2k})/k.

@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import urllib.request
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -214,6 +215,15 @@ def test_a_learnt_skin_is_recognised_by_its_file(tmp_path):
         for one in results:
             (marker,) = one.picture.markers
             assert marker.x == pytest.approx(found.position[one.frame.number, 0])
+    # Without a reference, the first frames are taken for it; a skin learnt without references needs none.
+    np.savez(tmp_path / "both.npz", frames=np.vstack([given["reference"][:5], 1.1 * later["frames"]]))
+    played = str(tmp_path / "both.npz")
+    ready = jeit.live.prepare(played, model=tmp_path / "skin.skops", rate=1000.0, untouched=0.0045)
+    np.testing.assert_allclose(ready.view.reference, given["reference"][0])
+    (tmp_path / "absolute").mkdir()
+    write_skin(replace(skin, mean_reference=None), tmp_path / "absolute" / "skin.skops")
+    ready = jeit.live.prepare(played, model=tmp_path / "absolute", rate=1000.0, untouched=0.001)
+    assert ready.view.reference is None
     (tmp_path / "network.jeit").write_bytes(b"")
     with pytest.raises(ValueError, match=r"holds skin\.skops and network\.jeit"):
         jeit.live.prepare("demo", model=tmp_path)

@@ -282,9 +282,11 @@ def test_a_slow_page_gets_two_pictures_and_then_the_newest(served):
     address = served(session)
     with page(address) as connection:
         until(connection, "scene")
+        until(connection, "state")
         for number in range(2):
             session.publish(number, number / 60)
-            assert until(connection, "picture")[0]["number"] == number
+            # No other state is sent before the page reports that it has read the first.
+            assert decoded(connection.recv(5))[0]["number"] == number
         for number in range(2, 20):
             session.publish(number, number / 60)
         with pytest.raises(TimeoutError):

@@ -6,7 +6,14 @@ import pytest
 
 from jeit.touch.learnt.learn_from_presses import Standing
 from jeit.touch.learnt.recorded_presses import Touches
-from jeit.touch.plots.learnt import plot_answers, plot_key_errors, plot_places
+from jeit.touch.plots.learnt import (
+    plot_answers,
+    plot_confusion,
+    plot_force_errors,
+    plot_key_errors,
+    plot_place_errors,
+    plot_places,
+)
 
 
 def touches(**fields) -> Touches:
@@ -52,4 +59,34 @@ def test_errors_of_keys_are_shares_of_presses():
     ax = plot_key_errors(Standing("som", [("som", 0.1)], held_out, right, None))
     assert [bar.get_height() for bar in ax.patches] == [25.0, 0.0]  # pyright: ignore
     assert ax.get_title() == "Keys: 87.5 % right, whole patterns 75.0 %"
+    plt.close(ax.figure)
+
+
+def test_errors_of_places_are_in_millimetres_at_the_true_places():
+    """The largest errors are drawn last, over the others."""
+    right = np.array([[0.01, 0.02], [0.03, 0.04], [0.05, 0.0], [0.0, 0.0]])
+    error = np.array([[3e-3, 4e-3], [0.0, 1e-3], [-2e-3, 0.0], [0.0, 0.0]])
+    ax = plot_place_errors(Standing("som", [], right + error, right))
+    (points,) = ax.collections
+    np.testing.assert_allclose(points.get_offsets(), right[[3, 1, 2, 0]])  # pyright: ignore
+    np.testing.assert_allclose(points.get_array(), [0, 1, 2, 5], atol=1e-12)  # pyright: ignore
+    assert points.get_clim() == (0, pytest.approx(5 - 0.06 * 3))
+    assert ax.get_title() == "Places: 2 mm on average, median 1.5 mm"
+    assert ax.figure.axes[1].get_ylabel() == "Error of presses held out (mm)"
+    plt.close(ax.figure)
+
+
+def test_errors_of_forces_and_labels():
+    right, held_out = np.array([[1.0], [2.0], [4.0]]), np.array([[1.5], [2.0], [3.0]])
+    ax = plot_force_errors(Standing("som", [], held_out, right))
+    line, points = ax.lines
+    np.testing.assert_array_equal(line.get_xydata(), [[1, 1], [4, 4]])
+    np.testing.assert_array_equal(points.get_xydata(), [[1, 1.5], [2, 2], [4, 3]])
+    assert (ax.get_xlabel(), ax.get_title()) == ("Force (N)", "Forces: 0.5 N off on average")
+    plt.close(ax.figure)
+    names = np.array(["a", "a", "a", "a", "b", "b"])
+    ax = plot_confusion(Standing("som", [], np.array(["a", "a", "b", "a", "b", "b"]), names))
+    np.testing.assert_array_equal(ax.images[0].get_array(), [[75, 25], [0, 100]])  # rows are true labels
+    assert [text.get_text() for text in ax.texts] == ["75", "25", "100"]
+    assert ax.get_title() == "Labels: 83.3 % right of presses held out"
     plt.close(ax.figure)

@@ -5,7 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jeit.touch.networks.three_stage_network import Convolution, repeat_pixels
+from jeit.touch.networks.three_stage_network import (
+    Convolution,
+    DepthAutoencoder,
+    repeat_pixels,
+)
 
 
 def test_weights_are_the_first_of_more_draws():
@@ -35,3 +39,15 @@ def test_a_convolution_of_a_doubled_image():
     np.testing.assert_allclose(one, other, atol=1e-5)
     for slope, own in zip(*map(jax.tree.leaves, (slopes, right)), strict=True):
         np.testing.assert_allclose(slope, own, rtol=1e-4, atol=1e-3 * float(np.abs(own).max()))
+
+
+def test_maps_keep_their_numbers_of_rows_and_columns():
+    """Their code has 128 values."""
+
+    def encoded_and_decoded(maps):
+        network = DepthAutoencoder((16, 40), key=jax.random.key(0))
+        code = network.encoder(maps)
+        return code, network.decoder(code)
+
+    code, maps = jax.eval_shape(encoded_and_decoded, jnp.zeros((3, 16, 40), jnp.float32))
+    assert (code.shape, maps.shape) == ((3, 128), (3, 16, 40))
