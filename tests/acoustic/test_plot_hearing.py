@@ -328,6 +328,8 @@ def test_frames_with_another_status_are_labelled(ax):
     np.testing.assert_allclose(doubted, stroke()[[3, 12]])
     np.testing.assert_allclose(other, second[[8]])
     np.testing.assert_allclose(first, stroke()[[8]])
+    pair = [c for c in ax.collections if isinstance(c, LineCollection)][-1]
+    np.testing.assert_allclose(pair.get_segments(), [[stroke()[8], second[8]]])
     np.testing.assert_allclose(outside, stroke()[[2, 3]])
     np.testing.assert_allclose(misfit, stroke()[[5]])
 

@@ -12,6 +12,7 @@ from jeit.acoustic.simulate import (
     simulate_sound_clips,
     simulate_stroke,
     simulate_wind,
+    wind_sound,
 )
 from jeit.acoustic.simulate.people import MODALITIES, SOUND_MANNERS
 from jeit.acoustic.simulate.propagation import expected_power, noise_power
@@ -49,6 +50,24 @@ def test_wind_is_incoherent_and_a_stroke_is_not(skin):
     assert coherence(blown.samples) < 0.05
     assert coherence(rubbed.samples) > 0.5
     assert blown.position.shape == (len(blown.position_times), 2)
+
+
+def test_eddies_are_spread_by_the_radius_and_stay_on_the_skin(skin, monkeypatch):
+    """64 of them determine their standard deviation to 6 %."""
+    seen = []
+
+    def received_power(skin, positions, frequencies):
+        seen.append(np.asarray(positions))
+        return found(skin, positions, frequencies)
+
+    found = wind_sound._received_power
+    monkeypatch.setattr(wind_sound, "_received_power", received_power)
+    simulate_wind(skin, KEY, WHERE, radius=0.01, duration=8.0, noise=False)
+    simulate_wind(skin, KEY, (0.1, -0.1), radius=0.01, duration=8.0, noise=False)
+    inside, corner = seen
+    np.testing.assert_allclose(inside.mean(axis=0), WHERE, atol=4e-3)
+    np.testing.assert_allclose(inside.std(axis=0), 0.01, rtol=0.25)
+    assert np.abs(corner).max() == pytest.approx(0.1)
 
 
 def test_wind_falls_with_frequency_by_its_exponent(skin):

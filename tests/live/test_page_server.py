@@ -306,7 +306,7 @@ def test_pause_and_steps_through_the_past(served):
     with page(address) as connection:
         assert until(connection, "picture")[0]["number"] == 5
         connection.send('{"do": "follow", "on": false}')
-        for asked, direction, found in ((2, -1, 2), (4, -1, 2), (3, 1, 5), (1, 1, 1)):
+        for asked, direction, found in ((2, -1, 2), (4, -1, 2), (3, 1, 5), (1, 1, 1), (0, -1, 0)):
             connection.send(json.dumps({"do": "show", "number": asked, "direction": direction}))
             header, _, pixels = until(connection, "picture")
             assert (header["number"], header["past"], pixels is None) == (found, True, found == 1)
