@@ -7,7 +7,7 @@ of the accuracy of images.
 import numpy as np
 import pytest
 
-from jeit.electrodes import BoundaryElectrodes, FaceDiscs, PointElectrodes
+from jeit.electrodes import BoundaryElectrodes, FaceDiscs, FacePatches, PointElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import Raster
 from jeit.image.inclusions import StrongestRegion
@@ -19,7 +19,7 @@ from jeit.live import ConductivityView, LiveFrame
 from jeit.live.views.conductivity import PixelGrid, channel_names, electrode_curves, scene_of
 from jeit.live.views.contacts import ContactsView
 from jeit.mesh import Disk, centroids, cylinder, rectangle, sphere
-from jeit.protocol import adjacent, reference_electrode
+from jeit.protocol import adjacent, opposite, reference_electrode, trigonometric
 from jeit.touch import CellFinder, ImageNoise, find_contacts, track_contacts
 
 RADIUS, NOISE = 0.1, 2e-4
@@ -94,9 +94,9 @@ def test_pixels_equal_those_of_the_stream(model, calibration, still, frames, mem
             continue
         expected = np.asarray(raster.sample(one.conductivity - 1.0))
         np.testing.assert_array_equal(picture.pixels, expected.astype(np.float32))
-        centroid, _ = StrongestRegion(model.mesh)(one.conductivity - 1.0)
-        assert [(marker.x, marker.y) for marker in picture.markers] == (
-            [] if one.status == "unchanged" else [tuple(centroid)]
+        centroid, peak = StrongestRegion(model.mesh)(one.conductivity - 1.0)
+        assert [(marker.x, marker.y, marker.label) for marker in picture.markers] == (
+            [] if one.status == "unchanged" else [(*centroid, f"{round(100 * peak):+d} %")]
         )
 
 
@@ -202,13 +202,16 @@ def test_a_scene_contains_what_a_page_draws(model, calibration, imager):
     np.testing.assert_allclose(np.linalg.norm(scene.outline[0], axis=1), RADIUS)
     np.testing.assert_array_equal(scene.outline[0][0], scene.outline[0][-1])
     place = np.asarray(model.electrodes.position)
-    assert [np.abs(one.mean(axis=0) - middle).max() < 1e-3 for one, middle in zip(scene.electrodes, place, strict=True)]
+    middles = [one.mean(axis=0) for one in scene.electrodes]
+    np.testing.assert_allclose(middles, place, atol=2e-3)  # vertices are not evenly spaced along 12 mm
     assert scene.names == [str(number) for number in range(1, 17)]
     assert scene.channels[:2] == ["1-2 → 3-4", "1-2 → 4-5"]
     assert len(scene.channels) == 208
 
 
 def test_channels_against_a_reference_electrode_are_named():
+    assert channel_names(opposite(8))[:2] == ["1-5 → 2-3", "1-5 → 3-4"]
+    assert channel_names(trigonometric(8))[:2] == ["1… → 1-2", "1… → 2-3"]
     names = channel_names(reference_electrode(8))
     assert all(name.count("→") == 1 for name in names)
     assert len(set(names)) == len(names)
@@ -226,6 +229,9 @@ def test_a_solid_is_shown_as_a_slice():
     assert np.abs(np.linalg.norm(edge, axis=1) - 0.05).max() < 0.003 + pixel  # a polygon of some nodes
     for curve, middle in zip(scene.electrodes, place, strict=True):
         np.testing.assert_allclose(np.linalg.norm(curve - middle[:2], axis=1), 0.008)
+    (curve, *_) = electrode_curves(mesh, FacePatches(place, 0.008, 0.004, 1e-3))
+    corners = [[-4e-3, -2e-3], [4e-3, -2e-3], [4e-3, 2e-3], [-4e-3, 2e-3], [-4e-3, -2e-3]]
+    np.testing.assert_allclose(curve - place[0, :2], corners, atol=1e-12)
 
 
 def test_electrodes_without_a_size_are_points(model):

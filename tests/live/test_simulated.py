@@ -73,6 +73,24 @@ def test_the_channels_that_change_most_are_those_of_the_nearest_electrodes():
         assert np.hypot(x - 0.05 * np.cos(angle), y - 0.05 * np.sin(angle)) < 2e-3
 
 
+def test_the_finger_is_nearest_to_the_electrodes_whose_channels_change_most(monkeypatch):
+    """At the middle of each stroke, 15 mm from the centre, in whichever direction the skin is stroked."""
+    monkeypatch.setattr("jeit.live.simulated._NUM_STROKE_STATES", 5)
+    monkeypatch.setattr("jeit.live.simulated._NUM_NODES", 400)
+    skin = simulated_skin()
+    reference, rest = skin.reference, skin.states[-1]
+    assert len(skin.states) == 16 * (5 + 24)
+    for stroke in range(16):
+        second = (stroke + 2.5 / 29) * skin.period / 16
+        x, y = skin.truth(second) or (np.nan, np.nan)
+        assert np.hypot(x, y) == pytest.approx(0.015)
+        assert skin.truth((stroke + 20 / 29) * skin.period / 16) is None
+        change = np.abs(skin.states[skin._state_index(second)] / rest - 1)
+        own = [change[reference.protocol.channels_touching(one)].mean() for one in range(16)]
+        # Electrode 1 is at the top, the others follow clockwise.
+        assert np.argmax(own) == round((np.pi / 2 - np.arctan2(y, x)) / (2 * np.pi / 16)) % 16
+
+
 def test_frames_come_at_their_rate_and_end_at_the_limit():
     seconds = [one.second for one in simulated_tank(rate=200, limit=20)]
     assert len(seconds) == 20
