@@ -68,6 +68,11 @@ def test_the_l_curve_shows_penalty_against_residual(choices, ax):
     assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
     assert "Residual" in ax.get_xlabel()
     assert "Penalty" in ax.get_ylabel()
+    decades = [text for text in ax.texts if "10^" in text.get_text()]
+    assert [text.get_text().startswith("λ = ") for text in decades] == [True, *(len(decades) - 1) * [False]]
+    for text in decades:
+        value = 10.0 ** int(text.get_text().partition("{")[2].rstrip("}$"))
+        assert text.xy == pytest.approx((choice.read(choice.residual, value), choice.read(choice.penalty, value)))
 
 
 def test_several_rules_are_marked_on_one_l_curve_with_a_panel_each(choices, ax):
