@@ -20,12 +20,12 @@ from jeit.forward import ForwardModel
 from jeit.image import ImageSeries, Inclusion
 from jeit.inverse.shapes import Quantities, Star
 from jeit.layout import perimeter, ring
-from jeit.mesh import Disk, Polygon, Rectangle, Solid, centroids, disk, layer, rectangle
+from jeit.mesh import Disk, Polygon, Rectangle, Solid, centroids, disk, layer, measures, rectangle
 from jeit.plot import ColourScale, plot_image, plot_mesh
 from jeit.plot.axes import extent_of, hide_axes
 from jeit.plot.colours import FACTOR_SCALE
 from jeit.plot.imaging.electrodes import draw_electrodes, draw_inclusions, draw_outlines
-from jeit.plot.imaging.image import plot_raster, plot_sensitivity
+from jeit.plot.imaging.image import plot_admittivity, plot_raster, plot_sensitivity
 from jeit.plot.imaging.judgement import plot_voltages
 from jeit.plot.imaging.series import plot_series
 from jeit.protocol import adjacent
@@ -296,11 +296,33 @@ def test_a_series_of_a_solid_is_cut_in_the_stated_plane():
 
 
 def test_sensitivity_is_lowest_in_the_middle(mesh, electrodes, ax):
-    plot_sensitivity(ForwardModel(mesh, electrodes, adjacent(8)), 1e-3, ax=ax)
+    model = ForwardModel(mesh, electrodes, adjacent(8))
+    plot_sensitivity(model, 1e-3, ax=ax)
     (cells,) = [c for c in ax.collections if c.get_array() is not None]
     middle = np.argmin(np.linalg.norm(np.asarray(centroids(mesh)), axis=1))
     assert cells.get_array()[middle] < -20  # decibels relative to the edge: adjacent drives hardly reach the middle
     assert cells.get_array().max() == 0
+    sensitivity = np.linalg.norm(model.jacobian(1e-3), axis=0) / measures(mesh)
+    below = cells.get_array() < 0
+    expected = 20 * np.log10(sensitivity / sensitivity[middle])
+    np.testing.assert_allclose((cells.get_array() - cells.get_array()[middle])[below], expected[below], atol=1e-9)
+    assert below.mean() == pytest.approx(0.99, abs=0.005)
+    assert colour_bar_label(ax) == "Sensitivity per area (dB)"
+
+
+def test_both_parts_of_an_admittivity_have_their_own_scale(mesh):
+    values = np.where(np.asarray(centroids(mesh))[:, 0] > 0, 2e-3 - 3e-6j, -1e-3 + 1e-6j)
+    axes = plot_admittivity(mesh, values, titles=("first", "second"))
+    drawn = [next(c for c in ax.collections if c.get_array() is not None) for ax in axes]
+    np.testing.assert_allclose(drawn[0].get_array(), 1e3 * values.real)
+    np.testing.assert_allclose(drawn[1].get_array(), 1e6 * values.imag)
+    assert [ax.get_title() for ax in axes] == ["first", "second"]
+    bars = [ax.get_ylabel() for ax in axes[0].figure.axes[2:]]
+    assert bars == ["Change of conductivity σ (mS)", "Change of susceptivity ωε (µS)"]
+    (figure,) = {ax.figure for ax in plot_admittivity(mesh, -values * np.sign(values.imag), difference=False)}
+    assert [ax.get_ylabel() for ax in figure.axes[2:]] == ["Conductivity σ (mS)", "Susceptivity ωε (µS)"]
+    with pytest.raises(ValueError, match="real; draw them with plot_image"):
+        plot_admittivity(mesh, values.real)
 
 
 def test_voltages_and_their_difference(ax):
@@ -311,6 +333,10 @@ def test_voltages_and_their_difference(ax):
     assert upper.get_title(loc="left") == "Relative misfit 2 %"
     assert upper.get_ylabel() == "Voltage (mV)"
     np.testing.assert_allclose(upper.lines[0].get_ydata(), 1e3 * measured)
+    np.testing.assert_allclose(upper.lines[1].get_ydata(), 1.02e3 * measured)
+    assert [line.get_label() for line in upper.lines] == ["measured", "modelled"]
+    (starts,) = upper.collections  # of each drive, with five channels
+    np.testing.assert_allclose([line[0, 0] for line in starts.get_segments()], np.arange(4.5, 35, 5))
     assert lower.lines[-1].get_ydata().max() == pytest.approx(2 * 2e-3 / np.sqrt(np.mean(measured**2)), rel=1e-9)
 
 
