@@ -288,6 +288,7 @@ def test_a_tap_is_a_dot_in_an_ellipse(ax):
     assert ellipse.center == pytest.approx((0.02, 0.03))
     assert ellipse.width == pytest.approx(2 * 2.4477 * 3e-3, rel=1e-4)
     assert named(ax) == ["microphone", "touch, 95 %"]
+    assert all(low < -0.1 and high > 0.1 for low, high in (ax.get_xlim(), ax.get_ylim()))  # the whole skin
     assert not ax.images
     assert len(ax.figure.axes) == 1  # a single time needs no colour bar
 

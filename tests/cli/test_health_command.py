@@ -71,6 +71,7 @@ def test_damage_is_detected_from_frames_alone(files, run, tmp_path):
     (event,) = events(tmp_path)
     assert abs(int(event["frame"]) - 300) < 8
     assert (event["electrode"], event["path_m"]) == ("", "")
+    assert f"\n  frame {event['frame']}: {event['kind']}, {event['status']}. " in output
     report = json.loads((tmp_path / "report.json").read_text("utf-8"), parse_constant=pytest.fail)
     assert report["units"]["time"] == "frames"
     assert (tmp_path / "health.png").read_bytes().startswith(b"\x89PNG")
@@ -126,12 +127,14 @@ def test_a_cut_is_located_on_a_described_skin(cut, run, tmp_path, monkeypatch):
         *("--patience", 9, "--output", tmp_path),
     )
     assert (status, error) == (0, "")
-    assert "mm long" in output
     (event,) = events(tmp_path)
     assert (event["kind"], event["status"]) == ("cut", "lasting")
     assert abs(float(event["time"]) - 12.0) < 1.0
     path = np.array([[float(one) for one in place.split()] for place in event["path_m"].split("; ")])
     assert np.linalg.norm(path.mean(axis=0) - [0.0075, 0.019]) < 0.01
+    length = 1e3 * np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+    assert f"\n  {float(event['time']):.2f} s: cut, {length:.0f} ± " in output
+    assert " mm long, lasting. " in output
     report = json.loads((tmp_path / "report.json").read_text("utf-8"), parse_constant=pytest.fail)
     assert report["with_a_model"]
 

@@ -2,14 +2,28 @@
 in time.
 """
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from jeit.electrodes import PointElectrodes
 from jeit.mesh import Rectangle
+from jeit.plot.colours import SERIES_COLOURS
 from jeit.touch import NamedTouch, SkinHealth, Standing
 from jeit.touch.gestures import ChangeCourse, StreamTouch
-from jeit.touch.plots import plot_changes, plot_health_course, plot_timeline, plot_touch_paths, plot_tried
+from jeit.touch.health.event import EventKind, EventStatus, HealthEvent
+from jeit.touch.plots import (
+    plot_changes,
+    plot_health,
+    plot_health_course,
+    plot_timeline,
+    plot_touch_paths,
+    plot_tried,
+)
+from jeit.touch.reports import report_health
 
 NAMES = ("pat", "tap")
 
@@ -93,3 +107,55 @@ def test_a_skin_over_time(ax):
     assert size[:5].max() < 1 < size[20:].min()
     with pytest.raises(ValueError, match="frames have shape"):
         plot_health_course(health, np.arange(49), frames, ax=ax)
+
+
+def event(kind, status=EventStatus.LASTING, **fields):
+    return HealthEvent(0, kind, status, 20.0, 24.0, 18, np.arange(6) < 2, np.zeros(6), 3.0, **fields)
+
+
+def with_events(*events, skin=None):
+    """The state of a skin of six channels after some events."""
+    health = SkinHealth.fit(1 + 1e-3 * np.random.default_rng(0).normal(size=(200, 6)))
+    return replace(health, record=replace(health.record, events=events, skin=skin))
+
+
+def test_events_of_a_skin_are_marked_at_their_time(ax):
+    """Electrodes are numbered from 1."""
+    health = with_events(event(EventKind.DEAD, electrode=2), event(EventKind.REPAIRED), event(EventKind.CHANGED))
+    plot_health_course(health, np.arange(50), np.ones((50, 6)), ax=ax)
+    assert [text.get_text() for text in ax.texts] == [" limit", "dead electrode 3", "repaired", "changed"]
+    _, limit, *marks = ax.lines
+    assert list(limit.get_ydata()) == [1, 1]
+    assert [list(line.get_xdata()) for line in marks] == 3 * [[20, 20]]
+    dead, repaired, changed = (line.get_color() for line in marks)
+    assert (dead, repaired, changed) == (SERIES_COLOURS[1], SERIES_COLOURS[2], SERIES_COLOURS[1])
+
+
+def test_a_report_of_damage_has_numbers_of_electrodes_and_metres():
+    cut = event(EventKind.CUT, path=np.array([[0.0, 0.0], [0.03, 0.04]]), deviation=2e-3)
+    report = report_health(with_events(event(EventKind.DEAD, electrode=2), cut), "skin", timed=True)
+    dead, cut = report["events"]
+    assert (dead["electrode"], dead["channels"], dead["length_m"], dead["path_m"]) == (3, [0, 1], None, None)
+    assert (dead["time"], dead["noticed"], dead["frame"], report["units"]["time"]) == (20.0, 24.0, 18, "s")
+    assert (cut["electrode"], cut["length_m"], cut["length_deviation_m"]) == (None, pytest.approx(0.05), 2e-3)
+    assert cut["path_m"] == [[0.0, 0.0], [0.03, 0.04]]
+
+
+def test_cuts_and_failed_electrodes_are_drawn_on_the_skin(ax):
+    electrodes = PointElectrodes([(0.05, 0.0), (0.0, 0.025), (-0.05, 0.0)])
+    model = SimpleNamespace(mesh=Rectangle(0.1, 0.05).mesh(num_points=60), electrodes=electrodes)
+    path = np.array([[-0.02, 0.0], [0.01, 0.004]])
+    cuts = [
+        event(EventKind.CUT, path=path, deviation=2.6e-3),
+        event(EventKind.CUT, EventStatus.MENDED, path=-path),
+        event(EventKind.CUT, EventStatus.DENIED, path=2 * path),
+    ]
+    failed = event(EventKind.DEAD, electrode=2), event(EventKind.LOOSE, EventStatus.MENDED, electrode=0)
+    plot_health(with_events(*cuts, *failed, skin=SimpleNamespace(model=model)), ax=ax)
+    *_, cut, mended, cross = ax.lines
+    np.testing.assert_array_equal(cut.get_xydata(), path)
+    np.testing.assert_array_equal(mended.get_xydata(), -path)
+    assert cut.get_linestyle() == "-" != mended.get_linestyle()
+    np.testing.assert_allclose(cross.get_xydata(), [[-0.05, 0.0]])
+    labels = [text.get_text() for text in ax.texts if text.get_text().endswith(" s")]
+    assert labels == ["cut, 30 ± 3 mm, at 20 s", "mended, 30 mm, at 20 s"]

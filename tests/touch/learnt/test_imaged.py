@@ -66,6 +66,15 @@ def test_the_contact_is_the_touch_for_any_sign_and_unit(sign, unit):
     assert np.linalg.norm(place - pressed["positions"], axis=1).mean() < 3e-3
 
 
+@pytest.mark.parametrize("reference", [None, np.zeros(108)])
+def test_changes_without_a_reference_are_imaged_by_the_given_model(reference):
+    changes = LEARNT["frames"] - LEARNT["reference"]
+    imaged, notes = ImageReconstruction.create(MODEL, changes, np.ones(108, bool), reference)
+    place = ContactFeatures(imaged)(changes)[:, :2]
+    assert np.linalg.norm(place - LEARNT["positions"], axis=1).mean() < 3e-3
+    assert notes == []
+
+
 def test_contacts_of_a_given_image():
     """Of a square of 3 × 3 cells, with its peak at the centre and the right neighbour above the level."""
     grid = np.stack(np.meshgrid(np.arange(3.0), np.arange(3.0)), axis=-1).reshape(-1, 2)
