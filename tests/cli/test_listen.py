@@ -19,7 +19,9 @@ from jeit.acoustic.simulate import (
     simulate_silence,
 )
 from jeit.cli import main
-from jeit.touch.listening import Listener, read_clips
+from jeit.cli.console import plain_console
+from jeit.touch.commands.listen import _print_summary
+from jeit.touch.listening import Listener, SoundLabels, read_clips
 
 RATE = 16_000
 
@@ -132,6 +134,20 @@ def test_a_recording_is_classified(folder, tmp_path, capsys):
     assert (tmp_path / "timeline.png").stat().st_size > 5_000
     labels = Listener.read(model).classify(read_recording(folder / "one.wav"))
     assert [row["sound"] for row in rows] == labels.named.tolist()
+
+
+def test_printed_sounds_have_seconds_per_cent_and_millimetres(capsys):
+    """The last sound has no place. The whole recording has the geometric mean of the probabilities."""
+    probabilities = np.array([[0.9, 0.1], [0.9, 0.1], [0.2, 0.8]])
+    no, yes, place = np.zeros(3, bool), np.ones(3, bool), np.array([[0.01, -0.02], [0.02, -0.02], [np.nan, np.nan]])
+    of_windows = {"quiet": no, "known": yes, "strongest": np.zeros(3, int), "loud": yes, "position": place}
+    labels = SoundLabels(np.array([1.0, 1.1, 1.2]), probabilities, ("low", "high"), **of_windows)
+    _print_summary(plain_console(), labels)
+    lines = [line.split() for line in capsys.readouterr().out.splitlines() if line]
+    assert ["as", "a", "whole", "low,", "73", "%"] in lines
+    assert " ".join(lines[-3]) == "sound from / s to / s sure / % x / mm y / mm"
+    assert (lines[-2][:1], lines[-2][2:]) == (["low"], ["1.15", "90", "15.0", "-20.0"])
+    assert (lines[-1][:2], lines[-1][3:]) == (["high", "1.15"], ["80"])
 
 
 def test_folders_within_a_class_are_held_out_together(folder, tmp_path):

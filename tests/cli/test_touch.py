@@ -2,13 +2,17 @@
 
 import csv
 import json
+import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from made_skins import record
 
+from jeit.cli.console import plain_console
 from jeit.data import load_description
 from jeit.mesh import centroids
+from jeit.touch.commands.touch import _print_touches
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -42,29 +46,48 @@ def test_from_presses_to_touches(files, run):
         "touch", "fit", folder / "presses.npz", "--output", folder / "skin", "--method", "neighbours"
     )
     assert (status, error) == (0, "")
-    assert "off on average" in output
-    assert "% right" in output
     assert (folder / "skin" / "learning.png").read_bytes().startswith(b"\x89PNG")
     report = json.loads((folder / "skin" / "report.json").read_text("utf-8"), parse_constant=pytest.fail)
     assert set(report["held_out"]) == {"place", "force", "label"}
     assert report["held_out"]["place"]["method"].startswith("neighbours")
     assert report["held_out"]["place"]["mean_error_m"] < 0.02
     assert abs(report["held_out"]["place"]["share_within_one_standard_deviation"] - 0.68) < 0.15
+    place, label = report["held_out"]["place"], report["held_out"]["label"]
+    keys = ("mean_error_m", "median_error_m", "error_of_95_percent_m", "mean_error_of_a_guess_m")
+    mean, median, high, guess = (f"{1e3 * place[key]:.3g} mm" for key in keys)
+    printed = " ".join(output.split())
+    assert f"{mean} off on average, median {median}, 95 % within {high}; guessing the middle: {guess}" in printed
+    assert f"{100 * label['right']:.1f} % right; the commonest label alone: " in printed
+    assert f"alone: {100 * label['right_by_the_commonest']:.1f} %" in printed
     status, output, error = run("touch", "predict", folder / "skin", folder / "frames.npz", "--output", folder / "out")
     assert (status, error) == (0, "")
-    assert "1 unlike any learnt from" in output
+    assert "40 frames; 1 unlike any learnt from; 39 with a place, standard deviation " in output
     rows = list(csv.DictReader((folder / "out" / "touches.csv").read_text("utf-8").splitlines()))
     assert list(rows[0]) == [
         *("frame", "x_m", "y_m", "std_x_m", "std_y_m", "force_N", "std_force_N", "label", "probability", "unlike")
     ]
     assert len(rows) == 40
     assert (rows[3]["x_m"], rows[3]["label"], rows[3]["unlike"]) == ("", "", "1")
+    std = np.median([float(row[key]) for row in rows if row["x_m"] for key in ("std_x_m", "std_y_m")])
+    (printed_std,) = re.findall(r"deviation (\S+) mm \(median\)", " ".join(output.split()))
+    assert float(printed_std) == pytest.approx(1e3 * std, rel=0.01)
     places = np.array([[float(row["x_m"]), float(row["y_m"])] for row in rows if row["x_m"]])
     right = np.delete(fresh["positions"], 3, axis=0)
     assert np.linalg.norm(places - right, axis=1).mean() < 0.015
     assert (folder / "out" / "touches.png").read_bytes().startswith(b"\x89PNG")
     report = json.loads((folder / "out" / "report.json").read_text("utf-8"), parse_constant=pytest.fail)
     assert report["unlike"] == [3]
+
+
+def test_printed_touches_have_seconds_millimetres_and_per_cent(capsys):
+    """The strongest change is the largest of any sign, relative to the background."""
+    position, peak = np.array([[0.0123, -0.004], [0.0, 0.0], [0.05, 0.001]]), np.array([1e-4, -5e-4, 2e-4])
+    touch = SimpleNamespace(number=7, onset=1.25, offset=2.5, position=position, peak=peak)
+    _print_touches(plain_console(), 32 * [touch], 1e-3)
+    names, *rows, more = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines() if line]
+    assert names == "touch from / s to / s first place / mm last place / mm strongest change"
+    assert rows == 30 * ["7 1.25 2.50 (+12.3, -4.0) (+50.0, +1.0) -50 %"]
+    assert more == "2 more in report.json"
 
 
 DISK = """

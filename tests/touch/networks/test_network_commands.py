@@ -11,6 +11,7 @@ from jeit.cli import main
 from jeit.data import Measurement, screen
 from jeit.data.exchange import write_table
 from jeit.protocol import adjacent
+from jeit.touch.networks import read_network
 from jeit.touch.simulate import DiscIndenter, Indent, relative_changes
 
 PLACES = ((0.01, -0.02), (-0.025, 0.01))
@@ -54,6 +55,9 @@ def test_reconstruct(imaging, recorded, run, tmp_path):
     )  # fmt: skip
     assert (status, error) == (0, "")
     assert "1 frame imaged" in out
+    x, y, depth = 1e3 * table_of(tmp_path)[1:]
+    assert f"deepest: {depth:.2f} mm at ({x:.1f}, {y:.1f}) mm, in frame 1" in " ".join(out.split())
+
     assert np.linalg.norm(table_of(tmp_path)[1:3] - PLACES[1]) < 0.015
     with np.load(tmp_path / "depth.npz") as written:
         assert written["depth"].shape == (1, *SHAPE)
@@ -111,7 +115,8 @@ def test_an_untouched_skin(imaging, recorded, run, tmp_path):
     given = "--reference", recorded / "rest.npz", "--method", "network", "--model", imaging[0], "--output", tmp_path
     status, out, _ = run("stream", recorded / "rest.npz", *given)
     assert status == 0
-    assert "untouched: nothing is deeper than noise makes it" in out
+    floor = 1e3 * read_network(imaging[0]).floor
+    assert f"untouched: nothing is deeper than noise makes it, {floor:.2g} mm" in out
     assert np.isnan(table_of(tmp_path)[1:3]).all()
 
 
