@@ -10,6 +10,7 @@ import io
 import json
 import re
 import signal
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from gesture_skin import GESTURES, RATE, TOML, linear_gestures_and_stream
 
 from jeit.cli import main
 from jeit.data import GestureSet
+from jeit.touch.commands.touch_watch import _describe_touch
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -115,8 +117,10 @@ def events(folder):
 def test_training_writes_a_model_and_a_report(learnt):
     folder, output = learnt
     assert "24, of 2 people" in output
-    assert "right, held out" in output
     report = json.loads((folder / "report.json").read_text("utf-8"), parse_constant=pytest.fail)
+    right, shares = report["held_out"]["right"], report["held_out"]["right_by_gesture"]
+    each = ", ".join(f"{name} {100 * share:.0f}" for name, share in shares.items())
+    assert f"right, held out {100 * right:.1f} % ({each})" in " ".join(output.split())
     assert report["reading"]["num_channels"] == 48
     assert {one["classifier"] for one in report["held_out"]["tried"]} == {"nearest on seven", "nearest on course"}
     assert (folder / "gestures.png").read_bytes().startswith(b"\x89PNG")
@@ -129,8 +133,10 @@ def test_gestures_in_a_file_are_classified(files, model, run):
         *("--output", folder / "out"),
     )
     assert (status, error) == (0, "")
-    assert "99 % within" in output
     detected = events(folder / "out")
+    times = re.findall(r"named within (\S+) ms of the frame after \(median\), 99 % within (\S+) ms", output)
+    latencies = [float(one["latency_ms"]) for one in detected]
+    np.testing.assert_allclose(np.array(times[0], float), np.quantile(latencies, (0.5, 0.99)), atol=0.1)
     assert [one["gesture"] for one in detected] == 2 * list(GESTURES)
     np.testing.assert_allclose([float(one["onset_s"]) for one in detected], stream.onset, atol=0.2)
     for one in detected:
@@ -148,6 +154,14 @@ def test_gestures_in_a_file_are_classified(files, model, run):
 def printed_touches(output):
     """Lines of the output that describe a touch, by its place."""
     return [line for line in output.splitlines() if line.endswith(") mm")]
+
+
+def test_a_printed_touch_has_its_probability_and_the_place_of_its_strongest_change():
+    course = SimpleNamespace(centroid=np.array([[0.0, 0.0], [0.012, -0.031]]), peak=np.array([1.0, 2.0]))
+    touch = SimpleNamespace(course=course, onset=3.25, offset=4.0, cut_off=False)
+    named = SimpleNamespace(touch=touch, unlike=False, gesture="stroke", probability=0.87, held=True)
+    words = ["3.25", "s", "0.75", "s", "stroke", "87", "%,", "held", "(+12,", "-31)", "mm"]
+    assert _describe_touch(named).split() == words
 
 
 def test_a_table_with_a_given_rate_gives_the_same_labels(files, model, run, tmp_path):

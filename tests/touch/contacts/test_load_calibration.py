@@ -58,7 +58,9 @@ def test_loads_beyond_the_calibration_are_refused():
     calibration = LoadCalibration.fit(*drawn(np.random.default_rng(3), 40, 0.01), radius=RADIUS)
     with pytest.raises(ValueError, match="greater loads"):
         calibration.load(contact(60.0, 0.02))
-    with pytest.raises(ValueError, match="farther out"):
+    reached = 1e3 * max(one.centroid[1] for one in drawn(np.random.default_rng(3), 40, 0.01)[0])
+    message = rf"is 47\.0 mm from the middle, and calibrated contacts reach {reached:.1f} mm; .* farther out"
+    with pytest.raises(ValueError, match=message):
         calibration.load(contact(5.0, 0.047))
 
 
@@ -108,6 +110,10 @@ def test_bad_input():
     for options in ({"radius": 0.0}, {"radius": 50.0}, {"radius": RADIUS, "centre": (50.0, 0.0)}):
         with pytest.raises(ValueError, match="radius"):
             LoadCalibration.fit(contacts, loads, **options)
+    reached = 1e3 * max(one.centroid[1] for one in contacts)
+    message = f"radius is 50000 mm, and contacts lie up to {reached:.3g} mm from the centre, and are 10 mm wide; "
+    with pytest.raises(ValueError, match=message):
+        LoadCalibration.fit(contacts, loads, radius=50.0)
     for centre in ((0.0,), "ab", (0.0, np.nan), None):
         with pytest.raises(ValueError, match=r"centre must be \(x, y\)"):
             LoadCalibration.fit(contacts, loads, radius=RADIUS, centre=centre)

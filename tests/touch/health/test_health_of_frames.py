@@ -209,6 +209,8 @@ def test_frames_are_compared_with_a_reference_taken_before_the_first(health):
     event = watch(fresh, later).events[-1]
     assert event.kind == EventKind.CHANGED
     assert abs(event.frame - 301) <= 2
+    outside, most = health.healthy.fraction_outside(event.change), health.healthy.max_fraction_outside
+    assert f"{100 * outside:.0f} % of it is in no direction of touches; of those, {100 * most:.0f} %" in event.reason
 
 
 def test_a_recording_that_begins_damaged_is_reported(health):

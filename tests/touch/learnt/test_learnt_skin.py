@@ -3,6 +3,8 @@
 Against places, forces, labels and keys of new presses on a simulated skin, which were not in the training data.
 """
 
+import re
+
 import numpy as np
 import pytest
 from made_skins import CHANNELS, off, record
@@ -83,6 +85,10 @@ def test_a_dead_channel_costs_little_accuracy(quick, reading):
         assert off(prediction, FRESH["positions"]).mean() < 2 * sound
         assert not prediction.alive[:, channel].any() or np.isfinite(reading)
         assert any(f" {channel}" in note for note in prediction.notes)
+    frames = FRESH["frames"].copy()
+    frames[:12, 3] = reading
+    notes = [note for note in quick.predict(frames, FRESH["reference"]).notes if "of the readings disagree" in note]
+    assert [0.2 < float(note.split(" %")[0]) < 0.5 for note in notes] == [True]  # 12 of 4,800 and a few others
 
 
 def few_channels(number, seed):
@@ -194,6 +200,8 @@ def test_places_where_a_press_was_recorded_late():
     skin = LearntSkin.fit(Presses.create(**late, positions=recorded["positions"][1:]), method="neighbours")
     assert skin.lag == 1
     assert "frames seem to be of the press 1 row before" in skin.notes[0]
+    aligned, recorded = map(float, re.findall(r"(\S+) mm", skin.notes[0]))
+    assert aligned < 20 < recorded < 70  # on a square of 100 mm
     assert off(skin.predict(**ASK), FRESH["positions"]).mean() < 8e-3
 
 
