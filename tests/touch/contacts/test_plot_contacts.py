@@ -29,7 +29,8 @@ def test_contacts_are_drawn_at_their_places(image):
         np.testing.assert_allclose(outline, contact.contour)
     texts = [text.get_text() for text in ax.texts]
     assert sum("mm" in text for text in texts) == 3  # two places and the scale bar
-    assert f"({1e3 * found[0].centroid[0]:+.1f}".replace("-", "−") in " ".join(texts)
+    places = [1e3 * one.centroid for one in found]
+    assert [f"({x:+.1f}, {y:+.1f}) mm".replace("-", "−") for x, y in places] == texts[-2:]
 
 
 def test_every_stage_has_its_axes(image):

@@ -20,12 +20,14 @@ import numpy as np
 import pytest
 from small_networks import PRESET, SHAPE, bits
 
+from jeit.data import Measurement
 from jeit.design import Skin
 from jeit.design.skin.names import skin_protocol
 from jeit.layout import named_layout
 from jeit.mesh import Rectangle
 from jeit.protocol import adjacent
 from jeit.touch.networks import NetworkPreset, learn_images, read_network, write_network
+from jeit.touch.networks.depth_maps import check_measured
 from jeit.touch.networks.learn import evaluate_network
 from jeit.touch.networks.simulated_touches import TouchExamples
 from jeit.touch.simulate import DiscIndenter, Indent, relative_changes
@@ -105,6 +107,29 @@ def test_frames_of_other_shapes(small_skin, learnt, resting, change, message):
         learnt[1].network.depth(*change(given[0], rest))
 
 
+def test_measurements_of_another_skin_are_refused(small_skin, learnt):
+    """A network states the skin that it was trained for in millimetres."""
+    network, model = learnt[1].network, small_skin.model
+    places = np.asarray(model.electrodes.position)
+    np.testing.assert_allclose(network.made_for["electrodes_mm"], 1e3 * places[:, :2], atol=6e-4)
+    np.testing.assert_allclose(network.made_for["skin_mm"], [-50, 50, -50, 50])
+
+    def measured(electrodes=model.electrodes, domain=small_skin.outline, factor=1.0):
+        given = np.full((1, 94), factor), np.ones((1, 94), bool), model.protocol
+        return Measurement(*given, electrodes=electrodes, domain=domain, name="tank")
+
+    check_measured(network, measured())
+    moved = eqx.tree_at(
+        lambda one: one.position, model.electrodes, places + (np.arange(16) == 4)[:, None] * [3e-3, 4e-3]
+    )
+    with pytest.raises(ValueError, match="'tank': electrode 5 is 5 mm from where the network's is"):
+        check_measured(network, measured(moved))
+    with pytest.raises(ValueError, match="its skin is 120 × 100 mm, and the network's 100 × 100 mm; train one"):
+        check_measured(network, measured(domain=Rectangle(0.12, 0.1)))
+    with pytest.raises(ValueError, match="'tank' is complex"):
+        check_measured(network, measured(factor=1.0j))
+
+
 def test_finished_work_is_not_repeated(small_skin, learnt):
     folder, found = learnt
     again = learn_images(small_skin, folder, preset=PRESET)
@@ -114,6 +139,7 @@ def test_finished_work_is_not_repeated(small_skin, learnt):
 
 SCRIPT = """
 import sys
+from jeit.data import Measurement
 from jeit.design import Skin
 from jeit.layout import named_layout
 from jeit.mesh import Rectangle
