@@ -183,6 +183,9 @@ def test_locate_from_intensities(folder, tmp_path, capsys):
     assert "25 touch, 15 no touch" in printed
     # A stroke: from (70, 0) mm to the position 1.2 s later.
     assert f"1 0.000 1.200 70.0 → {70 * np.cos(3.6):.1f} 0.0 → {60 * np.sin(3.6):.1f}" in printed
+    ((error, length),) = re.findall(r"→ \S+ \S+ → \S+ (\S+) (\S+) 25 touch", printed)
+    assert 0 <= float(error) <= 0.05 + 1e3 * max(float(row["std_x_m"]) + float(row["std_y_m"]) for row in table[:25])
+    assert float(length) == pytest.approx(1e3 * np.linalg.norm(np.diff(path[:25], axis=0), axis=1).sum(), rel=0.03)
 
 
 @pytest.mark.parametrize("name", ["touch.npz", "touch.wav"])

@@ -15,10 +15,12 @@ from jeit.plot.colours import SERIES_COLOURS
 from jeit.touch import NamedTouch, SkinHealth, Standing
 from jeit.touch.gestures import ChangeCourse, StreamTouch
 from jeit.touch.health.event import EventKind, EventStatus, HealthEvent
+from jeit.touch.listening import SoundLabels
 from jeit.touch.plots import (
     plot_changes,
     plot_health,
     plot_health_course,
+    plot_sound_labels,
     plot_timeline,
     plot_touch_paths,
     plot_tried,
@@ -159,3 +161,23 @@ def test_cuts_and_failed_electrodes_are_drawn_on_the_skin(ax):
     np.testing.assert_allclose(cross.get_xydata(), [[-0.05, 0.0]])
     labels = [text.get_text() for text in ax.texts if text.get_text().endswith(" s")]
     assert labels == ["cut, 30 ± 3 mm, at 20 s", "mended, 30 mm, at 20 s"]
+
+
+def test_sounds_are_probabilities_in_per_cent_over_time(ax):
+    """The second window is quiet, so that its probabilities are left out."""
+    quiet, yes = np.array([False, True, False]), np.ones(3, bool)
+    probabilities = np.array([[0.9, 0.1], [0.5, 0.5], [0.2, 0.8]])
+    labels = SoundLabels(np.array([1.0, 1.1, 1.2]), probabilities, ("low", "high"), quiet, yes, np.zeros(3, int), yes)
+    plot_sound_labels(labels, ax=ax)
+    drawn = np.ma.filled(ax.images[0].get_array().astype(float), np.nan)
+    np.testing.assert_allclose(drawn, [[90, np.nan, 20], [10, np.nan, 80]])
+    assert ax.images[0].get_clim() == (0, 100)
+    left, right, *rows = ax.images[0].get_extent()
+    assert (left < 1.0, right > 1.2, 1.0 - left) == (True, True, pytest.approx(right - 1.2))
+    assert rows == [-0.5, 1.5]
+    assert ax.get_title() == "recording: sounds in red; blank, 1 of 3 windows quiet"
+    assert [round(line.get_ydata()[0] + 0.42) for line in ax.lines] == [0, 1]
+    assert [one.get_text() for one in ax.get_yticklabels()] == ["low", "high"]
+    assert "Probability (%)" in [one.get_ylabel() for one in ax.figure.axes] + [
+        one.get_ylabel() for one in ax.child_axes
+    ]

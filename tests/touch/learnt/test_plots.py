@@ -1,5 +1,7 @@
 """Pictures of what a learnt skin predicts, and of its errors on held-out presses, from predictions that are made up."""
 
+from types import SimpleNamespace
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -14,6 +16,8 @@ from jeit.touch.plots.learnt import (
     plot_place_errors,
     plot_places,
 )
+from jeit.touch.reports import listener
+from jeit.touch.reports.learnt_skin import summary
 
 
 def touches(**fields) -> Touches:
@@ -90,3 +94,14 @@ def test_errors_of_forces_and_labels():
     assert [text.get_text() for text in ax.texts] == ["75", "25", "100"]
     assert ax.get_title() == "Labels: 83.3 % right of presses held out"
     plt.close(ax.figure)
+
+
+def test_summaries_of_what_was_learnt_are_in_per_cent():
+    right = np.array([[True, False], [True, True], [False, True], [False, False]])
+    held_out = right ^ np.array([[True, False], [False, False], [False, False], [False, False]])
+    assert summary("keys", Standing("som", [], held_out, right)) == "87.5 % of the keys right, 75.0 % of whole patterns"
+    sounds = Standing("trees", [("trees", 0.25), ("linear", 0.4)], np.array(["a", "b", "b", "b"]), np.array([*"aabb"]))
+    words = "75.0 % of 4 clips right; tried: trees 75.0 %, linear 60.0 %"
+    assert listener.summary(SimpleNamespace(standing=sounds)) == words
+    title = "trees: 75.0 % of 4 clips held out classified correctly"
+    assert listener.draw_listener(SimpleNamespace(standing=sounds, method="trees")).axes[0].get_title() == title
