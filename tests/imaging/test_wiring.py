@@ -13,7 +13,7 @@ from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.imaging import ImagingSettings, image_difference, prepare_difference
 from jeit.imaging.calibration import imaging_mesh
-from jeit.imaging.wiring import channel_orders, find_wiring, uniform_impedances
+from jeit.imaging.wiring import Wiring, channel_orders, find_wiring, uniform_impedances
 from jeit.layout import perimeter, ring
 from jeit.mesh import Disk, Polygon, centroids
 from jeit.protocol import adjacent, opposite, skip
@@ -73,6 +73,20 @@ def test_two_exchanges_and_a_cycle_of_three_are_detected():
     wiring = find_wiring(MODEL, measured(places=turned))
     assert wiring.places == turned
     assert "each look as if they stood where the next one should" in wiring.explanation
+
+
+def test_the_explanation_counts_electrodes_from_1():
+    def explanation(*places):
+        return Wiring(places, misfit=0.012, described=0.34).explanation
+
+    assert explanation(0, 2, 1, 4, 3, 5, 6, 7).startswith("electrodes 2 and 3, 4 and 5 look exchanged: ")
+    assert explanation(1, 0, 3, 4, 2, 5, 6, 7) == (
+        "electrodes 1 and 2 look exchanged, and electrodes 3 → 4 → 5 → 3 each look as if they stood where the next one "
+        "should: so taken the misfit is 1.2 %, as described 34 %."
+    )
+    assert "counted from another one, electrode 1 standing where 8 should" in explanation(7, 0, 1, 2, 3, 4, 5, 6)
+    assert "counted the other way round, electrode 1 standing where 3 should" in explanation(2, 1, 0, 7, 6, 5, 4, 3)
+    assert "counted the other way round: " in explanation(0, 7, 6, 5, 4, 3, 2, 1)
 
 
 @pytest.mark.parametrize("order", list(channel_orders(adjacent(COUNT)))[1:])
