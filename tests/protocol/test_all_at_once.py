@@ -86,6 +86,8 @@ def test_a_given_number_selects_the_first_currents(bodies):
     some, every = protocol.optimal(*bodies, number=3), protocol.optimal(*bodies)
     np.testing.assert_array_equal(some.drive, np.asarray(every.drive)[:3])
     assert some.num_measurements == 3 * NUMBER
+    one = protocol.optimal(*bodies, number=1)
+    np.testing.assert_allclose(one.drive, np.asarray(every.drive)[:1], rtol=1e-9)
 
 
 def test_optimal_currents_are_as_many_as_the_bodies_differ_by_and_begin_with_a_positive_maximum(bodies):

@@ -145,9 +145,14 @@ def test_bad_subsets(keep, lesson):
         protocol.adjacent(8).subset(keep)
 
 
-def test_electrodes_that_do_not_exist():
+@pytest.mark.parametrize("electrodes", [8, -1, [-1, 3], [0, 8], [[0, 1]], 1.0, True])
+def test_electrodes_that_do_not_exist(electrodes):
     with pytest.raises(ValueError, match="0 to 7"):
-        protocol.adjacent(8).channels_touching(8)
+        protocol.adjacent(8).channels_touching(electrodes)
+
+
+def test_no_electrodes_touch_no_channel():
+    assert not protocol.adjacent(8).channels_touching([]).any()
 
 
 def test_jit_vmap_and_grad_pass_through():
