@@ -6,7 +6,7 @@ import meshio
 import numpy as np
 import pytest
 
-from jeit.electrodes import FaceDiscs, FacePatches, PointElectrodes, plates
+from jeit.electrodes import CombinedElectrodes, FaceDiscs, FacePatches, PointElectrodes, SheetDiscs, plates
 from jeit.mesh import box, disk
 from jeit.report import write_vtk_series, write_vtu, write_xdmf
 from jeit.report.volume_files import electrode_of_nodes
@@ -50,13 +50,14 @@ def test_one_file_holds_the_image_and_the_electrode_positions(tank, frames, tmp_
     np.testing.assert_array_equal(under[~left & (np.asarray(tank.points)[:, 2] > 0.06 - 1e-9)], 2)
 
 
-@pytest.mark.parametrize("kind", ["discs", "patches", "points"])
+@pytest.mark.parametrize("kind", ["discs", "patches", "points", "combined"])
 def test_nodes_under_electrodes_are_near_them(tank, kind):
     places = np.array([[0.05, 0.0, 0.03], [-0.05, 0.01, 0.03]])
     electrodes = {
         "discs": FaceDiscs(places, 0.02, 1e-3),
         "patches": FacePatches(places, 0.04, 0.04, 1e-3),
         "points": PointElectrodes(places),
+        "combined": CombinedElectrodes(FaceDiscs(places[:1], 0.02, 10), FacePatches(places[1:], 0.04, 0.04, 1e-3)),
     }[kind]
     under = electrode_of_nodes(tank, electrodes)
     for number, place in enumerate(places, start=1):
@@ -64,6 +65,16 @@ def test_nodes_under_electrodes_are_near_them(tank, kind):
         assert len(nodes)
         assert np.linalg.norm(nodes - place, axis=1).max() < 0.035
         np.testing.assert_allclose(nodes[:, 0], place[0])
+
+
+def test_nodes_under_discs_on_a_sheet_are_those_within_their_radius():
+    sheet = disk(0.05, num_points=400)
+    places = np.array([[0.02, 0.0], [-0.01, 0.02]])
+    under = electrode_of_nodes(sheet, SheetDiscs(places, 0.012, [1e-3, 10.0]))
+    for number, place in enumerate(places, start=1):
+        distance = np.linalg.norm(np.asarray(sheet.points) - place, axis=1)
+        assert (under[distance < 0.011] == number).all()
+        assert (under[distance > 0.016] != number).all()
 
 
 def test_a_series_has_one_file_per_frame_and_an_index(tank, frames, tmp_path):
