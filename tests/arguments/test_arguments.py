@@ -18,6 +18,7 @@ from jeit.arguments import (
     did_you_mean,
     interval_text,
     is_number,
+    names_text,
     real_array,
     signed_percent,
 )
@@ -110,6 +111,13 @@ def test_check_key_accepts_traced_keys():
 def test_check_key_rejects_other_values(key, message):
     with pytest.raises(ValueError, match=f"^seed must be one random key, .*{message}"):
         check_key(key, "seed")
+
+
+def test_names_text_states_how_many_names_it_leaves_out():
+    assert names_text([]) == "nothing"
+    assert names_text(range(8)) == "0, 1, 2, 3, 4, 5, 6, 7"
+    assert names_text("abcde", max_names=2) == "a, b and 3 more"
+    assert names_text(["a" * 24, "b" * 25]) == f"{'a' * 24}, {'b' * 23}…"
 
 
 def test_check_name():

@@ -49,8 +49,10 @@ def test_values_of_nodes_are_interpolated_and_the_distortion_is_stated(sleeve):
 
 
 def test_values_that_do_not_fit_the_surface_are_refused(sleeve):
-    with pytest.raises(ValueError, match="values"):
-        plot_unrolled(sleeve, np.zeros(3))
+    num_triangles, num_nodes = len(sleeve.cells), len(sleeve.surface.points)
+    for shape in ((3,), (num_triangles + 1,), (num_nodes, 1), ()):
+        with pytest.raises(ValueError, match=f"one for each of the {num_triangles} triangles or the {num_nodes} nodes"):
+            plot_unrolled(sleeve, np.zeros(shape))
     with pytest.raises(ValueError, match="real or imaginary part"):
         plot_unrolled(sleeve, np.zeros(len(sleeve.cells), complex))
     with pytest.raises(ValueError, match="electrodes"):

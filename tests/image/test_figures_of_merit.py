@@ -7,6 +7,7 @@ import pytest
 import scipy.io
 
 from jeit.image import figures_of_merit
+from jeit.image.rasters import FiguresOfMerit
 
 BODY = 0.1
 EXTENT = (-BODY, BODY, -BODY, BODY)
@@ -138,6 +139,16 @@ def test_vmap_and_jit_equal_a_loop():
         for field in FIELDS:
             np.testing.assert_allclose(getattr(together, field)[k], getattr(alone, field), rtol=1e-12, atol=1e-15)
             np.testing.assert_allclose(getattr(mapped, field)[k], getattr(alone, field), rtol=1e-12, atol=1e-15)
+
+
+def test_the_text_states_the_position_error_in_millimetres_and_medians_of_several_targets():
+    one = FiguresOfMerit(*map(np.asarray, (0.9, -2.5e-3, 0.25, 0.125, 0.5, 0.04, 0.1)))
+    assert repr(one) == (
+        "FiguresOfMerit(amplitude response 0.9, position error -2.5 mm,\n  resolution 0.25, shape deformation 0.125, "
+        "ringing 0.5)"
+    )
+    three = FiguresOfMerit(*(np.array([0.0, 1.0, 5.0]) * value for value in (0.9, -2.5e-3, 0.25, 0.125, 0.5, 0.04, 1)))
+    assert repr(three) == repr(one).replace("(amplitude", "(medians of 3 targets: amplitude")
 
 
 def test_images_of_another_toolkit(reference_folder):
