@@ -271,6 +271,16 @@ def test_a_forked_process_refuses_to_compile_if_jax_had_started(monkeypatch):
         registered[0]("/jax/core/compile/backend_compile_duration", 0.1, fun_name="f")
 
 
+def test_the_refusal_is_registered_where_processes_can_fork(monkeypatch):
+    registered = []
+    monkeypatch.setattr(os, "register_at_fork", lambda **hooks: registered.append(hooks), raising=False)
+    jax_setup.refuse_compiled_code_in_forks()
+    assert registered == [{"after_in_child": jax_setup._refuse_in_child}]
+    monkeypatch.delattr(os, "register_at_fork")  # as on Windows
+    jax_setup.refuse_compiled_code_in_forks()
+    assert len(registered) == 1
+
+
 OTHERS = [pytest.param(*one, marks=pytest.mark.slow) for one in (("false", True), ("1", False), (None, False))]
 
 
