@@ -21,11 +21,12 @@ from jeit.design import (
 )
 from jeit.design.sensitivity import SensitivityMap
 from jeit.design.skin.names import skin_protocol
+from jeit.design.skin.sheet_touches import sheet_touches
 from jeit.electrodes import FaceDiscs, SurfaceDiscs
 from jeit.forward import ForwardModel
 from jeit.inverse import one_step
 from jeit.layout import Layout, SurfaceLayout, grid, spread
-from jeit.mesh import Mesh, Rectangle, bend, box, forearm, layer, shell, tube
+from jeit.mesh import Mesh, Rectangle, bend, box, centroids, forearm, layer, shell, tube
 from jeit.mesh.geodesic import Geodesics, Triangles
 from jeit.touch.contacts import CellFinder, find_contacts
 
@@ -132,18 +133,51 @@ def unbent(surface: Mesh, radius: float) -> np.ndarray:
     return np.column_stack([radius * np.arctan2(points[:, 0], radius + points[:, 2]), points[:, 1]])
 
 
-def test_a_bent_sheet_without_thickness_equals_the_flat_sheet():
-    """`bend` preserves all lengths on the sheet, and discs are measured along it."""
+@pytest.fixture(scope="module")
+def bent_and_flat() -> tuple[Mesh, Mesh]:
+    """A bent sheet and the flat one with the same cells: `bend` preserves all lengths on the sheet."""
     fine = SHEET.mesh(num_points=400)
-    surface, flat = bend(fine, 0.03), bend(fine, np.inf)
+    return bend(fine, 0.03), bend(fine, np.inf)
+
+
+def on_bent(surface: Mesh, flat: Mesh, points) -> np.ndarray:
+    """Points (n, 3) of the bent sheet, from points (n, 2) of the flat one."""
+    at = Triangles.of(flat).nearest(raised(points))
+    return np.einsum("pk,pkd->pd", at.weights, np.asarray(surface.points)[np.asarray(surface.cells)[at.triangle]])
+
+
+def test_a_bent_sheet_without_thickness_equals_the_flat_sheet(bent_and_flat):
+    """Discs are measured along the sheet."""
+    surface, flat = bent_and_flat
     centres = grid(0.08, 0.08, 3, 3)
-    at = Triangles.of(flat).nearest(raised(centres))
-    bent = np.einsum("pk,pkd->pd", at.weights, np.asarray(surface.points)[np.asarray(surface.cells)[at.triangle]])
+    bent = on_bent(surface, flat, centres)
     voltages = [
         np.asarray(Skin.create(SurfaceLayout(one, 8e-3, mesh), num_layers=0).model.voltages(0.01))
         for one, mesh in ((raised(centres), flat), (bent, surface))
     ]
     np.testing.assert_allclose(voltages[1], voltages[0], rtol=1e-10)
+
+
+def test_touches_of_a_bent_sheet_and_their_derivatives_are_those_of_the_flat_sheet(bent_and_flat):
+    """The tangential directions are not specified: products of derivatives do not depend on them."""
+    surface, flat = bent_and_flat
+    bent = on_bent(surface, flat, [[0.01, 0.02]])
+    depth, deviation, thickness, contrast = 2e-3, 12e-3, 0.01, 3.0
+    touches = sheet_touches(surface, Bell(depth, deviation), bent, thickness=thickness, contrast=contrast)
+    used = np.flatnonzero(np.asarray(touches.touched.change)[0])
+    assert len(used) > 100
+    cells, change = (np.asarray(one)[0, used] for one in (touches.touched.cells, touches.touched.change))
+    slope = np.asarray(touches.slope)[0, used]
+    apart = np.asarray(centroids(flat))[cells, :2] - [0.01, 0.02]
+    expected = (contrast - 1) * depth / thickness * np.exp(-np.sum(apart**2, axis=1) / (2 * deviation**2))
+    np.testing.assert_allclose(change, expected, rtol=1e-9)
+    expected_slope = expected[:, None] * apart / deviation**2
+    np.testing.assert_allclose(np.linalg.norm(slope, axis=1), np.linalg.norm(expected_slope, axis=1), rtol=1e-9)
+    products, expected_products = slope @ slope.T, expected_slope @ expected_slope.T
+    np.testing.assert_allclose(products, expected_products, rtol=0, atol=0.05 * expected_products.max())
+    thicker = touches.at_thickness(2 * thickness)
+    np.testing.assert_allclose(thicker.touched.change, np.asarray(touches.touched.change) / 2, rtol=1e-12)
+    np.testing.assert_allclose(thicker.slope, np.asarray(touches.slope) / 2, rtol=1e-12)
 
 
 @pytest.fixture(scope="module")
