@@ -2,6 +2,7 @@
 and left out of the image; bodies are not taken for moved electrodes."""
 
 import functools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from jeit import image_difference
 from jeit.data import Measurement
 from jeit.electrodes import BoundaryElectrodes, body_mesh
 from jeit.forward import ForwardModel
-from jeit.imaging import ImagingSettings, image_sequence
+from jeit.imaging import ImagingSettings, electrode_changes, image_sequence
 from jeit.imaging.stream_preparation import StreamSettings, image_stream, prepare_imager
 from jeit.inverse import stream
 from jeit.layout import ring
@@ -149,3 +150,30 @@ def test_a_stream_subtracts_movement_from_its_first_frame_on(solver):
     assert max(peaks[1], peaks[3]) < 0.3 * min(plain[1], plain[3])
     assert peaks[2] > 0.9 * plain[2]
     assert [image.number for image in images] == [0, 1, 2, 3]
+
+
+def test_the_evidence_is_that_of_a_dense_covariance():
+    """9 channels, of which reciprocity leaves 6 combinations; 4 changes of electrodes, and a factor common to all."""
+    rng = np.random.default_rng(0)
+    basis = np.linalg.qr(rng.normal(size=(9, 9)))[0]
+    eigenvalues = np.array([5.0, 3.0, 1.0, 0.3, 0.1, 0.02, 0.0, 0.0, 0.0])
+    weight, channels = rng.uniform(1.0, 2.0, 9), np.delete(np.arange(12), [2, 5, 11])
+    difference, reference, patterns = rng.normal(size=12), rng.uniform(1.0, 3.0, 12), rng.normal(size=(12, 4))
+    spectrum = SimpleNamespace(eigenvalues=eigenvalues, basis=basis)
+    linearisation = SimpleNamespace(spectrum=spectrum, root_weight=weight, channels=channels)
+    problem = electrode_changes._WhitenedProblem(linearisation, difference, patterns, reference)
+    data, level, columns = ((weight * values.T[..., channels]).T for values in (difference, reference, patterns))
+    size, reciprocal = np.sqrt(np.mean(data**2)), basis[:, :6] @ basis[:, :6].T
+    level, columns = reciprocal @ level, reciprocal @ columns
+    level *= electrode_changes._MAX_FACTOR * size * np.sqrt(9) / np.linalg.norm(level)
+    for logarithms in ([-0.5, -2.0, -2.5], [-0.5, -2.0, -2.5, -1.0], [0.2, -1.0, -3.5, 0.4]):
+        conductivity, noise, error = np.exp(2 * np.array(logarithms[:3])) * size**2
+        covariance = conductivity * (basis * eigenvalues) @ basis.T * 9 / eigenvalues.sum() + noise * np.eye(9)
+        covariance += error * reciprocal + np.outer(level, level)
+        departure = (logarithms[:3] - electrode_changes._INITIAL_LOGARITHMS[:3]) / electrode_changes._LOGARITHMS_WIDTH
+        prior = departure @ departure
+        if len(logarithms) == 4:
+            covariance += np.exp(2 * logarithms[3]) * columns @ columns.T
+            prior += (2 * max(logarithms[3], 0)) ** 2
+        expected = 0.5 * (data @ np.linalg.solve(covariance, data) + np.linalg.slogdet(covariance)[1] + prior)
+        np.testing.assert_allclose(problem._cost(np.array(logarithms)), expected, rtol=1e-9)

@@ -47,6 +47,17 @@ def test_a_sound_image_has_no_rows_of_faults(printed):
     assert "peaks of the image, which blurs" in text
 
 
+def test_a_hyperparameter_is_called_default_where_it_is_the_methods_number(imaged):
+    def chosen_by(method, hyperparameter, rule):
+        settings = ImagingSettings(method, hyperparameter=hyperparameter)
+        return replace(imaged, settings=settings, reconstruction=SimpleNamespace(rule=rule)).chosen_by
+
+    default = ImagingSettings("gauss-newton").hyperparameter
+    assert chosen_by("gauss-newton", None, "given") == chosen_by("gauss-newton", default, "given") == "default"
+    assert chosen_by("gauss-newton", 2 * default, "given") == chosen_by("one-step", default, "given") == "given"
+    assert chosen_by("one-step", None, "gcv") == "gcv"
+
+
 def test_faults_have_rows_of_their_own(imaged, printed):
     turned = Wiring((0, 1, 6, 3, 4, 5, 2, 7), described=0.4)
     text, rows = printed(wiring=turned, unlike_electrodes={2: 2.54})
