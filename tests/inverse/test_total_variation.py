@@ -21,7 +21,8 @@ from jeit.inverse import (
 from jeit.inverse.channels import IndependentChannels
 from jeit.inverse.nonlinear import GaussNewton, LevenbergMarquardt
 from jeit.layout import perimeter
-from jeit.mesh import Rectangle, box, centroids, measures
+from jeit.mesh import Rectangle, box, centroids, measures, rectangle
+from jeit.mesh.mesh import interior_facets
 from jeit.protocol import adjacent
 
 OUTLINE = Rectangle(0.2, 0.16)
@@ -126,6 +127,39 @@ def test_the_quadratic_model_bounds_the_energy_from_above(mesh):
     for scale in (0.1, 0.5, 1.0, 1.5):
         above = float(cost + scale * slope + scale**2 * curvature / 2)
         assert float(energy(point + scale * np.asarray(direction))) <= above * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("size", [1.0, 0.1])
+def test_the_energy_in_a_solid_is_the_integral_of_the_gradient(size):
+    """λ/s² ∫ √(|∇x|² + (β/h)²) dV + ½ · 1e-3 λ mean(c²): of steep and of shallow images, on cells of any size."""
+    mesh = box(size, 0.8 * size, 0.4 * size, cell_size=0.4 * size)
+    basis, penalty = TotalVariation(0.05).penalty(mesh, np.full(mesh.num_cells, 0.3), 20.0)
+    points, volumes = np.asarray(mesh.points), np.asarray(measures(mesh))
+    for slope in (np.array([2.0, -1.0, 0.5]) / size, np.array([0.0, 0.01, 0.02]) / size):
+        image = points @ slope
+        cell_size = np.cbrt(volumes)
+        edges = np.sum(volumes * np.sqrt(slope @ slope + (0.05 / cell_size) ** 2)) / size**2
+        mean_square = np.sum(volumes * (image[np.asarray(mesh.cells)] ** 2).mean(axis=1)) / volumes.sum()
+        expected = 20.0 * edges + 0.5 * 20.0 * 1e-3 * mean_square
+        assert float(penalty.cost(image)) == pytest.approx(expected, rel=1e-9)
+        assert float(penalty.cost(np.append(image, [3.0, 4.0]))) == pytest.approx(expected + 12.5, rel=1e-9)
+    np.testing.assert_allclose(basis.expand(image), image[np.asarray(mesh.cells)].mean(axis=1), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("mesh", [rectangle(0.1, 0.08, cell_size=0.03), box(0.1, 0.08, 0.05, cell_size=0.05)])
+def test_the_energy_of_cells_is_that_of_the_jumps_between_them(mesh):
+    """λ Σ l √(d² + β²), with the size l of a facet relative to the body's, + ½ · 1e-3 λ mean(c²)."""
+    image, reference = np.random.default_rng(0).normal(size=(2, mesh.num_cells))
+    pairs, nodes = interior_facets(mesh)
+    corners = np.asarray(mesh.points)[nodes]
+    edges = [corners[:, k] - corners[:, 0] for k in range(1, mesh.dimension)]
+    lengths = np.linalg.norm(edges[0], axis=1) if mesh.dimension == 2 else np.linalg.norm(np.cross(*edges), axis=1) / 2
+    jumps = np.diff((image + reference)[pairs], axis=1)[:, 0]
+    mean_square = np.average(image**2, weights=measures(mesh))
+    expected = 20 * (lengths @ np.hypot(jumps, 0.05)) / 0.1 ** (mesh.dimension - 1) + 0.5 * 20 * 1e-3 * mean_square
+    penalty = TotalVariation(0.05).penalty(mesh, reference, 20.0, per_cell=True)[1]
+    assert float(penalty.cost(image)) == pytest.approx(expected, rel=1e-9)
+    assert float(penalty.cost(np.append(image, [3.0, 4.0]))) == pytest.approx(expected + 12.5, rel=1e-9)
 
 
 @pytest.mark.parametrize(
