@@ -107,6 +107,8 @@ def test_bodies_of_one_material_have_the_contrast_of_the_first(ellipsoids, coars
     bodies = [same.body(k, moved) for k in range(3)]
     assert bodies[0].contrast == bodies[2].contrast != bodies[1].contrast
     assert same.on(coarse.mesh).body(2, moved).contrast == bodies[0].contrast
+    for k, row in enumerate(same.rows(moved)):
+        np.testing.assert_array_equal(moved[list(quantities._radius_and_contrast_index(same, k))], row[3:5])
     np.testing.assert_allclose(same.odds, -np.log(EllipsoidPrior().odds_for_one_material))
     alone, rest = same.without(0, moved)
     assert not alone.body(1, rest).alike
@@ -124,13 +126,28 @@ def test_bodies_keep_their_effect_when_they_become_one_material(ellipsoids):
     point[[5, 25]] = 0.6, -0.6  # contrasts of the first and the last
     ellipsoids, point = ellipsoids.with_other_kind([2], point)
     same, after = ellipsoids.of_one_material(1, point)
+
+    def effect(bodies, values, k, ends):
+        body, row = bodies.body(k, values), bodies.rows(values)[k]
+        size = np.exp((1 + ends) * bodies.log_radius(row))
+        return size * np.expm1(body.contrast) / (np.exp(body.contrast) + ends)
+
     for k, ends in ((0, 2), (2, 1)):
-        effect = []
-        for one, values in ((ellipsoids, point), (same, after)):
-            body, row = one.body(k, values), one.rows(values)[k]
-            size = np.exp((1 + ends) * one.log_radius(row))
-            effect.append(size * np.expm1(body.contrast) / (np.exp(body.contrast) + ends))
-        np.testing.assert_allclose(*effect)
+        np.testing.assert_allclose(effect(ellipsoids, point, k, ends), effect(same, after, k, ends))
+    # So do they when the contrast of their material is explored; the other material keeps its own.
+    problem: Any = SimpleNamespace(
+        fit=lambda bodies, start, *_: Fit(bodies, start, 1.0, ROWS), surprise=lambda fit: 7.0
+    )
+    last = np.log(same.body(2, after).contrast)
+    for log_contrast in (last - 0.5, last + 1.0):
+        explored = quantities._fit_with_fixed_contrast(problem, same, after, 2, last, log_contrast)
+        fit = explored.fit
+        assert (explored.log_contrast, explored.negative_log_likelihood) == (log_contrast, 7.0)
+        for k, ends in ((0, 2), (2, 1)):
+            assert fit.bodies.body(k, fit.coefficients).contrast == pytest.approx(np.exp(log_contrast))
+            np.testing.assert_allclose(effect(fit.bodies, fit.coefficients, k, ends), effect(same, after, k, ends))
+        np.testing.assert_array_equal(fit.bodies.rows(fit.coefficients)[1], same.rows(after)[1])
+        assert fit.bodies.body(1, fit.coefficients).contrast == same.body(1, after).contrast
 
 
 def test_the_kind_of_bodies_can_be_given(coarse):
