@@ -14,8 +14,9 @@ from jeit.image import Inclusion, Raster
 from jeit.imaging import ImagingSettings, calibration, image_difference
 from jeit.imaging.difference import _region_labels
 from jeit.imaging.wiring import Wiring
+from jeit.inverse.shapes import Ellipsoid, Star
 from jeit.mesh import centroids
-from jeit.report.image import draw_image
+from jeit.report.image import draw_image, report_image
 from jeit_solvers import Status
 
 
@@ -68,6 +69,52 @@ def test_faults_have_rows_of_their_own(imaged, printed):
     assert rows == [*USUAL[:3], "rounding", *USUAL[3:]]
     assert "noise in it not known" in text
     assert "1.2 % of the difference: voltages have few digits" in text
+
+
+def test_the_report_states_numbers_in_their_units(imaged):
+    background = float(imaged.calibration.conductivity)
+    body = Inclusion(-1, (0.02, -0.01), 3e-4, -0.5 * background, contrast_interval=(-0.7, None), strength=2e-4)
+    ball = Inclusion(1, (0.02, -0.01, 0.03), 4e-6, 0.25 * background)
+    report = report_image(replace(imaged, unlike_electrodes={0: 2.5, 7: 3.0}, inclusions=(body, ball)))
+    currents = {name: report["protocol"][name] for name in ("electrodes", "drives", "measurements", "largest_current")}
+    assert currents == {"electrodes": 8, "drives": 8, "measurements": 40, "largest_current": pytest.approx(1e-3)}
+    fit = report["calibration"]
+    assert fit["conductivity"] == pytest.approx(background)
+    assert (fit["conductivity_unit"], fit["contact_impedance_unit"]) == ("S", "ohm·m")
+    assert report["unlike_electrodes"] in ({1: 2.5, 8: 3.0}, {"1": 2.5, "8": 3.0})
+    first, second = report["inclusions"]
+    assert (first["kind"], second["kind"]) == ("resistive", "conductive")
+    assert (first["area"], first["area_unit"]) == (3e-4, "m²")
+    assert (second["volume"], second["volume_unit"]) == (4e-6, "m³")
+    assert (first["peak_relative_to_background"], second["peak_relative_to_background"]) == pytest.approx((-0.5, 0.25))
+    assert (first["contrast_interval"], first["strength"], first["strength_unit"]) == ([-0.7, None], 2e-4, "m²")
+    assert "strength" not in second
+
+
+def test_fitted_bodies_are_reported_with_their_conductivity_relative_to_the_background(imaged):
+    outline = np.array([[0.02, 0.0], [0.02, 0.01], [0.01, 0.01], [0.01, 0.0]])
+    weak, strong = (Star(sign, outline[0], outline, np.log(4), sign < 0, 3.0) for sign in (-1, 1))
+    axes, centre = np.diag([0.03, 0.02, 0.01]), np.array([0.0, 0.01, 0.02])
+    ball, column = (
+        Ellipsoid(sign, centre, axes, 3e-5, centre, np.log(2), column=sign < 0, alike=sign > 0, rise=2.0)
+        for sign in (1, -1)
+    )
+    shapes = SimpleNamespace(
+        bodies=(weak, ball), doubtful=(strong,), alternatives=(None, column), alternative_deviations=(np.nan, 0.3),
+        misfit=1.5, drift=0.01,
+    )  # fmt: skip
+    report = report_image(replace(imaged, shapes=shapes))["shapes"]
+    sheet_body, solid_body, (left_out,) = *report["bodies"], report["left_out"]
+    assert sheet_body["conductivity_over_background"] == pytest.approx(0.25)
+    assert (sheet_body["sign"], sheet_body["area"], sheet_body["rise"]) == (-1, pytest.approx(1e-4), 3.0)
+    assert (sheet_body["conductivity_is"], "or" in sheet_body) == ("estimated from the data", False)
+    assert left_out["conductivity_over_background"] == pytest.approx(4)
+    assert left_out["conductivity_is"] == "assumed, as of what is strong"
+    assert (solid_body["form"], solid_body["volume"]) == ("ellipsoid", 3e-5)
+    assert solid_body["conductivity_over_background"] == pytest.approx(2)
+    assert "of one material with all others of its sign" in solid_body["conductivity_is"]
+    assert (solid_body["or"]["form"], solid_body["or"]["deviation_of_logarithm"]) == ("column", 0.3)
+    assert solid_body["or"]["conductivity_over_background"] == pytest.approx(0.5)
 
 
 def test_a_calibration_that_failed_is_explained(imaged, printed):
