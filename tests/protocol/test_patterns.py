@@ -119,6 +119,9 @@ def test_trigonometric_drives_are_orthogonal():
     drive = np.asarray(protocol.trigonometric(16, current=1.0).drive)
     gram = drive @ drive.T
     np.testing.assert_allclose(gram, np.diag([8.0] * 14 + [16.0]), atol=1e-13)
+    angle = 2 * np.pi * np.arange(5) / 5
+    expected = [np.cos(angle), np.sin(angle), np.cos(2 * angle), np.sin(2 * angle)]
+    np.testing.assert_allclose(protocol.trigonometric(5, current=2e-3).drive, 2e-3 * np.array(expected), atol=1e-15)
 
 
 def test_from_matrices_selects_channels_drive_by_drive():

@@ -73,6 +73,16 @@ def test_transfer_between_drives_is_symmetric_where_known():
     np.testing.assert_array_equal(transfer_without[..., np.arange(8) != 3], transfer[..., np.arange(8) != 3])
 
 
+def test_of_drives_with_one_channel_only_its_own_voltage_is_known():
+    chosen = protocol.two_terminal(3, current=2e-3)
+    arrays = map(np.asarray, (chosen.drive, chosen.measurement, chosen.drive_index, chosen.measurement_index))
+    used = np.array([True, True, False])
+    transfer, known, noise = transfer_between_drives(*arrays, np.array([[1.0, 2.0, 3.0]]), used)
+    np.testing.assert_array_equal(known, np.diag(used))
+    np.testing.assert_allclose(np.diag(transfer[0])[:2], [2e-3, 4e-3])
+    np.testing.assert_allclose(np.diag(noise)[:2], 2e-3)
+
+
 def drives_across(lost_pairs, drives):
     """Whether each pair of `drives` joins the two parts into which a ring falls without its edges `lost_pairs`."""
     number = drives.shape[1]
