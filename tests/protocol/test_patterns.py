@@ -155,14 +155,15 @@ BAD = {
     "too few electrodes": (lambda: protocol.adjacent(3), "at least 4"),
     "not an integer": (lambda: protocol.adjacent(16.0), "integer"),
     "odd opposite": (lambda: protocol.opposite(15), r"opposite pairs.*skip\(\.\.\., 6\)"),
-    "milliamperes": (lambda: protocol.adjacent(16, current=1.4), "1.4 mA"),
+    "milliamperes": (lambda: protocol.adjacent(16, current=1.4), "1.4 mA, write 1.4e-3 .microamperes: 1.4e-6"),
     "milliamperes in matrices": (lambda: protocol.from_matrices([[1.41, -1.41]], [[1, -1]]), "amperes"),
     "no current": (lambda: protocol.adjacent(16, current=0.0), "positive"),
     "NaN current": (lambda: protocol.adjacent(16, current=float("nan")), "finite"),
     "skip back to itself": (lambda: protocol.skip(8, 7), "from 0 to 6"),
     "unknown order": (lambda: protocol.adjacent(16, order="clockwise"), "'rotating'"),
     "unknown half": (lambda: protocol.adjacent(16, reciprocal="none"), "'half'"),
-    "pair with itself": (lambda: protocol.two_terminal(4, [(1, 1)]), "itself"),
+    "pair with itself": (lambda: protocol.two_terminal(4, [(0, 1), (2, 2)]), "pair 1 is electrode 2 with itself"),
+    "negative electrode": (lambda: protocol.two_terminal(4, [(-1, 1)]), "0 to 3"),
     "electrode that is not": (lambda: protocol.two_terminal(4, [(0, 4)]), "0 to 3"),
     "common that is not": (lambda: protocol.all_against_one(8, common=8), "0 to 7"),
     "nothing left": (lambda: protocol.all_against_one(8, driven_electrodes=False), "driven_electrodes=True"),
@@ -177,13 +178,24 @@ BAD = {
     ),
     "rows do not sum to zero": (lambda: protocol.from_matrices([[1e-3, 0]], [[1, -1]]), "sums to 0.001"),
     "absolute potential": (lambda: protocol.from_matrices([[1e-3, -1e-3]], [[1, 0]]), "differences"),
-    "zero row": (lambda: protocol.from_matrices([[1e-3, -1e-3], [0, 0]], [[1, -1]]), "all zero"),
-    "NaN": (lambda: protocol.from_matrices([[np.nan, -1e-3]], [[1, -1]]), "NaN"),
+    "zero row": (
+        lambda: protocol.from_matrices([[1e-3, -1e-3], [0, 0], [0, 0]], [[1, -1]]),
+        "drive pattern 1 is all zero: .*.2 such rows",
+    ),
+    "NaN": (
+        lambda: protocol.from_matrices([[1e-3, -1e-3]], [[1, -1], [np.nan, -1]]),
+        "measurement pattern 1 contains NaN",
+    ),
     "other L": (lambda: protocol.from_matrices([[1e-3, -1e-3]], [[1, -1, 0]]), "3"),
     "select of another shape": (lambda: protocol.from_matrices([[1e-3, -1e-3]], [[1, -1]], [True]), "shape"),
     "select nothing": (lambda: protocol.from_matrices([[1e-3, -1e-3]], [[1, -1]], [[False]]), "no channel"),
     "text": (lambda: protocol.from_matrices([["a", "b"]], [[1, -1]]), "real numbers"),
-    "index from one": (lambda: protocol.from_channels([[1e-3, -1e-3]], [[1, -1]], [1]), "0-based"),
+    "index from one": (
+        lambda: protocol.from_channels([[1e-3, -1e-3]] * 3, [[1, -1]] * 3, [1, 2, 3]),
+        "drive_index runs from 1 to 3, but there are 3 drive patterns, numbered 0 to 2. Indices are 0-based",
+    ),
+    "negative index": (lambda: protocol.Protocol([[1e-3, -1e-3]], [[1, -1]], [0, 0], [0, -1]), "runs from -1 to 0"),
+    "no index": (lambda: protocol.Protocol([[1e-3, -1e-3]], [[1, -1]], [], []), "integers|at least one"),
     "index of another length": (lambda: protocol.from_channels([[1e-3, -1e-3]], [[1, -1]], [0, 0]), "each of the 1"),
     "fractional index": (lambda: protocol.Protocol([[1e-3, -1e-3]], [[1, -1]], [0.5], [0]), "integers"),
 }
@@ -194,3 +206,22 @@ def test_invalid_patterns_are_refused_with_advice(name):
     build, lesson = BAD[name]
     with pytest.raises(ValueError, match=lesson):
         build()
+
+
+LEAST = {
+    protocol.adjacent: 4,
+    protocol.opposite: 4,
+    protocol.all_against_one: 3,
+    protocol.trigonometric: 3,
+    protocol.two_terminal: 2,
+    protocol.haar: 2,
+}
+
+
+@pytest.mark.parametrize(("build", "least"), LEAST.items())
+def test_the_least_number_of_electrodes_is_accepted_and_one_less_refused(build, least):
+    has_options = build in (protocol.all_against_one, protocol.opposite)
+    options = {"driven_electrodes": True} if has_options else {}
+    assert build(least, **options).num_electrodes == least
+    with pytest.raises(ValueError, match=f"at least {least}; got {least - 1}"):
+        build(least - 1, **options)
