@@ -14,9 +14,10 @@ from jeit.image import Inclusion, Raster
 from jeit.imaging import ImagingSettings, calibration, image_difference
 from jeit.imaging.difference import _region_labels
 from jeit.imaging.wiring import Wiring
+from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes import Ellipsoid, Star
 from jeit.mesh import centroids
-from jeit.report.image import draw_image, report_image
+from jeit.report.image import _arrays, draw_image, report_image
 from jeit_solvers import Status
 
 
@@ -115,6 +116,18 @@ def test_fitted_bodies_are_reported_with_their_conductivity_relative_to_the_back
     assert "of one material with all others of its sign" in solid_body["conductivity_is"]
     assert (solid_body["or"]["form"], solid_body["or"]["deviation_of_logarithm"]) == ("column", 0.3)
     assert solid_body["or"]["conductivity_over_background"] == pytest.approx(0.5)
+
+
+def test_the_arrays_of_an_iterative_image_contain_the_logarithm_of_its_conductivity(imaged):
+    change, background = np.asarray(imaged.change), float(imaged.calibration.conductivity)
+    iterative = replace(imaged, reconstruction=object.__new__(Reconstruction))
+    arrays = _arrays(iterative)
+    np.testing.assert_allclose(arrays["departure"], np.log10((background + change) / background), rtol=1e-9, atol=1e-15)
+    np.testing.assert_array_equal(arrays["conductivity"], change)
+    assert arrays["background"] == background
+    assert "departure" not in {*_arrays(imaged), *_arrays(replace(iterative, change=change * (1 + 0.1j)))}
+    assert "labels" not in arrays
+    np.testing.assert_array_equal(_arrays(replace(imaged, labels=np.eye(3)))["labels"], np.eye(3))
 
 
 def test_a_calibration_that_failed_is_explained(imaged, printed):

@@ -94,6 +94,10 @@ def test_films_of_long_streams_are_short(tmp_path, monkeypatch):
     write_film(tmp_path / "a.gif", MESH, changes(40), rate=1000.0)
     with Image.open(tmp_path / "a.gif") as shown:
         assert (shown.n_frames, shown.info["duration"]) == (4, 40)  # no faster than 25 a second
+    monkeypatch.setattr(series, "FILM_FRAMES", 2)
+    write_film(tmp_path / "b.gif", MESH, changes(40), rate=50.0)
+    with Image.open(tmp_path / "b.gif") as shown:
+        assert (shown.n_frames, shown.info["duration"]) == (2, 400)  # as long as the stream, 0.8 s
 
 
 def test_a_film_of_a_solid_states_the_planes_of_its_slices(tmp_path, monkeypatch):
@@ -101,8 +105,10 @@ def test_a_film_of_a_solid_states_the_planes_of_its_slices(tmp_path, monkeypatch
     monkeypatch.setattr("matplotlib.figure.Figure.supxlabel", lambda _, text, **__: labels.append(text))
     solid = Solid(Disk(RADIUS), 0.04).mesh(num_points=600)
     write_film(tmp_path / "a.gif", solid, np.ones((1, solid.num_cells)))
-    write_film(tmp_path / "b.gif", MESH, changes(1))
+    write_film(tmp_path / "b.gif", MESH, changes(2))
     assert labels == ["slice at z = 20.0 mm"]
+    with Image.open(tmp_path / "b.gif") as shown:
+        assert (shown.n_frames, shown.info["duration"]) == (2, 100)  # of a stream without a rate
 
 
 def test_unknown_kinds_of_films_are_refused(tmp_path, monkeypatch):
