@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from jeit.electrodes import BoundaryElectrodes
 from jeit.imaging.doubts import doubts_of_data
+from jeit.layout import ring
+from jeit.mesh import Disk
 
 
 def calibration(background: float, dimension: int, **fields) -> Any:
@@ -64,3 +67,15 @@ def test_files_are_not_taken_for_exchanged_because_of_the_scale_of_the_model():
     assert doubts(1.02, 1.0) == doubts(disturbed, 1.0) == []
     (exchanged,) = doubts(1.0, disturbed)
     assert "are the two exchanged?" in exchanged
+
+
+@pytest.mark.parametrize(("width", "doubted"), [(2e-3, True), (3e-3, False)])
+def test_electrodes_much_narrower_than_their_distance_are_doubted(width, doubted):
+    """Eight electrodes on a tank 1.2 m across, which are 471 mm apart."""
+    electrodes, domain = BoundaryElectrodes(ring(0.6, 8), width, 0.05), Disk(0.6)
+    frame: Any = SimpleNamespace(
+        mask=np.ones((1, 10), bool), voltages=np.full((1, 10), 0.1), notes=(), electrodes=electrodes, domain=domain
+    )
+    doubts = doubts_of_data(frame, frame, calibration(0.2, 2))
+    expected = "the electrodes are 2 mm wide and 471 mm apart, on a body 1.2 m wide: are all lengths in metres?"
+    assert doubts == ([expected] if doubted else [])

@@ -152,6 +152,15 @@ def test_a_stream_subtracts_movement_from_its_first_frame_on(solver):
     assert [image.number for image in images] == [0, 1, 2, 3]
 
 
+def test_the_doubt_states_distances_in_millimetres_and_electrodes_from_1():
+    shift = np.array([[1e-3, 0.0], [0.0, -2e-3], [0.0, 0.0], [2e-3, 2e-3]])
+    doubt = electrode_changes.ElectrodeChange(shift, np.array([1.0, 2.0, 1.0, 0.4]), np.zeros(3), 0.12).doubt
+    assert "by about 1.8 mm (root mean square; electrode 4 by about 2.8 mm), and contact" in doubt
+    assert "contact impedances had changed by a factor of about 1.8 (of electrode 4, 0.4), or" in doubt
+    assert "contact" not in electrode_changes.ElectrodeChange(shift, np.ones(4), np.zeros(3), 0.12).doubt
+    assert "the rest of the difference, 12 % of it" in doubt
+
+
 def test_the_evidence_is_that_of_a_dense_covariance():
     """9 channels, of which reciprocity leaves 6 combinations; 4 changes of electrodes, and a factor common to all."""
     rng = np.random.default_rng(0)

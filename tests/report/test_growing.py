@@ -11,10 +11,10 @@ from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse.streaming.stream import FrameImage, FrameStatus
 from jeit.layout import ring
-from jeit.mesh import Disk
+from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
 from jeit.report import write_stream
-from jeit.report.stream import GrowingRows, GrowingTable, Sample, _StreamSummary
+from jeit.report.stream import _COLUMNS, GrowingRows, GrowingTable, Sample, _StreamPictures, _StreamSummary, _table_row
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +51,34 @@ def test_a_stream_is_written_as_it_was_imaged(calibrated, tmp_path):
     np.testing.assert_allclose(written.latency, 1e-3 * np.array([one for one in range(40) if one % 3 != 1]))
     assert progress == ["images", "contact sheet"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["frames.csv", "frames.png", "images.npz"]
+    with (tmp_path / "frames.csv").open(encoding="utf-8") as file:
+        lines = list(csv.DictReader(file))
+    assert [int(line["frame"]) for line in lines] == list(range(40))
+    assert {line["channels"] for line in lines} == {"40"}
+    refused = {**dict.fromkeys(lines[1], ""), "status": "refused", "latency_ms": "1.000", "reason": "no good"}
+    assert lines[1] == {**refused, "frame": "1", "channels": "40", "iterations": "0"}
+    pressed = lines[33]
+    assert (pressed["status"], pressed["misfit"], pressed["iterations"]) == ("imaged", "1", "2")
+    assert float(pressed["latency_ms"]) == pytest.approx(33)
+    place = np.asarray(centroids(calibrated.model.mesh))[33]
+    np.testing.assert_allclose([float(pressed["x_m"]), float(pressed["y_m"])], place, atol=1e-5)
+    assert float(pressed["peak"]) == pytest.approx(1e-3 * 34 / 40, rel=1e-4)
+
+
+@pytest.mark.parametrize(("rate", "titles"), [(None, ["frame 0", "frame 7"]), (5.0, ["0.00 s", "1.40 s"])])
+def test_frames_are_called_by_their_times_if_the_rate_is_known(rate, titles, tmp_path):
+    assert _StreamPictures(tmp_path, None, rate, print)._titles([0, 7]) == titles
+
+
+def test_the_line_of_a_solid_has_the_horizontal_place():
+    def strongest(change):
+        return np.array([0.01, -0.02, 0.03]), float(change[0])
+
+    pressed = FrameImage(3, np.full(5, 1.2), FrameStatus.IMAGED, "", np.ones(40, bool), np.nan, 2, 2e-3)
+    line = _table_row(pressed, strongest, 1.0)  # pyright: ignore[reportArgumentType]
+    stated = dict(zip(_COLUMNS, line, strict=True))
+    assert (stated["x_m"], stated["y_m"], stated["peak"]) == ("0.01000", "-0.02000", "0.2")
+    assert (stated["misfit"], stated["latency_ms"]) == ("", "2.000")
 
 
 def test_an_unchanged_frame_has_no_peak(calibrated, tmp_path):
