@@ -1,16 +1,22 @@
 """`jeit choose`: the table, picture and report of the hyperparameters that the rules choose."""
 
 import json
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from jeit.cli.commands.choose import show
 from jeit.data import read
+from jeit.image import Inclusion
 from jeit.imaging import ImagingSettings, compare_on_data, image_difference
 from jeit.inverse import RULES
+from jeit.mesh import disk
 from jeit.report import draw_choice, report_choice
+from jeit.report.hyperparameter_rules import _draw_outcome
 
 SMALL = ("--num-points", 250, "--contact", "fixed")
 
@@ -31,11 +37,15 @@ def test_every_rule_is_in_table_picture_and_report(tank, run, tmp_path):
     assert [entry["rule"] for entry in written["rules"]] == list(RULES)
     assert written["prior"] == "noser"
     assert written["doubts"] == []
+    assert (written["conductivity_unit"], written["centroid_unit"]) == ("S", "m")
     for entry in written["rules"]:
         row = rows[entry["rule"]]
         assert f"{entry['hyperparameter']:.3g}" in row
         assert f"{entry['noise_figure']:.3g}" in row
         assert row.split()[-1] == str(len(entry["inclusions"]))
+        assert all(
+            (one["kind"] == "conductive") == (one["sign"] > 0) == (one["peak"] > 0) for one in entry["inclusions"]
+        )
         assert 0 < entry["relative_residual"] < 1
         lengths = {len(entry[curve]) for curve in ("candidates", "criterion", "residual", "penalty")}
         assert len(lengths) == 1
@@ -51,6 +61,20 @@ def test_every_rule_is_in_table_picture_and_report(tank, run, tmp_path):
     assert float(imaged.reconstruction.hyperparameter) == pytest.approx(figure["hyperparameter"])
     assert imaged.reconstruction.choice is not None
     assert imaged.reconstruction.choice.note == ""
+
+
+@pytest.mark.parametrize(("number", "title", "marks"), [(1, "gcv\n1 inclusion", 1), (9, "gcv\n9 inclusions", 0)])
+def test_the_image_of_a_rule_has_its_own_scale_and_few_marks(number, title, marks):
+    mesh = disk(0.05, num_points=60)
+    change, found = np.linspace(-2e-3, 1e-3, mesh.num_cells), (Inclusion(1, (0.01, 0.0), 1e-4, 1e-3),)
+    outcome: Any = SimpleNamespace(change=change, inclusions=number * found)
+    figure = Figure()
+    ax = figure.subplots()
+    _draw_outcome(ax, "gcv", outcome, mesh)
+    bar = figure.axes[1]
+    assert [label.get_text() for label in bar.get_xticklabels()] == ["−2", "0", "+2 mS"]
+    np.testing.assert_allclose(bar.get_xticks(), [-2, 0, 2])
+    assert (ax.get_title(), len(ax.patches)) == (title, marks)
 
 
 def test_noise_in_the_difference_is_doubted(tank, run, tmp_path):

@@ -69,10 +69,18 @@ def test_files_are_not_taken_for_exchanged_because_of_the_scale_of_the_model():
     assert "are the two exchanged?" in exchanged
 
 
-@pytest.mark.parametrize(("width", "doubted"), [(2e-3, True), (3e-3, False)])
-def test_electrodes_much_narrower_than_their_distance_are_doubted(width, doubted):
+@pytest.mark.parametrize(
+    ("width", "domain", "doubted"),
+    [
+        (2e-3, Disk(0.6), True),
+        (3e-3, Disk(0.6), False),
+        ([3e-3, *7 * [2e-3]], Disk(0.6), False),
+        (2e-3, None, False),  # the body is not known
+    ],
+)
+def test_electrodes_much_narrower_than_their_distance_are_doubted(width, domain, doubted):
     """Eight electrodes on a tank 1.2 m across, which are 471 mm apart."""
-    electrodes, domain = BoundaryElectrodes(ring(0.6, 8), width, 0.05), Disk(0.6)
+    electrodes = BoundaryElectrodes(ring(0.6, 8), width, 0.05)
     frame: Any = SimpleNamespace(
         mask=np.ones((1, 10), bool), voltages=np.full((1, 10), 0.1), notes=(), electrodes=electrodes, domain=domain
     )
