@@ -58,6 +58,12 @@ def test_results_are_written(recording, tmp_path, capsys, monkeypatch):
     table = (tmp_path / "regions.csv").read_text().splitlines()
     assert table[0] == 'time_s,"half:1,0","box:-0.09,-0.09,0,0.09"'
     assert len(table) == 21
+    np.testing.assert_allclose([float(line.split(",")[0]) for line in table[1:]], np.arange(20) / 5)
+    assert (report["unit"], report["frame_rate_unit"], found["unit"]) == ("S", "Hz", "Hz")
+    assert (report["frames"], report["refused"], report["refused_frames"]) == (20, 0, [])
+    curves = np.genfromtxt(tmp_path / "regions.csv", delimiter=",", skip_header=1)[:, 1:]
+    for curve, one in zip(curves.T, parts, strict=True):
+        assert one["amplitude"] == pytest.approx(np.sqrt(2) * np.std(curve), rel=0.1)
     assert (tmp_path / "series.png").stat().st_size > 20_000
     assert (tmp_path / "a.gif").stat().st_size > 10_000
     printed = " ".join(capsys.readouterr().out.split())
