@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from jeit.arguments import percent
 from jeit.electrodes import BoundaryElectrodes
 from jeit.imaging.doubts import doubts_of_data
 from jeit.layout import ring
@@ -57,16 +58,27 @@ def test_files_are_not_taken_for_exchanged_because_of_the_scale_of_the_model():
 
     def frame(factor) -> Any:
         mask = np.ones((1, len(rest)), bool)
-        return SimpleNamespace(voltages=(rest * factor)[None], mask=mask, notes=(), electrodes=None, domain=None)
+        mask[0, 3] = False
+        return SimpleNamespace(voltages=(10 * rest * factor)[None], mask=mask, notes=(), electrodes=None, domain=None)
 
     def doubts(of_frame, of_reference):
         fitted = calibration(0.02, 2, voltages=1.4 * rest, misfit=0.4)
         return doubts_of_data(frame(of_frame), frame(of_reference), fitted)
 
     disturbed = 1 + 0.6 * np.cos(np.arange(len(rest)))
+    weaker = 1 + 0.1 * np.cos(np.arange(len(rest)))
     assert doubts(1.02, 1.0) == doubts(disturbed, 1.0) == []
-    (exchanged,) = doubts(1.0, disturbed)
-    assert "are the two exchanged?" in exchanged
+    assert "are the two exchanged?" in doubts(1.0, disturbed)[0]
+    (exchanged,) = doubts(weaker, disturbed)
+    shares = []
+    for factor in (weaker, disturbed):
+        predicted, measured = (np.delete(values, 3) for values in (rest, rest * factor))
+        fitted = predicted * (predicted @ measured) / (predicted @ predicted)
+        shares.append(percent(np.linalg.norm(measured - fitted) / np.linalg.norm(measured)))
+    assert exchanged == (
+        f"the frame fits an undisturbed body better ({shares[0]} misfit) than the reference does ({shares[1]}): "
+        "are the two exchanged?"
+    )
 
 
 @pytest.mark.parametrize(
