@@ -25,7 +25,7 @@ def calibration(background: float, dimension: int, **fields) -> Any:
     [
         (0.2, 3, 0.9, 0.1, []),
         (0.2, 3, 0.3, 0.1, ["only 3 of 10 voltages are left (30 %)"]),
-        (220.0, 3, 0.9, 0.1, [r'is no water\'s.*: \[protocol\] current_unit = "mA"\?$']),
+        (220.0, 3, 0.9, 0.1, [r'is no water\'s.*, which conduct 0.001 to 30 S/m: \[protocol\] current_unit = "mA"\?$']),
         (
             2e-4,
             3,
