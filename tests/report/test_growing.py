@@ -196,6 +196,21 @@ def test_single_rows_are_read_from_the_file(tmp_path):
         assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(("number", "expected"), [(2, []), (8, ["96 %", "100 %"])])
+def test_the_progress_of_large_files_is_reported(number, expected, tmp_path, monkeypatch):
+    monkeypatch.setattr("jeit.report.stream._BLOCK_BYTES", 92)
+    reported = []
+    with GrowingRows(tmp_path, (2, 3)) as rows:
+        for one in range(number):
+            rows.append(np.full((2, 3), one))
+        for progress in (reported.append, None):
+            rows.write_npz(tmp_path / "a.npz", "rows", {"other": np.arange(3)}, progress)
+            with np.load(tmp_path / "a.npz") as held:
+                np.testing.assert_array_equal(held["rows"], np.arange(number)[:, None, None] + np.zeros((2, 3)))
+                np.testing.assert_array_equal(held["other"], np.arange(3))
+    assert reported == expected
+
+
 def test_a_sample_of_rows_is_evenly_spaced_and_limited():
     sample = Sample()
     for one in range(1000):
