@@ -121,6 +121,19 @@ def test_a_thread_that_waits_lends_its_core():
     assert not free_cores.take()
 
 
+def test_there_is_at_most_one_more_thread_than_cores():
+    free = cores._FreeCores(2)
+    for _ in range(3):  # after threads have ended, as many may begin
+        assert [free.take(), free.take(), free.take()] == [True, True, False]
+        with free.lend():
+            assert free.take()
+            with free.lend():
+                assert not free.take()
+            free.give_back()
+        free.give_back()
+        free.give_back()
+
+
 def test_arrays_of_parts_are_freed_at_once():
     """Not when garbage is collected: gigabytes would remain until then."""
     array = np.ones(3)
