@@ -56,7 +56,9 @@ def run(options: Options) -> Result:
     frames = clean + noise * random.normal(size=clean.shape)
     networks = _networks(options, nominal_skin, quick)
     tuned = problem.tuning_touches(8 if quick else 40)
-    tuning = problem.JudgedSkins(seed=78, skins=1 if quick else 2, cell=4.5e-3 if quick else problem.CELL).changes(tuned[0])
+    tuning = problem.JudgedSkins(seed=78, skins=1 if quick else 2, cell=4.5e-3 if quick else problem.CELL).changes(
+        tuned[0]
+    )
     tuning = tuning + noise * random.normal(size=tuning.shape)
     ways: dict[str, Maps] = {"Tikhonov, Laplace": _linear(nominal_skin, Laplace(), noise, places, tuning, tuned[1])}
     ways["one-step, Gaussian"] = _linear(nominal_skin, Gaussian(8e-3), noise, places, tuning, tuned[1])

@@ -12,6 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
 
 from jeit.arguments import describe
 from jeit.mesh import Domain, Polygon
@@ -20,6 +21,9 @@ from jeit_solvers.module import Module
 
 # Maximum number of spline knots: more would slow down evaluation without making the surface smoother.
 _MAX_KNOTS = 300
+# Distance in the best plane below which points are at one place, and difference of the heights of such points from
+# their mean above which the surface folds, relative to the extent of the points.
+_SAME_PLACE, _FOLD_HEIGHT = 1e-3, 0.01
 
 
 class AbstractSurface(Module):
@@ -183,15 +187,18 @@ def _curved_surface(vertices: np.ndarray, points_on_surface: np.ndarray) -> Curv
     axes = np.stack([first_axis, np.cross(normal, first_axis)], axis=1)
     chart, height = (points_on_surface - origin) @ axes, (points_on_surface - origin) @ normal
     scale = np.ptp(chart, axis=0).max()
-    knot_indices = _farthest_points(chart, _MAX_KNOTS)
-    chart, height = chart[knot_indices], height[knot_indices]
-    distances = np.linalg.norm(chart[:, None] - chart, axis=-1) + 2 * scale * np.eye(len(chart))
-    first_index, second_index = np.unravel_index(distances.argmin(), distances.shape)
-    if distances.min() < 1e-3 * scale and abs(height[first_index] - height[second_index]) > 10 * distances.min():
+    knots = chart[_farthest_points(chart, _MAX_KNOTS, _SAME_PLACE * scale)]
+    distance, knot_index = KDTree(knots).query(chart)
+    is_at_knot = distance <= _SAME_PLACE * scale
+    knot_index, height_at_knot = knot_index[is_at_knot], height[is_at_knot]
+    # A place that was touched several times has the mean height.
+    knot_height = np.bincount(knot_index, height_at_knot) / np.bincount(knot_index)
+    if (np.abs(height_at_knot - knot_height[knot_index]) > _FOLD_HEIGHT * scale).any():
         raise ValueError(
             "positions: the surface folds over its best plane (two points lie above each other), which jeit cannot "
             "chart; calibrate its parts one by one."
         )
+    chart, height = knots, knot_height
     squared = np.sum((chart[:, None] - chart) ** 2, axis=-1)
     kernel = _thin_plate(squared)
     polynomial = np.column_stack([np.ones(len(chart)), chart])
@@ -203,12 +210,11 @@ def _curved_surface(vertices: np.ndarray, points_on_surface: np.ndarray) -> Curv
     return CurvedSurface(Polygon((vertices - origin) @ axes), *(as_array(array) for array in arrays))
 
 
-def _farthest_points(points: np.ndarray, max_points: int) -> np.ndarray:
-    """Indices of at most `max_points` of the `points` that are far from each other (farthest-point sampling)."""
-    if len(points) <= max_points:
-        return np.arange(len(points))
-    indices, distance = [0], np.full(len(points), np.inf)
-    while len(indices) < max_points:
-        distance = np.minimum(distance, np.linalg.norm(points - points[indices[-1]], axis=1))
+def _farthest_points(points: np.ndarray, max_points: int, min_distance: float) -> np.ndarray:
+    """Indices, in increasing order, of at most `max_points` of the `points` that are far from each other
+    (farthest-point sampling), and more than `min_distance` apart."""
+    indices, distance = [0], np.linalg.norm(points - points[0], axis=1)
+    while len(indices) < max_points and distance.max() > min_distance:
         indices.append(int(distance.argmax()))
-    return np.array(indices)
+        distance = np.minimum(distance, np.linalg.norm(points - points[indices[-1]], axis=1))
+    return np.sort(indices)

@@ -56,8 +56,8 @@ _CONTACT_DEVIATION, _MAX_FACTOR = 1.0, 100.0
 _INITIAL_LOGARITHMS, _LOGARITHMS_WIDTH = np.array([-0.3, -3.0, -3.0, -2.0]), 3.0
 # Eigenvalues below this share of the largest one belong to errors alone.
 _RANK_TOLERANCE = 1e-10
-# Maximum number of steps by which the change of the voltages is computed without the linear approximation, and shares of a step
-# that are tried until less of the difference remains: contact impedances may have changed by factors.
+# Maximum number of steps by which the change of the voltages is computed without the linear approximation, and shares
+# of a step that are tried until less of the difference remains: contact impedances may have changed by factors.
 _NUM_CORRECTIONS, _STEP_SHARES = 8, (1.0, 0.5, 0.25, 0.125)
 # Factor by which contact impedances have usually changed, above which a doubt states it.
 _MIN_STATED_FACTOR = 1.1

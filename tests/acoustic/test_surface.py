@@ -158,6 +158,19 @@ def test_many_points_are_thinned_out():
     assert np.linalg.norm(again - known, axis=1).max() < 5e-4
 
 
+def test_a_place_that_was_touched_twice_has_the_mean_height():
+    """Two taps at one place whose heights differ by 0.6 mm, and 1 µm apart, as positions measured by hand may be."""
+    rim, taps = cylinder(9)
+    plain = make_surface(rim, taps)
+    again = taps[4] + [1e-6, 0.0, 0.0]
+    along = np.array([0.0, 0.0, 6e-4])
+    twice = make_surface(rim, np.vstack([taps, again + along / 2, again - along / 2]))
+    once = np.asarray(plain.place(plain.project(np.asarray(taps.T)))).T
+    repeated = np.asarray(twice.place(twice.project(np.asarray(taps.T)))).T
+    assert len(twice.knots) == len(plain.knots)
+    np.testing.assert_allclose(repeated, once, atol=2e-5)
+
+
 def test_the_surface_does_not_depend_on_axes():
     """Rotated and translated with all its points, it is the same surface, at the same distance from the points off
     it.

@@ -54,9 +54,8 @@ class ImageReconstruction:
         """
         notes, conductivity, mask = [], 1.0, as_array(used)
         if reference is not None and np.abs(reference[used]).max() > 0:
-            polarity = np.sign(
-                np.where(used, model.voltages(1.0), 0.0) @ reference
-            )  # -1 where the polarity of a channel is reversed
+            # -1 if the polarity of the channels is reversed.
+            polarity = np.sign(np.where(used, model.voltages(1.0), 0.0) @ reference)
             calibration = calibrate(model, as_array(polarity * reference), mask=mask, contact="fixed")
             if np.isfinite(calibration.misfit):
                 model, conductivity = calibration.model, calibration.conductivity
