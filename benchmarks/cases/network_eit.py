@@ -46,7 +46,8 @@ def run(options: Options) -> Result:
     quick = options.quick
     nominal_skin = problem.park_skin()
     noise = detection_noise(nominal_skin)
-    judged_by = problem.JudgedSkins(skins=1 if quick else problem.SKINS, cell=4.5e-3 if quick else problem.CELL)
+    cell = 4.5e-3 if quick else problem.CELL
+    judged_by = problem.JudgedSkins(skins=1 if quick else problem.SKINS, cell=cell)
     touches, right = problem.grid_touches()
     if quick:
         touches, right = touches[::15], right[::15]
