@@ -239,7 +239,10 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
         )
         factor, common_share = _common_factor(change, mean, deviations)
         noise_share, noisy_electrode = (None, None) if error is None else _noise_in(change, mean, deviations, factor)
-        own_errors = {f"the reference '{reference.name}'": reference_error, "the frame": reciprocity_error(frame)}
+        errors_by_name = {
+            f"the reference '{reference.name}'": reference_error,
+            "the frame": reciprocity_error(frame),
+        }
         impossible_share = max(signs) if signs else None
         rounding = float(np.linalg.norm(rounding_of_difference(frame, mean))) / size if size > 0 else 0.0
         results.append(
@@ -261,7 +264,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
                     rounding,
                     impossible_share,
                     (error, evidence),
-                    own_errors,
+                    errors_by_name,
                     cosine,
                 ),
             )
@@ -345,12 +348,12 @@ def _rejection_reason(
     rounding: float,
     impossible_share: float | None,
     of_difference: tuple[float | None, float | None],
-    own_errors: dict[str, float | None],
+    errors_by_name: dict[str, float | None],
     cosine: float,
 ) -> str:
     """Reason why a frame cannot be imaged; empty if it can. `of_difference`: reciprocity error of the difference and
-    the evidence that it is not noise; `own_errors`: reciprocity errors of frame and reference by name; `cosine`: cosine
-    of the angle between frame and reference."""
+    the evidence that it is not noise; `errors_by_name`: reciprocity errors of frame and reference; `cosine`: cosine of
+    the angle between frame and reference."""
     if num_usable < num_electrodes:
         return (
             f"only {counted(num_usable, 'channel')} usable in both it and its reference, for {num_electrodes} "
@@ -377,7 +380,7 @@ def _rejection_reason(
         return (
             "its voltages have the opposite sign of its reference's: reverse the polarity of it, or of its reference."
         )
-    for name, error in own_errors.items():
+    for name, error in errors_by_name.items():
         if error is not None and error > MOST_RECIPROCITY_ERROR:
             return (
                 f"{name} breaks reciprocity by {percent(error)} on its own: it is too noisy, or its channels are in "

@@ -224,11 +224,12 @@ def change_and_noise(
     return as_array(departure), as_array(noise)
 
 
-def _unexplained_share(prepared: PreparedDifference, background: float, relative: np.ndarray, step: float) -> float:
-    """Share of the measured voltage difference that the model leaves unexplained: the modelled change of voltages for a
-    `step` along the image is divided by `step` and subtracted. Channels are divided by their noise."""
+def _unexplained_share(prepared: PreparedDifference, background: float, change: np.ndarray, step: float) -> float:
+    """Share of the measured voltage difference that the model leaves unexplained: what remains after the derivative of
+    the modelled voltages in the direction of the `change` is subtracted, with the derivative computed as a
+    difference quotient of width `step`. Channels are divided by their noise."""
     model, used = prepared.model, np.asarray(prepared.mask)
-    conductivity = background * np.maximum(1 + step * relative, _MIN_CONDUCTIVITY)
+    conductivity = background * np.maximum(1 + step * change, _MIN_CONDUCTIVITY)
     predicted = (np.asarray(model.voltages(conductivity)) - np.asarray(model.voltages(background))) / step
     noise, difference = np.asarray(prepared.relative_noise)[used], np.asarray(prepared.difference)[used]
     return float(np.linalg.norm((predicted[used] - difference) / noise) / np.linalg.norm(difference / noise))

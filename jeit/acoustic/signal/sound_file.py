@@ -44,7 +44,7 @@ def read_sound(path: Path) -> tuple[np.ndarray, float, float | None] | None:
 
 
 def _is_mp3(start: bytes) -> bool:
-    """Whether the bytes `start` begin an MPEG layer III (MP3) frame: eleven set bits, any version, and the layer."""
+    """Whether the bytes `start` begin an MP3 frame: eleven bits that are 1, any version, and layer III."""
     return len(start) > 1 and start[0] == 0xFF and start[1] & 0xE6 == 0xE2
 
 

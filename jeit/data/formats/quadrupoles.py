@@ -347,8 +347,8 @@ def _arrange_frames(
     values: Inexact[np.ndarray, " R"],
     like: Measurement | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, tuple[str, ...]]:
-    """Arrange the values of lines in frames. Returns the electrodes (channels, 4), voltages (frames, channels), times
-    of the frames, and notes. Voltages are NaN for channels that have no line in a frame."""
+    """Group the values of a file's lines into frames. Returns the electrodes (channels, 4), voltages (frames,
+    channels), times of the frames, and notes. Voltages are NaN for channels that have no line in a frame."""
     channels, channel_of_line = np.unique(electrodes, axis=0, return_inverse=True)
     channel_of_line, notes = channel_of_line.ravel(), ()
     frame_of_line, frame_notes = _frame_of_lines(path, table.column("frame"), channel_of_line, len(channels))

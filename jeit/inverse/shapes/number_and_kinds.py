@@ -81,7 +81,7 @@ def remove_unsupported(
 
 def _fit_without(problem: ShapeProblem, certain_cost: float, start: tuple[Bodies, Float[np.ndarray, " n"]]) -> Fit:
     """Fit the remaining bodies from their coefficients `start`. The fit ends early if its cost remains far above
-    `certain_cost`, at which the absent body is beyond doubt."""
+    `certain_cost`, above which the omitted body certainly exists."""
     first_fit = problem.fit(*start, _FIRST_REMOVAL_STEPS, 2 * COARSE_TOLERANCE)
     if first_fit.cost > _HOPELESS_RISE * certain_cost:
         return first_fit

@@ -200,7 +200,7 @@ class Stars(Bodies):
 
     @property
     def odds(self) -> float:
-        """Logarithm of the prior odds against the weak bodies among the stars."""
+        """Logarithm of the prior odds against those star-shaped bodies whose contrast is low."""
         return float(self.is_other_kind.sum() * np.log(self.prior.odds_against_weak))
 
     @property

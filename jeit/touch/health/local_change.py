@@ -107,8 +107,8 @@ def _halve_cells(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, is_l
     first_node, second_node, third_node = rotated_cells[~is_unchanged].T
     new_nodes, parents_of_halved = midpoint_nodes[rotated_edges[~is_unchanged]], parent[~is_unchanged]
     new_cells, new_parents = [rotated_cells[is_unchanged]], [parent[is_unchanged]]
-    halves = ((second_node, third_node, new_nodes[:, 1]), (third_node, first_node, new_nodes[:, 2]))
-    for corner, opposite, edge_midpoint in halves:
+    half_triangles = ((second_node, third_node, new_nodes[:, 1]), (third_node, first_node, new_nodes[:, 2]))
+    for corner, opposite, edge_midpoint in half_triangles:
         # Half of a cell is the triangle (corner, opposite, midpoint of the longest edge); its edge from corner to
         # opposite may be halved too.
         is_halved = edge_midpoint >= 0

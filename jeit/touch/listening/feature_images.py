@@ -68,8 +68,8 @@ class SoundImages:
     @property
     def normalised(self) -> "SoundImages":
         """The feature images with powers divided by the `loudness` of each window; silent windows are unchanged."""
-        divisor = np.where(self.loudness > 0, self.loudness, 1.0)[:, None, None]
-        return replace(self, intensity=self.intensity / divisor, spectrum=self.spectrum / divisor)
+        positive_loudness = np.where(self.loudness > 0, self.loudness, 1.0)[:, None, None]
+        return replace(self, intensity=self.intensity / positive_loudness, spectrum=self.spectrum / positive_loudness)
 
     @classmethod
     def concatenate(cls, blocks: "list[SoundImages]") -> "SoundImages":

@@ -235,7 +235,7 @@ class _EliminationTree:
         height = self.pivots + self.border
         panel_indices = (self.early - self.first[holder]) * height[holder] + self._local_indices(holder, self.late)
         panel_indices = panel_indices[self.entry_order]
-        entry_ends = np.searchsorted(holder[self.entry_order], np.arange(len(height) + 1)).tolist()
+        entry_offsets = np.searchsorted(holder[self.entry_order], np.arange(len(height) + 1)).tolist()
         is_parent_pivot = self.rows_in_parent < self.pivots[self.parent[self.border_front]]
         num_parent_pivots = np.bincount(self.border_front[is_parent_pivot], minlength=len(height)).tolist()
         num_subtree_rows = np.bincount(self.border_front[self.border_row < top], minlength=len(height)).tolist()
@@ -247,7 +247,7 @@ class _EliminationTree:
         fronts = []
         for number, (pivots, first) in enumerate(zip(self.pivots.tolist(), self.first.tolist(), strict=True)):
             rows = slice(starts[number], starts[number] + counts[number])
-            entries = slice(entry_ends[number], entry_ends[number + 1])
+            entries = slice(entry_offsets[number], entry_offsets[number + 1])
             front = Front(
                 pivots, counts[number], first, self.border_row[rows], entries, panel_indices[entries],
                 tuple(children[number]), self.rows_in_parent[rows], num_parent_pivots[number], num_subtree_rows[number]
