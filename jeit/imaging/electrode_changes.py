@@ -12,7 +12,9 @@ a part that breaks reciprocity, as noise does, and a part that does not, as erro
 deviations of all but c maximise the evidence p(d). Electrodes are taken to have changed if the evidence with t exceeds
 that without t by far, and if t displaces many electrodes and explains much of the difference. The change of the
 voltages is then computed from t without the linear approximation, and t is corrected for what the approximation missed.
-A single displaced electrode is not distinguished from a small body beside it, and stays in the image.
+
+If a few electrodes would be displaced, they are not distinguished from small bodies beside them. A single electrode is:
+its displacement, or the change of its contact, alone explains nearly all of the difference, and a body does not.
 
 Soleimani, Gómez-Laberge and Adler, Physiological Measurement 27 (2006) S103, on electrode movement in difference
 imaging; Gómez-Laberge and Adler, Physiological Measurement 29 (2008) S89.
@@ -46,6 +48,10 @@ from jeit_solvers.engines import as_array, on_host
 # only for bodies smaller than an electrode beside it, with a number of at most 2.7, and was 6 for patches along the
 # wall of a tank with 8 electrodes; in measured tanks it was 8 at most.
 _MIN_RISE, _MIN_RISE_PER_CHANNEL, _MAX_REST, _MIN_NUMBER = 30.0, 0.4, 0.95, 3.0
+# Maximum share of the difference that is left by a change of a single electrode, and maximum size of this change in
+# standard deviations. In simulated disks, displacements by 0.3 to 4° left 0.03 to 0.2 in the linear approximation, and
+# bodies 0.19 or more, also those smaller than the electrode beside them.
+_MAX_SINGLE_REST, _MAX_SINGLE_CHANGE = 0.15, 3.0
 # A change is looked for if the electrodes alone, at plausible displacements, explain this share of the difference where
 # errors are `_ASSUMED_ERROR` of it. The share was 0.1 to 0.7 at rest, and 0.87 to 1 after movements by 0.3° or more.
 _MIN_SUSPICIOUS_SHARE, _ASSUMED_ERROR = 0.6, 0.3
@@ -92,12 +98,22 @@ class ElectrodeChange(NamedTuple):
             else f", and contact impedances had changed by a factor of about {usual_factor:.2g} (of electrode "
             f"{contact + 1}, {self.contact_factor[contact]:.2g})"
         )
+        if np.count_nonzero(distances) + np.count_nonzero(logarithm) > 1:
+            change = (
+                f"electrodes had moved since the reference, by about {np.sqrt(np.mean(distances**2)):.2g} mm (root "
+                f"mean square; electrode {largest + 1} by about {distances[largest]:.2g} mm){contacts}, or as if a "
+                "layer along the wall had changed"
+            )
+        elif distances.any():
+            change = f"electrode {largest + 1} had moved by about {distances[largest]:.2g} mm since the reference"
+        else:
+            change = (
+                f"the contact impedance of electrode {contact + 1} had changed by a factor of about "
+                f"{self.contact_factor[contact]:.2g} since the reference"
+            )
         return (
-            "the voltages have changed as if electrodes had moved since the reference, by about "
-            f"{np.sqrt(np.mean(distances**2)):.2g} mm (root mean square; electrode {largest + 1} by about "
-            f"{distances[largest]:.2g} mm){contacts}, or as if a layer along the wall had changed. The image shows the "
-            f"rest of the difference, {percent(self.rest)} of it (as_is=True, --as-is: all of it). Measure a new "
-            "reference."
+            f"the voltages have changed as if {change}. The image shows the rest of the difference, "
+            f"{percent(self.rest)} of it (as_is=True, --as-is: all of it). Measure a new reference."
         )
 
 
@@ -147,7 +163,7 @@ class ElectrodeChanges:
         if estimator is None:
             return None
         coefficients, change = np.zeros(len(estimator)), np.zeros(len(difference))
-        rest = 1.0
+        rest, max_rest = 1.0, _max_rest(estimator)
         for _ in range(_NUM_CORRECTIONS):
             step = estimator @ (difference - change + self._patterns @ coefficients) - coefficients
             for share in _STEP_SHARES:
@@ -161,7 +177,7 @@ class ElectrodeChanges:
                     break
             else:
                 break
-        if rest >= _MAX_REST:
+        if rest >= max_rest:
             return None
         contact_factor = np.exp(self._log_contact(coefficients))
         return ElectrodeChange(self._shift(coefficients), contact_factor, change, rest)
@@ -173,13 +189,13 @@ class ElectrodeChanges:
         `estimator`; zero for differences (N, M) of which they explain little. All are in volts."""
         coefficients = differences @ estimator.T
         changes = coefficients @ self._patterns.T
-        is_large = self._size(differences - changes) < _MAX_REST * self._size(differences)
+        is_large = self._size(differences - changes) < _max_rest(estimator) * self._size(differences)
         # If n electrodes are displaced equally, the square of the sum of squares is n times the sum of fourth powers.
         squares = (coefficients**2)[:, : self._num_shifts]
         num_electrodes = self.model.electrodes.num_electrodes
         square = squares.reshape(len(squares), num_electrodes, -1).sum(axis=2)
         effective_number = square.sum(axis=1) ** 2 / np.maximum((square**2).sum(axis=1), np.finfo(float).tiny)
-        is_spread = effective_number > min(_MIN_NUMBER, num_electrodes / 4)
+        is_spread = _is_single(estimator) | (effective_number > min(_MIN_NUMBER, num_electrodes / 4))
         is_change = self.are_suspicious(differences) & is_large & is_spread
         return np.where(is_change[:, None], changes, 0.0)
 
@@ -193,14 +209,30 @@ class ElectrodeChanges:
     def estimator(self, difference: Float[np.ndarray, " M"]) -> Float[np.ndarray, "p M"] | None:
         """Matrix (p, M) that estimates changes of the electrodes, in units of their standard deviations, from a
         difference in volts. Its standard deviations are those that best explain the `difference` (M,). None if the
-        evidence is not for changes of the electrodes, or if they explain little of the difference."""
+        evidence is not for changes of the electrodes, or if they explain little of the difference. Of a single
+        electrode, a matrix with one row that is not zero."""
         if not self.are_suspicious(difference[None])[0]:
             return None
         noise, mask = as_array(self._noise), as_array(self.mask)
         linearisation = Linearisation.create(self.model, self.background, prior=self.prior, noise=noise, mask=mask)
         estimator = _WhitenedProblem(linearisation, difference, self._patterns, self._reference).estimator()
         if estimator is None or not self.voltages(difference[None], estimator).any():
+            return self._single_estimator(difference)
+        return estimator
+
+    def _single_estimator(self, difference: Float[np.ndarray, " M"]) -> Float[np.ndarray, "p M"] | None:
+        """As `estimator`, for a change of the one electrode that explains most of the difference (M,); None if even
+        this leaves too much, or if the change would be implausibly large."""
+        rows, weighted = self._without_common_factor(self._patterns.T), self._without_common_factor(difference[None])[0]
+        squares, products = np.sum(rows**2, axis=1), rows @ weighted
+        explained = products**2 / np.maximum(squares, np.finfo(float).tiny)
+        best = int(np.argmax(explained))
+        # The linear approximation leaves up to twice as much as the displaced electrode itself.
+        is_enough = weighted @ weighted - explained[best] < (2 * _MAX_SINGLE_REST) ** 2 * (weighted @ weighted)
+        if not is_enough or abs(products[best]) > _MAX_SINGLE_CHANGE * squares[best]:
             return None
+        estimator = np.zeros_like(rows)
+        estimator[best] = rows[best] * self._weights / squares[best]
         return estimator
 
     def are_suspicious(self, differences: Float[np.ndarray, "N M"]) -> Bool[np.ndarray, " N"]:
@@ -324,6 +356,16 @@ def _voltages_and_derivatives(
     changes = changes[: len(changes) - electrodes.num_electrodes + _num_contacts(model)]
     voltages, *derivatives = (np.asarray(select_channels(protocol, change)) for change in (impedance, *changes))
     return voltages, np.stack(derivatives, axis=1)
+
+
+def _is_single(estimator: Float[np.ndarray, "p M"]) -> bool:
+    """Whether an estimator is that of the change of a single electrode."""
+    return np.count_nonzero(estimator.any(axis=1)) == 1
+
+
+def _max_rest(estimator: Float[np.ndarray, "p M"]) -> float:
+    """Maximum share of a difference that may be left, or the difference is not due to changes of electrodes."""
+    return _MAX_SINGLE_REST if _is_single(estimator) else _MAX_REST
 
 
 def _num_contacts(model: ForwardModel) -> int:
