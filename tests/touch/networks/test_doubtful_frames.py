@@ -54,7 +54,15 @@ def test_frames_that_no_touch_produces(imaging, change):
 
     assert doubted(np.concatenate([change, 0 * change])) == ["", ""]
     assert "not that of a touch" in doubted(-change)[0]
-    assert all(doubted(40 * change))
+    deep = float(network.share(40 * change).max()) * 10
+    assert doubted(40 * change)[0].startswith(f"{deep:.3g} mm deep, and the skin is 10 mm thick")
+    # A map that is indented more than it bulges is not one of a skin pushed outwards.
+    share = np.zeros((2, *network.share(change).shape[1:]))
+    share[0, 2, 3], share[0, 5, 5] = 0.4, -0.3
+    share[1] = -share[0]
+    indented, pushed = network.doubts(np.concatenate([-change, -change]), share)
+    assert indented == ""
+    assert "a skin pushed outwards" in pushed
     with pytest.raises(ValueError, match="times those of the reference; are units the same"):
         network.depth(1e3 * np.ones(94), np.ones(94))
 

@@ -93,7 +93,7 @@ def test_sizes_in_millimetres_are_noticed(make):
     [
         (lambda: DiscIndenter(0.0), "diameter must be a positive length"),
         (lambda: RingIndenter(0.01, 0.02), "inner_diameter is 20 mm, more than the outer"),
-        (lambda: RingIndenter(0.01, 0.01), "nothing is left"),
+        (lambda: RingIndenter(0.01, 0.01), "the outer one, 10 mm: nothing is left"),
         (lambda: BarIndenter(0.01, np.nan), "width must be"),
         (lambda: PrismIndenter(0.01, 0.01, -1.0), "height must be"),
         (lambda: RevolvedIndenter(0.01), "indentation must be"),

@@ -252,7 +252,9 @@ def test_an_untouched_skin_drifts_over_time(model):
 def test_a_half_space_is_not_pressed_at_its_edge(model):
     """Its contact area would be cut off at the edge, and the rest scaled up to carry all of the load."""
     skin = PressedSkin(KEY, model, dataclasses.replace(STILL, support=HalfSpace(3e5, pixels=24)))
-    with pytest.raises(ValueError, match="of its pressure would lie on the skin"):
+    with pytest.raises(
+        ValueError, match=r"half-space, (19|20) % of its pressure would lie on the skin, less than 20 %"
+    ):
         skin.touched([Press(ball_indenter(0.02), 2.0, (0.052, 0.0))])
     skin.touched(
         [

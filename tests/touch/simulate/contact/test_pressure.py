@@ -157,8 +157,11 @@ def test_bodies_do_not_overlap(shape):
         (lambda: LAYER.pressure(ball_indenter(0.01), 0.0), "load must be positive, in newtons"),
         (lambda: RUBBER.pressure(ball_indenter(0.01), np.nan), "load must be positive"),
         (lambda: LAYER.pressure(DiscIndenter(0.01), 100.0), "presses the indenter 3.8. mm into a layer 3 mm thick"),
-        (lambda: LAYER.pressure(BarIndenter(0.04, 1e-5), 1.0), "thinner than a pixel"),
-        (lambda: RUBBER.pressure(PlacedIndenter(DiscIndenter(1e-5), (0.02, 0.0)), 1.0), "thinner than a pixel"),
+        (lambda: LAYER.pressure(BarIndenter(0.04, 1e-5), 1.0), r"thinner than a pixel, 0\.42 mm"),
+        (
+            lambda: RUBBER.pressure(PlacedIndenter(DiscIndenter(1e-5), (0.02, 0.0)), 1.0),
+            r"thinner than a pixel, 0\.6. mm",
+        ),
         (lambda: Foundation(-1.0, 1e-3), "modulus must be positive"),
         (lambda: Foundation(1e6, 0.0), "thickness must be"),
         (lambda: HalfSpace(1e6, 0.6), "poisson must be"),

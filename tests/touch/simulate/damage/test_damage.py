@@ -79,7 +79,7 @@ def test_cuts_are_inside_and_have_the_given_length():
         cut = draw_cut(jax.random.key(number), outline, margin=0.004)
         assert 0.02 <= cut.length <= 0.06
         assert np.abs(cut.along(1e-3)).max() < 0.096
-    with pytest.raises(ValueError, match="no cut of"):
+    with pytest.raises(ValueError, match=r"no cut of 5\d\.\d mm"):
         draw_cut(jax.random.key(0), Disk(0.01), length=(0.05, 0.06))
 
 
