@@ -1,6 +1,7 @@
 """Left-out taps: they choose the decay model, and the factor by which covariances are widened."""
 
 import functools
+from types import SimpleNamespace
 
 import equinox as eqx
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from microphone_arrays import MICROPHONES, OUTLINE, listen, models
 
 from jeit.acoustic import Calibration, Intensities, Taps, calibrate_microphones, locate
-from jeit.acoustic.calibration.calibrate import fit_each_decay, select_fit
+from jeit.acoustic.calibration.calibrate import CalibrationFit, fit_each_decay, select_fit
 from jeit.acoustic.calibration.usable_microphones import LeftOutTaps, _assign_folds
 from jeit.acoustic.decay import DECAYS
 from jeit.layout import grid
@@ -68,6 +69,14 @@ def test_the_simpler_of_two_equally_good_laws_is_chosen():
         lambda f: f.left_out, fits["inverse-square"], (("inverse-square", 1.06e-3),)
     )
     assert select_fit(errors_of_fits, {}).calibration.microphone_array.decay.name == "attenuated"
+
+
+def test_errors_of_fits_are_stated_in_millimetres_and_percent():
+    errors = (("inverse-square", 0.0123), ("exponential", 0.02), ("attenuated", np.inf))
+    fit = SimpleNamespace(error=0.304, left_out=errors)
+    expected = "locates taps left out of the fit to 12.3 mm, median (exponential 20.0 mm, attenuated refused)"
+    assert CalibrationFit.evidence.fget(fit) == expected
+    assert CalibrationFit.note.fget(fit).startswith("the models miss the recorded levels by 30 %")
 
 
 def test_taps_in_another_order_are_refused():

@@ -1,5 +1,7 @@
 """Microphones that are not at their given positions, and gains that changed after the calibration."""
 
+import re
+
 import numpy as np
 import pytest
 from microphone_arrays import OUTLINE, array, inside, listen, localise, models, received_power
@@ -65,6 +67,10 @@ def test_displacements_are_bounded():
     off[5] = 0.02, 0.02
     fit = calibrated(off)
     assert not fit.calibration.usable[5]
+    own, median = map(float, re.findall(r"(\d+) %", fit.calibration.reasons[5]))
+    relative = np.delete(fit.calibration.microphone_array.noise.relative, 5)
+    assert 2 * median < own < 60
+    assert median == pytest.approx(100 * np.median(relative), abs=3)
     assert np.delete(fit.calibration.usable, 5).all()
     assert np.abs(fit.displacement).max() <= 4 * 2e-3 * (1 + 1e-9)
 
@@ -81,7 +87,12 @@ def test_changed_gains_are_estimated(seed):
     assert (found.status != "two touches").all()
     assert np.median(error) < 0.6 * np.median(before)
     assert error.max() < 0.01
-    assert [note.startswith("gains have changed") for note in found.notes] == [True]
+    (note,) = found.notes
+    assert note.startswith("gains have changed")
+    number, change = re.search(r"most that of microphone (\d+), by (\S+) % of its intensity", note).groups()
+    gain = drawn_gains(seed)[int(number)]
+    assert gain == pytest.approx(1 + float(change) / 100, abs=0.04)
+    assert abs(np.log(gain)) > np.abs(np.log(drawn_gains(seed))).max() - 0.04
 
 
 def test_strongly_changed_gains():

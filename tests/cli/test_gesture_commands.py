@@ -70,6 +70,7 @@ def test_contacts_of_a_recording_are_tracked_without_learning(files, run, tmp_pa
     assert (status, error) == (0, "")
     assert "3 touches" in output
     report = json.loads((tmp_path / "report.json").read_text("utf-8"), parse_constant=pytest.fail)
+    assert "with less than 40 % of the strongest change of the frame" in report["notes"][0]
     np.testing.assert_allclose([touch["onset"] for touch in report["touches"]], stream.onset[:3], atol=0.2)
     np.testing.assert_allclose([touch["offset"] for touch in report["touches"]], stream.offset[:3], atol=0.2)
     assert [touch["path_length"] > 0.05 for touch in report["touches"]] == [False, False, True]

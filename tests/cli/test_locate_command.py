@@ -108,6 +108,14 @@ def test_the_printed_table_gives_the_parameters_of_each_microphone_with_their_un
     decay = calibration.microphone_array.decay
     np.testing.assert_allclose(table[:, [1, 3]], np.stack([decay.a, 1e6 * decay.b], axis=1), rtol=6e-3)
     np.testing.assert_allclose(table[:, [2, 4]], 100 * calibration.standard_errors.T, atol=0.06)
+    summary = " ".join((folder / "cal.txt").read_text("utf-8").split())
+    (model_error,), (location_error,) = (
+        re.findall(pattern, summary) for pattern in (r"error of the model (\S+) %", r"error of location ± (\S+) mm")
+    )
+    relative = calibration.microphone_array.noise.relative
+    assert float(model_error) == pytest.approx(100 * np.median(relative), abs=0.06)
+    assert float(location_error) < 0.2
+    assert "locates taps left out of the fit to 0.0 mm, median (" in summary
     # A calibration with an exponential, an unknown standard error, and a microphone that is not usable.
     array = SimpleNamespace(
         decay=Exponential(np.array([0.5, 2.0]), np.array([0.03, 0.04])),

@@ -181,6 +181,7 @@ def test_contacts_and_paths_equal_those_of_the_batch(model, calibration, imager,
     for picture, contacts in zip(pictures, found, strict=True):
         assert [(one.x, one.y) for one in picture.markers] == [tuple(one.centroid) for one in contacts]
         assert [one.radius for one in picture.markers] == [one.deviation for one in contacts]
+        assert [one.label for one in picture.markers] == [f"{100 * one.peak:+.0f} %" for one in contacts]
     paths = track_contacts(np.arange(len(given)) / 60, found)
     numbers = [one.track for picture in pictures for one in picture.markers]
     assert sorted(set(numbers)) == [path.number for path in paths] == [0, 1]

@@ -3,6 +3,7 @@ frames.
 """
 
 import tomllib
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -17,7 +18,7 @@ from jeit.design import Skin
 from jeit.layout import named_layout
 from jeit.live import LiveFrame
 from jeit.live.views.contacts import GestureView
-from jeit.live.views.learnt import DepthView, LearntSkinView
+from jeit.live.views.learnt import DepthView, LearntSkinView, _key_text, _label_text
 from jeit.mesh import Rectangle
 from jeit.touch import LearntSkin, Presses, TouchImages, TouchWatch, learn_gestures
 from jeit.touch.networks import ImageNetwork, stream_depths
@@ -113,6 +114,11 @@ def test_labels_and_keys_are_events_once_they_last():
         view.set_reference(frames[:3])
 
 
+def test_probabilities_are_percentages_and_keys_are_numbered_from_one():
+    touches = SimpleNamespace(label=["palm"], probability=[0.125], touched=np.array([[True, False, True]]))
+    assert (_label_text(touches), _key_text(touches)) == ("palm 12 %", "keys 1, 3")
+
+
 def test_a_skin_learnt_by_sessions_is_refused():
     given = record(60)
     learnt = LearntSkin.fit(Presses.create(**given, group=np.arange(60) // 20), method="neighbours", per_session=True)
@@ -149,6 +155,7 @@ def test_depths_equal_those_of_the_stream(network):
     given = [*frames, frames[1][:-1], np.where(np.arange(len(rest)) == 3, np.nan, frames[2]), 200 * frames[1]]
     view = DepthView(imaging, rest[None])
     made = [view.picture(LiveFrame(0, 0.0, 0.0, one)) for one in given]
+    assert view.scene.notes == (f"Depths below {1e3 * imaging.floor:.2g} mm are noise.",)
     for picture, one in zip(made, stream_depths(imaging, given, rest), strict=True):
         assert (picture.status == "refused", picture.reason) == (one.depth is None, one.reason)
         if one.depth is None:
@@ -159,6 +166,7 @@ def test_depths_equal_those_of_the_stream(network):
         if deep:
             middle = depth_centroids(one.depth[None], pixel_places(imaging.extent, imaging.shape))[0]
             np.testing.assert_allclose((picture.markers[0].x, picture.markers[0].y), middle)
+            assert picture.markers[0].label == f"{1e3 * one.depth.max():.2f} mm"
     assert [one.status for one in made] == ["unchanged", "imaged", "imaged", "refused", "imaged", "refused"]
     assert np.linalg.norm(np.array((made[2].markers[0].x, made[2].markers[0].y)) - [0.02, 0.03]) < 0.01
     assert view.picture(LiveFrame(0, 0.0, 0.0, "text")).status == "refused"
@@ -209,5 +217,9 @@ def test_gestures_continue_after_faulty_frames_and_a_new_reference(gestures):
     begin, end = (round(one * RATE) for one in (stream.onset[1] - 0.3, stream.offset[1] + 0.5))
     later = pictures(view, stream.voltages[begin:end], stream.seconds[begin:end])
     assert sum(len(one.events) for one in later) == 1
+    course = SimpleNamespace(centroid=np.array([[0.0, 0.0], [0.012, -0.034]]), peak=np.array([1.0, 2.0]))
+    touch = SimpleNamespace(course=course, onset=1.0, offset=1.5)
+    named = SimpleNamespace(number=1, touch=touch, unlike=False, gesture="push", probability=0.8)
+    assert view._classified_sentence(named) == "push 80 % at (+12, -34) mm, 0.50 s long"
     with pytest.raises(ValueError, match="reference"):
         view.set_reference(-stream.voltages[:30])

@@ -117,8 +117,10 @@ def test_frames_that_were_sent_before_the_program_could_read_count_into_the_refe
 
 
 def test_lines_that_have_all_arrived_are_the_reference_as_far_as_a_second_reads_them():
-    still, following = first_frames(Scheduled([*np.linspace(0, 1e-3, 16), 2.0, 2.1]), 1.0)
+    source = Scheduled([*np.linspace(0, 1e-3, 16), 2.0, 2.1])
+    still, following = first_frames(source, 1.0)
     assert (len(still), [frame.number for frame in following]) == (16, [16, 17])
+    assert "The sensor changed by 80 % in the first 1 s" in source.messages[-1][1]
 
 
 @posix

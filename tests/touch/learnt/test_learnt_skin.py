@@ -260,7 +260,11 @@ def test_keys_pressed_in_sequence(group):
     rng = np.random.default_rng(0)
     touched = np.repeat(np.eye(3, dtype=bool), 16, axis=0)
     frames = touched @ rng.normal(size=(3, 12)) + 0.1 * rng.normal(size=(48, 12))
-    skin = LearntSkin.fit(Presses.create(frames, touched=touched, group=group))
+    reports = []
+    skin = LearntSkin.fit(Presses.create(frames, touched=touched, group=group), progress=reports.append)
+    folds = 5 if group is None else 3  # finished in any order
+    expected = ["channels", *(f"keys, fold {one} of {folds}" for one in range(1, folds + 1))]
+    assert sorted(reports) == sorted([*expected, "key 1 of 3", "key 2 of 3", "key 3 of 3"])
     wrong = np.mean(skin.standing["keys"].held_out != touched)
     assert wrong < 0.01 if group is None else wrong >= 0.2
     assert group is not None or np.array_equal(skin.predict(frames).touched, touched)
