@@ -56,7 +56,7 @@ def test_a_peak_is_printed_as_a_change_and_relative_to_the_background():
     lines = printed(BODIES, background=0.05)
     assert lines[0][-4:] == ["peak", "change", "of", "back-"]
     assert lines[1][-3:] == ["/", "mS/m", "ground"]
-    assert [line[-3:] for line in lines[2:]] == [["200", "400", "%"], ["-4", "-8", "%"]]
+    assert [line[-4:] for line in lines[2:]] == [["20.00", "200", "400", "%"], ["10.00", "-4", "-8", "%"]]
 
 
 def body_with_intervals(kind, **more):

@@ -23,7 +23,9 @@ from jeit.acoustic import (
 )
 from jeit.acoustic.calibration.calibration import calibrated_intensities
 from jeit.acoustic.commands.calibrate_microphones import _parameter_table
+from jeit.acoustic.commands.locate import _table_rows
 from jeit.acoustic.decay import Exponential
+from jeit.acoustic.localisation.locations import LocationStatus
 from jeit.acoustic.reports import write_calibration, write_track
 from jeit.cli import main
 from jeit.layout import grid
@@ -194,6 +196,23 @@ def test_locate_from_intensities(folder, tmp_path, capsys):
     ((error, length),) = re.findall(r"→ \S+ \S+ → \S+ (\S+) (\S+) 25 touch", printed)
     assert 0 <= float(error) <= 0.05 + 1e3 * max(float(row["std_x_m"]) + float(row["std_y_m"]) for row in table[:25])
     assert float(length) == pytest.approx(1e3 * np.linalg.norm(np.diff(path[:25], axis=0), axis=1).sum(), rel=0.03)
+
+
+def test_the_second_of_two_touches_has_its_own_line():
+    """It is the touch farther from the track, in whichever order the two were found."""
+    near, far = np.array([[10.0, 20, 0], [12, 20, 0]]) / 1e3, np.array([[-30.0, 5, 0], [-30, 7, 0]]) / 1e3
+    locations = SimpleNamespace(
+        times=[0.5, 0.75],
+        status=np.array(2 * [LocationStatus.TWO_TOUCHES]),
+        position=np.stack([near[0], far[1]]),
+        second=np.stack([far[0], near[1]]),
+    )
+    touch = SimpleNamespace(first=0, last=1, onset=0.5, offset=0.75, length=0.002)
+    track = SimpleNamespace(touches=[touch], position=near, covariance=np.tile(4e-6 * np.eye(2), (2, 1, 1)))
+    assert list(_table_rows(SimpleNamespace(locations=locations, track=track))) == [
+        ("1", "0.500", "0.750", "11.0", "20.0", "2.0", "2", "2 two touches"),
+        ("1, other", "0.500", "0.750", "-30.0", "6.0", "", "", "2 two touches"),
+    ]
 
 
 @pytest.mark.parametrize("name", ["touch.npz", "touch.wav"])

@@ -54,6 +54,7 @@ def test_position_error_is_positive_for_images_too_near_to_the_centre():
     inwards, outwards = merit(disc(0.03, 0.04), (0.036, 0.048)), merit(disc(0.03, 0.04), (0.024, 0.032))
     assert float(inwards.position_error) == pytest.approx(0.01, abs=0.1 * PIXEL)
     assert float(outwards.position_error) == pytest.approx(-0.01, abs=0.1 * PIXEL)
+    assert f"position error {1e3 * float(inwards.position_error):.3g} mm," in repr(inwards)
     around = merit(disc(0.03, 0.04), (0.05, 0.0))
     assert float(around.position_error) == pytest.approx(0, abs=0.1 * PIXEL)
 

@@ -70,6 +70,10 @@ def test_note_on_the_misfit_depends_on_the_body(model):
     assert "deeper than a sheet" in sheet
     assert "misses 20 % of the reference: size of the body, how high it is filled, places and sizes of" in solid
     assert "sheet" not in solid
+    moved = eqx.tree_at(
+        lambda found: found.shift, found, jnp.array([[0.003], [0.004]]), is_leaf=lambda one: one is None
+    )
+    assert "up to 4 mm from where they are described (root mean square 3.5 mm)" in moved.note
 
 
 def test_every_impedance_is_recovered_separately(model):

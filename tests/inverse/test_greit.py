@@ -219,7 +219,7 @@ def test_default_radius_suits_other_numbers_of_electrodes():
         ({"conductivity": 1 + 1j}, "complex"),
         ({"conductivity": "nodes"}, "one value per cell"),
         ({"target_radius": 1e-4}, "fractions of the body's radius"),
-        ({"radius": 0.015, "target_radius": 0.01, "num_targets": 50}, "lost between the cells"),
+        ({"radius": 0.015, "target_radius": 0.01, "num_targets": 50}, "1.5 mm radius is lost between the cells"),
     ],
 )
 def test_bad_input(model, changed, message):

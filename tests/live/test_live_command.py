@@ -25,7 +25,7 @@ import jeit.live
 from jeit.cli import main
 from jeit.data import load_description, write_table
 from jeit.imaging.stream_preparation import StreamSettings
-from jeit.live.commands.live import _has_display
+from jeit.live.commands.live import _has_display, _print_counters
 from jeit.touch import LearntSkin, Presses, learn_gestures, write_skin
 
 
@@ -261,6 +261,15 @@ def test_a_browser_opens_where_there_is_a_display(monkeypatch, served, run, file
     _, output, _ = run(*given)
     assert ("open it in a browser" in output) != shown
     assert opened == ["http://127.0.0.1:1/"] * shown
+
+
+def test_latencies_are_printed_in_milliseconds():
+    lines = []
+    console = SimpleNamespace(print=lambda line, **options: lines.append(line.strip()))
+    counts = {"read": 5, "imaged": 3, "dropped": 0, "refused": 2, "statuses": {"partial": 1}, "reasons": {"short": 2}}
+    _print_counters(console, {**counts, "latency_median": 0.0123, "latency_99": 0.25})
+    latencies = "latency to the picture: median 12.3 ms, 99 % within 250.0 ms"
+    assert lines == ["5 frames: 3 imaged, 2 refused", latencies, "1 partial", "2 × short"]
 
 
 def test_a_port_in_use_is_named(run, files):

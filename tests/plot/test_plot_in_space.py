@@ -319,6 +319,7 @@ def test_the_overview_cuts_through_the_strongest_change(tank, image, patches):
     assert [line.get_marker() for line in space.lines if line.get_marker() in ("+", "_")] == ["_", "+"]
     (words,) = [text.get_text() for one in figure.axes for text in one.texts if "found" in text.get_text()]
     assert "100 cm³ at (−30, 60, 60) ±2.3 mm" in words
+    assert "surfaces at 50 % of the strongest change" in words
 
 
 def test_a_constant_image_is_drawn(tank):

@@ -1,6 +1,8 @@
 """Gesture models: selected on held-out people, applied, saved in files, and tested on touches that are no gesture."""
 
+import dataclasses
 import zipfile
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from jeit.touch.gestures.gesture_classifiers import (
     random_folds,
 )
 from jeit.touch.gestures.logit_boost import LogitBoostClassifier
+from jeit.touch.reports.touch_watch import draw_gestures
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +62,10 @@ def test_the_best_method_on_held_out_people_is_selected():
     assert model.standing.method == f"{model.method} on {model.form}" == model.standing.tried[0][0]
     assert np.mean(model.standing.held_out != model.standing.right) == errors[0]
     assert model.notes == ()
+    wrong = np.where(np.arange(len(labels)) % 4 == 0, "none", model.standing.right)
+    drawn = dataclasses.replace(model, standing=dataclasses.replace(model.standing, held_out=wrong))
+    title = draw_gestures(SimpleNamespace(model=drawn)).axes[0].get_title()
+    assert title == f"Gestures: {100 * np.mean(wrong != 'none'):.1f} % right of touches held out"
 
 
 def test_data_of_one_person_are_reported_as_such():
