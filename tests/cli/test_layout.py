@@ -47,7 +47,10 @@ def test_a_layout_and_its_file_give_the_same_result(run, tmp_path):
     """Files hold millimetres with nine digits; this rounding causes no blind spot."""
     write_layout(named_layout("grid-3x2", Rectangle(0.06, 0.05)), tmp_path / "file.csv")
     options = ["--width-mm", 60, "--height-mm", 50, "--output", tmp_path / "out", *OPTIONS]
-    assert run("layout", "compare", "grid-3x2", tmp_path / "file.csv", *options)[0] == 0
+    status, output, _ = run("layout", "compare", "grid-3x2", tmp_path / "file.csv", *options)
+    assert status == 0
+    assert "a layer 10 mm thick; two-terminal measurements: 6 and 6" in output
+    assert "touched at 6 × 6 places, 5 mm or more from the edge" in output
     report = json.loads((tmp_path / "out" / "report.json").read_text("utf-8"))
     assert [one["blind_spot_fraction"] for one in report["layouts"]] == [0, 0]
 

@@ -83,7 +83,10 @@ def test_bad_input_is_refused(tmp_path):
         (["--conductivity", "nan"], "--conductivity must be from"),
         (["--contact-impedance", -1], "--contact-impedance must be positive"),
         (["--minimum-spacing-mm", -3], "--minimum-spacing-mm must not be negative; it is -3"),
-        (["--minimum-spacing-mm", 300], "--minimum-spacing-mm: 32 electrodes 300 mm apart"),
+        (
+            ["--minimum-spacing-mm", 300],
+            "--minimum-spacing-mm: 32 electrodes 300 mm apart do not fit the outline, 200 × 200 mm;",
+        ),
         (["--steps", 0], "--steps must be at least 1"),
         (["--starts", 0], "--starts must be at least 1"),
         (["--num-points", 0], "--num-points must be from 4 to 250000"),
@@ -94,7 +97,10 @@ def test_bad_input_is_refused(tmp_path):
         (["--keep-out", "0,0,nan"], "give a disc x,y,radius or a rectangle"),
         (["--keep-out", "0,0,-3"], "0,0,-3 has no size"),
         (["--keep-out", "5,0,5,9"], "5,0,5,9 has no size"),
-        (["--keep-out", "0,0,5", "--keep-out", "500,0,10"], "500,0,10 lies off the skin, which spans -100 to 100 mm"),
+        (
+            ["--keep-out", "0,0,5", "--keep-out", "500,0,10"],
+            "500,0,10 lies off the skin, which spans -100 to 100 mm by -100 to 100 mm.",
+        ),
     ],
 )
 def test_error_messages_name_the_options(options, message, tmp_path):

@@ -49,7 +49,7 @@ def test_places_are_spread_by_distance_along_the_surface():
     assert apart.min() > 0.65 * pitch
     assert ways.surface.distance_to_border(places).min() >= 0.0099
     np.testing.assert_array_equal(places, spread(mesh, 20, margin=0.01))
-    with pytest.raises(ValueError, match="leaves no room"):
+    with pytest.raises(ValueError, match="margin: 150 mm leaves no room"):
         spread(mesh, 20, margin=0.15)
 
 
@@ -330,9 +330,17 @@ def test_a_touch_across_the_seam_is_one_touch():
 @pytest.mark.parametrize(
     ("match", "centres", "diameter"),
     [
-        ("off the surface, farther than its radius", [[0.05, 0, 0.05]], 6e-3),
-        ("lies on the surface's edge", [[0.03, 0, 0.0005]], 6e-3),
-        ("overlap by", [[0.03, 0, 0.05], [0.03, 0, 0.053]], 6e-3),
+        (
+            r"electrode 1, 6 mm across at \(50, 0, 50\) mm, is 20\.\d mm off the surface, farther than its radius",
+            [[0.05, 0, 0.05]],
+            6e-3,
+        ),
+        (
+            r"electrode 1, 6 mm across at \(30, 0, 0\.5\) mm, lies on the surface's edge, 0\.5 mm from it",
+            [[0.03, 0, 0.0005]],
+            6e-3,
+        ),
+        (r"electrode 1 \('1'\) and electrode 2 \('2'\) overlap by 3 mm", [[0.03, 0, 0.05], [0.03, 0, 0.053]], 6e-3),
         ("larger than the surface's radius of curvature", [[0.03, 0, 0.05]], 8e-2),
     ],
 )
