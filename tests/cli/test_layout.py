@@ -53,6 +53,8 @@ def test_a_layout_and_its_file_give_the_same_result(run, tmp_path):
     assert "touched at 6 × 6 places, 5 mm or more from the edge" in output
     report = json.loads((tmp_path / "out" / "report.json").read_text("utf-8"))
     assert [one["blind_spot_fraction"] for one in report["layouts"]] == [0, 0]
+    lengths = [report["options"][name] for name in ("thickness_mm", "margin_mm", "cell_mm")]
+    assert lengths == pytest.approx([10, 5, 6])
 
 
 def test_the_second_layout_is_checked_before_the_first_is_simulated(layouts, run, tmp_path, monkeypatch):

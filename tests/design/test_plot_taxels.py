@@ -157,6 +157,7 @@ def test_the_line_in_histograms_of_sensitivity_has_a_label(ax):
     }
     plot_sensitivity_histograms(maps, ax=ax)
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["a", "b", "least of a"]
+    np.testing.assert_allclose(ax.lines[0].get_xdata(), 1.0)  # mV
     assert not ax.spines["top"].get_visible()
 
 

@@ -88,3 +88,15 @@ def test_named_layouts_for_any_skin_and_diameter(name, outline, number):
 def test_names_unsuitable_for_a_skin(name, message):
     with pytest.raises(ValueError, match=message):
         named_layout(name, Polygon([[0, 0], [0.2, 0], [0.2, 0.1], [0, 0.05]]))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("grid-10x2", "would be 5 mm apart, and they are 7 mm across: they would overlap by 2 mm"),
+        ("perimeter-8", "electrodes 7 mm across do not fit around the edge"),
+    ],
+)
+def test_names_of_layouts_whose_electrodes_do_not_fit(name, message):
+    with pytest.raises(ValueError, match=message):
+        named_layout(name, Rectangle(0.05, 0.02 if name == "grid-10x2" else 0.008), diameter=7e-3)
