@@ -45,6 +45,17 @@ def test_a_touch_that_is_no_gesture_is_unlike_any(model):
     assert model.predict([touch("push", rng)]).unlike.tolist() == [False]
 
 
+def test_the_share_of_right_gestures_is_drawn_in_percent(model, monkeypatch):
+    titles = []
+    monkeypatch.setattr("jeit.touch.plots.plot_confusion", lambda _, *, title, ax: titles.append(title))
+    monkeypatch.setattr("jeit.touch.plots.plot_tried", lambda *_, **__: None)
+    right = model.standing.right
+    wrong = np.where(np.arange(len(right)) % 4 == 0, "none", right)
+    drawn = dataclasses.replace(model, standing=dataclasses.replace(model.standing, held_out=wrong))
+    draw_gestures(SimpleNamespace(model=drawn))
+    assert titles == [f"Gestures: {100 * np.mean(wrong == right):.1f} % right of touches held out"]
+
+
 @pytest.fixture
 def quick_network(monkeypatch):
     """A linear discriminant of whole time courses in place of the network, which `test_temporal_network` covers."""
@@ -62,10 +73,6 @@ def test_the_best_method_on_held_out_people_is_selected():
     assert model.standing.method == f"{model.method} on {model.form}" == model.standing.tried[0][0]
     assert np.mean(model.standing.held_out != model.standing.right) == errors[0]
     assert model.notes == ()
-    wrong = np.where(np.arange(len(labels)) % 4 == 0, "none", model.standing.right)
-    drawn = dataclasses.replace(model, standing=dataclasses.replace(model.standing, held_out=wrong))
-    title = draw_gestures(SimpleNamespace(model=drawn)).axes[0].get_title()
-    assert title == f"Gestures: {100 * np.mean(wrong != 'none'):.1f} % right of touches held out"
 
 
 def test_data_of_one_person_are_reported_as_such():
