@@ -86,7 +86,7 @@ def run(options: Options) -> Result:
         if quick
         else {"one person": (1, 120, 1), "many people": (35, 5, 2)}
     )
-    names = (THEIRS, "linear-discriminant", "temporal-network") if quick else tuple(GESTURE_CLASSIFIERS)
+    names = (THEIRS, "linear-discriminant") if quick else tuple(GESTURE_CLASSIFIERS)
     folds = 3 if quick else FOLDS
     experiments, sets = {}, {}
     for name, (people, each, seed) in sizes.items():
