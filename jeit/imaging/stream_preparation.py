@@ -144,8 +144,9 @@ def image_stream(
     reference that moved electrodes explain.
 
     Electrodes that moved are searched for in the first suspicious frame, in the second, the fourth, and so on, since a
-    search takes up to a second. Once they are found, their part is subtracted from every frame of which it explains
-    much, and `found` is called with the number of the frame and the change of the electrodes.
+    search takes up to a second. Once they are found, `found` is called with the number of the frame and the change of
+    the electrodes, and their part is subtracted from every frame of which it explains much. The other suspicious frames
+    are searched further, as electrodes may move again.
 
     `imager`, `calibration`: see `prepare_imager`; `frames`: see `jeit.inverse.stream`.
     """
@@ -156,17 +157,18 @@ def image_stream(
         start_time = time.perf_counter()
         difference = None if changes is None else _ordinary_change(state, frame)
         if changes is not None and difference is not None:
-            if estimator is None and changes.are_suspicious(difference[None])[0]:
-                num_suspicious += 1
-                if num_suspicious.bit_count() == 1:  # a power of two
-                    estimator = changes.estimator(difference)
-                change = None if estimator is None else changes.find(difference, estimator)
-                if change is None:
-                    estimator = None
-                else:
-                    found(number, change)
+            due_to_electrodes = np.zeros(len(difference))
             if estimator is not None:
-                frame = np.asarray(frame) - changes.voltages(difference[None], estimator)[0]
+                due_to_electrodes = changes.voltages(difference[None], estimator)[0]
+            if not due_to_electrodes.any() and changes.are_suspicious(difference[None])[0]:
+                num_suspicious += 1
+                is_power_of_two = num_suspicious.bit_count() == 1
+                new_estimator = changes.estimator(difference) if is_power_of_two else None
+                change = None if new_estimator is None else changes.find(difference, new_estimator)
+                if new_estimator is not None and change is not None:
+                    found(number, change)
+                    estimator, due_to_electrodes = new_estimator, changes.voltages(difference[None], new_estimator)[0]
+            frame = np.asarray(frame) - due_to_electrodes
         seconds = time.perf_counter() - start_time
         image = state.image(number, frame)
         yield replace(image, latency=image.latency + seconds)

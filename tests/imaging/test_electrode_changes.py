@@ -156,17 +156,19 @@ def test_frames_of_a_series_with_moved_electrodes_are_named_although_another_fra
 @pytest.mark.parametrize("solver", ["one-step", pytest.param("gauss-newton", marks=pytest.mark.slow)])
 def test_a_stream_subtracts_movement_from_its_first_frame_on(solver):
     frames = [frame("none", 0.0, seed=5), frame("none", 1.0), frame("strong"), frame("none", 0.8)]
+    frames.append(frame("none", 1.0, only=int(np.argmax(np.abs(SHIFT)))))  # afterwards, one electrode alone
     voltages = [np.asarray(one.voltages)[0] for one in frames]
     imager, calibration = prepare_imager(frame("none", 0.0, seed=2), StreamSettings(solver, num_points=600))
     found = []
     images = list(image_stream(imager, calibration, voltages, lambda number, change: found.append((number, change))))
-    assert [number for number, _ in found] == [1]
+    assert [number for number, _ in found] == [1, 4]
     assert "electrodes had moved" in found[0][1].doubt
+    assert f"electrode {np.argmax(np.abs(SHIFT)) + 1} had moved" in found[1][1].doubt
     peaks = [np.abs(np.log(image.conductivity / calibration.conductivity)).max() for image in images]
     plain = [np.abs(np.log(image.conductivity / calibration.conductivity)).max() for image in stream(imager, voltages)]
-    assert max(peaks[1], peaks[3]) < 0.3 * min(plain[1], plain[3])
+    assert max(peaks[1], peaks[3], peaks[4]) < 0.3 * min(plain[1], plain[3], plain[4])
     assert peaks[2] > 0.9 * plain[2]
-    assert [image.number for image in images] == [0, 1, 2, 3]
+    assert [image.number for image in images] == [0, 1, 2, 3, 4]
 
 
 def test_the_doubt_states_distances_in_millimetres_and_electrodes_from_1():
