@@ -162,6 +162,9 @@ class ElectrodeChanges:
         estimator = self.estimator(difference) if estimator is None else estimator
         if estimator is None:
             return None
+        linear = estimator @ difference
+        linear_change = self._patterns @ linear
+        linear_rest = float(self._size(difference - linear_change) / self._size(difference))
         coefficients, change = np.zeros(len(estimator)), np.zeros(len(difference))
         rest, max_rest = 1.0, _max_rest(estimator)
         for _ in range(_NUM_CORRECTIONS):
@@ -177,6 +180,9 @@ class ElectrodeChanges:
                     break
             else:
                 break
+        # On a coarse mesh, voltages jump where an electrode passes a node, and the linear approximation is better.
+        if linear_rest < rest:
+            coefficients, change, rest = linear, linear_change, linear_rest
         if rest >= max_rest:
             return None
         contact_factor = np.exp(self._log_contact(coefficients))

@@ -90,6 +90,16 @@ def test_one_moved_electrode_is_named_and_shows_no_bodies():
     assert f"as if electrode {electrode + 1} had moved by about {distance} since" in result.electrode_change.doubt
 
 
+@pytest.mark.parametrize("electrode", [int(np.argmax(np.abs(SHIFT))), 12])
+def test_a_coarse_mesh_and_noise_add_no_bodies_beside_one_moved_electrode(electrode):
+    """On this mesh, voltages jump as the first electrode moves. The second moves so little that noise is most of what
+    remains."""
+    settings = ImagingSettings("one-step", num_points=1000, raster_shape=(64, 64))
+    result = image_difference(frame("none", 1.0, only=electrode), frame("none", 0.0, seed=2), settings)
+    assert np.flatnonzero(result.electrode_change.shift[:, 0]).tolist() == [electrode]
+    assert result.inclusions == ()
+
+
 def test_a_body_beside_one_moved_electrode_stays_in_the_image():
     result = image("weak", 1.0, only=12)
     assert result.electrode_change is None
