@@ -52,6 +52,8 @@ _MIN_RISE, _MIN_RISE_PER_CHANNEL, _MAX_REST, _MIN_NUMBER = 30.0, 0.4, 0.95, 3.0
 # standard deviations. In simulated disks, displacements by 0.3 to 4° left 0.03 to 0.2 in the linear approximation, and
 # bodies 0.19 or more, also those smaller than the electrode beside them.
 _MAX_SINGLE_REST, _MAX_SINGLE_CHANGE = 0.15, 3.0
+# Error of the voltages that a change of a single electrode explains, as a share of them.
+_SINGLE_CHANGE_ERROR = 0.1
 # A change is looked for if the electrodes alone, at plausible displacements, explain this share of the difference where
 # errors are `_ASSUMED_ERROR` of it. The share was 0.1 to 0.7 at rest, and 0.87 to 1 after movements by 0.3° or more.
 _MIN_SUSPICIOUS_SHARE, _ASSUMED_ERROR = 0.6, 0.3
@@ -84,6 +86,13 @@ class ElectrodeChange(NamedTuple):
     contact_factor: Float[np.ndarray, " L"]
     voltages: Float[np.ndarray, " M"]
     rest: float
+
+    @property
+    def relative_error(self) -> float:
+        """Error of the `voltages`, as a share of them, that bodies in the image are held against: that of a single
+        electrode. If many are displaced, their displacements adapt to errors."""
+        is_single = np.count_nonzero(self.shift) + np.count_nonzero(self.contact_factor != 1) == 1
+        return _SINGLE_CHANGE_ERROR if is_single else 0.0
 
     @property
     def doubt(self) -> str:

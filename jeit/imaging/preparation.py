@@ -55,8 +55,6 @@ def naming_frame(measurement: Measurement, number: int) -> Iterator[None]:
 
 # Minimum share of a voltage difference that is assumed to remain unexplained by any model.
 _MIN_MISFIT = 0.03
-# Error of the voltages that a change of the electrodes explains, as a share of them.
-_ELECTRODE_CHANGE_ERROR = 0.1
 # Factor by which the share of the voltage difference that the model does not explain is larger for images with sharp
 # outlines.
 _SHARP_FACTOR = 3.0
@@ -254,13 +252,16 @@ class PreparedDifference:
         """Root of the sum of squares of noise, rounding, and an error that is a `share` of the measured difference,
         volts."""
         relative_noise, used = np.asarray(self.relative_noise), np.asarray(self.mask)
-        due_to_electrodes = 0.0 if (change := self.electrode_change) is None else change.voltages
+        change = self.electrode_change
+        due_to_electrodes, relative_error = (
+            (np.zeros(len(used)), 0.0) if change is None else (change.voltages, change.relative_error)
+        )
         relative_size, electrode_size = (
             np.sqrt(np.mean(np.abs(voltages[used] / relative_noise[used]) ** 2))
-            for voltages in (np.asarray(self.difference) + due_to_electrodes, np.zeros(len(used)) + due_to_electrodes)
+            for voltages in (np.asarray(self.difference) + due_to_electrodes, due_to_electrodes)
         )
         noise = min(1.0, 0.1 * relative_size) if self.noise is None else self.quality.trusted_noise
-        error = np.hypot(share * relative_size, _ELECTRODE_CHANGE_ERROR * electrode_size)
+        error = np.hypot(share * relative_size, relative_error * electrode_size)
         return as_array(np.hypot(relative_noise * np.hypot(noise, error), self._rounding))
 
     @functools.cached_property
