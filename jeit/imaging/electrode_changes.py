@@ -215,11 +215,17 @@ class ElectrodeChanges:
         return np.where(is_change[:, None], changes, 0.0)
 
     def estimator_for(self, differences: Float[np.ndarray, "N M"]) -> Float[np.ndarray, "p M"] | None:
-        """`estimator` for the largest of several differences (N, M) that shows changes of the electrodes; None if none
-        of the `_NUM_CANDIDATES` largest suspicious ones does."""
+        """`estimator` for the largest of several differences (N, M) that shows changes of the electrodes, of many
+        rather than of a single one; None if none of the `_NUM_CANDIDATES` largest suspicious ones does."""
         suspicious = np.flatnonzero(self.are_suspicious(differences))
         largest = suspicious[np.argsort(-self._size(differences[suspicious]), kind="stable")[:_NUM_CANDIDATES]]
-        return next((found for one in largest if (found := self.estimator(differences[one])) is not None), None)
+        single = None
+        for one in largest:
+            if (estimator := self.estimator(differences[one])) is not None:
+                if not _is_single(estimator):
+                    return estimator
+                single = estimator if single is None else single
+        return single
 
     def estimator(self, difference: Float[np.ndarray, " M"]) -> Float[np.ndarray, "p M"] | None:
         """Matrix (p, M) that estimates changes of the electrodes, in units of their standard deviations, from a

@@ -1,6 +1,7 @@
 """The benchmarks' command: its list, the arguments that it refuses, and the other cases after one fails."""
 
 import ast
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from benchmarks import __main__ as command
 from benchmarks.cases import NAMES, load
 from benchmarks.harness.case import MISSED, Asked, Options, Result, Table
-from benchmarks.harness.run_case import CaseFailedError, run_apart, run_here
+from benchmarks.harness.run_case import CaseFailedError, run_apart, run_here, run_shared
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -74,6 +75,20 @@ def test_a_quick_case_is_measured_and_not_judged():
 def test_a_case_in_a_process_of_its_own_may_fail():
     with pytest.raises(CaseFailedError, match="nonsense ended with exit code 1"):
         run_apart("nonsense", Options(quick=True), threads=1)
+
+
+def test_quick_cases_share_processes_and_one_that_fails_does_not_lose_the_others(monkeypatch, capsys):
+    def run(name, options):
+        return run_shared("nonsense" if name == "solver" else name, options)
+
+    monkeypatch.setattr(command, "shared_processes", ThreadPoolExecutor)
+    monkeypatch.setattr(command, "run_shared", run)
+    monkeypatch.setattr(command.machine, "use_cores", lambda: None)
+    assert command.main(["--quick", "solver", "real_skins"]) == 1
+    printed = capsys.readouterr()
+    assert "## real_skins" in printed.out
+    assert "nonsense failed:" in printed.err
+    assert "Traceback" in printed.err
 
 
 def test_nothing_imports_the_tests():

@@ -56,7 +56,7 @@ def test_a_comparison_with_itself_has_no_blind_spot():
     assert one == other
     assert one["blind_spot_fraction"] == 0
     theta = np.asarray(response.sensitivity.values)
-    # Two points are told apart at the diameter of a taxel, on average.
+    # Two points are distinguished at the diameter of a taxel, on average.
     diameter_mm = 10 * np.sqrt(4 * one["taxel_area_cm2"]["mean"] / np.pi)
     assert 0.8 * diameter_mm < one["two_point_mm"] < 1.01 * diameter_mm
     assert one["sensitivity_uniformity"] == pytest.approx(theta.mean() / np.sqrt((theta**2).mean()))

@@ -217,3 +217,19 @@ def test_the_evidence_is_that_of_a_dense_covariance():
             prior += (2 * max(logarithms[3], 0)) ** 2
         expected = 0.5 * (data @ np.linalg.solve(covariance, data) + np.linalg.slogdet(covariance)[1] + prior)
         np.testing.assert_allclose(problem._cost(np.array(logarithms)), expected, rtol=1e-9)
+
+
+def test_a_series_prefers_the_movement_of_many_electrodes_to_that_of_one():
+    electrode = int(np.argmax(np.abs(SHIFT)))
+    frames = [frame("none", 1.5, only=electrode), frame("none", 0.8)]
+    series = recorded([np.asarray(one.voltages)[0] for one in frames], noise=0)
+    assert image_sequence(series, frame("none", 0.0, seed=2), SETTINGS).moved[1]
+
+
+def test_a_stream_searches_fewer_and_fewer_suspicious_frames(monkeypatch):
+    imager, calibration = prepare_imager(frame("none", 0.0, seed=2), StreamSettings("one-step", num_points=600))
+    searched = []
+    monkeypatch.setattr(electrode_changes.ElectrodeChanges, "estimator", lambda self, change: searched.append(change))
+    moved = np.asarray(frame("none", 1.0).voltages)[0]
+    assert len(list(image_stream(imager, calibration, [moved] * 9, lambda number, change: None))) == 9
+    assert len(searched) == 4  # of the suspicious frames 1, 2, 4 and 8

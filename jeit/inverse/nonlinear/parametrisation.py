@@ -429,8 +429,8 @@ class Parametrisation(Module):
         return None if self.regions is None else Regions.create(mesh, self.regions)
 
     def box(self, background: Float[Array, " m"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        """Lower and upper bounds (n,) on the coefficients: finite for the conductivity of the cells,
-        infinite for further unknowns.
+        """Lower and upper bounds (n,) on the coefficients: those of the conductivity of the cells, then infinite ones
+        of further unknowns.
 
         Raises `ValueError` if the link does not allow bounds or the background lies outside them.
         """
