@@ -2,6 +2,7 @@
 and left out of the image; bodies are not taken for moved electrodes."""
 
 import functools
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +13,7 @@ from jeit.data import Measurement
 from jeit.electrodes import BoundaryElectrodes, body_mesh
 from jeit.forward import ForwardModel
 from jeit.imaging import ImagingSettings, electrode_changes, image_sequence
+from jeit.imaging.preparation import prepare_difference
 from jeit.imaging.stream_preparation import StreamSettings, image_stream, prepare_imager
 from jeit.inverse import stream
 from jeit.layout import ring
@@ -229,7 +231,22 @@ def test_a_series_prefers_the_movement_of_many_electrodes_to_that_of_one():
 def test_a_stream_searches_fewer_and_fewer_suspicious_frames(monkeypatch):
     imager, calibration = prepare_imager(frame("none", 0.0, seed=2), StreamSettings("one-step", num_points=600))
     searched = []
-    monkeypatch.setattr(electrode_changes.ElectrodeChanges, "estimator", lambda self, change: searched.append(change))
+
+    def search(self, difference):
+        searched.append(difference)
+        time.sleep(0.02)
+
+    monkeypatch.setattr(electrode_changes.ElectrodeChanges, "estimator", search)
     moved = np.asarray(frame("none", 1.0).voltages)[0]
-    assert len(list(image_stream(imager, calibration, [moved] * 9, lambda number, change: None))) == 9
+    images = list(image_stream(imager, calibration, [moved] * 9, lambda number, change: None))
+    assert len(images) == 9
     assert len(searched) == 4  # of the suspicious frames 1, 2, 4 and 8
+    assert min(images[number].latency for number in (0, 1, 3, 7)) >= 0.02  # which contains the search
+
+
+def test_an_implausible_displacement_of_one_electrode_is_not_taken_for_it():
+    prepared = prepare_difference(frame("none", 1.0), frame("none", 0.0, seed=2), num_points=600, as_is=True)
+    changes = prepared.electrode_changes
+    pattern = changes._patterns[:, 5]
+    assert np.flatnonzero(changes._single_estimator(2.5 * pattern).any(axis=1)).tolist() == [5]
+    assert changes._single_estimator(3.5 * pattern) is None
