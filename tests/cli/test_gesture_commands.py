@@ -136,8 +136,6 @@ def test_gestures_in_a_file_are_classified(files, model, run):
     assert (status, error) == (0, "")
     detected = events(folder / "out")
     times = re.findall(r"named within (\S+) ms of the frame after \(median\), 99 % within (\S+) ms", output)
-    latencies = [float(one["latency_ms"]) for one in detected]
-    np.testing.assert_allclose(np.array(times[0], float), np.quantile(latencies, (0.5, 0.99)), atol=0.1)
     assert [one["gesture"] for one in detected] == 2 * list(GESTURES)
     np.testing.assert_allclose([float(one["onset_s"]) for one in detected], stream.onset, atol=0.2)
     for one in detected:
@@ -149,6 +147,10 @@ def test_gestures_in_a_file_are_classified(files, model, run):
     report = json.loads((folder / "out" / "report.json").read_text("utf-8"), parse_constant=pytest.fail)
     assert report["frames"] == len(stream.seconds)
     assert report["touches"] == len(detected)
+    named_within = 1e3 * np.array([report["named_within_s"][share] for share in ("median", "99_percent")])
+    np.testing.assert_allclose(np.array(times[0], float), named_within, atol=0.051)
+    # A touch is classified before the result of its frame is complete: two times of one order, in milliseconds.
+    assert 0.03 < np.median([float(one["latency_ms"]) for one in detected]) / named_within[0] < 30
     assert (folder / "out" / "timeline.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -326,16 +326,16 @@ def test_latency_is_of_displayed_pictures():
     async def judged():
         viewer = Viewer()
         now = time.monotonic()
-        for number, ago in ((1, 9.0), (2, 0.03)):
+        for number, ago in ((1, 90.0), (2, 30.0)):
             viewer.note_sent(number, now - ago)
         assert not viewer.is_ready_for(3)
         viewer.note_drawn(2, hidden=False)
-        viewer.note_sent(3, now - 60)
+        viewer.note_sent(3, now - 600)
         viewer.note_drawn(3, hidden=True)
         viewer.note_drawn(77, hidden=False)
         return viewer.summary()
 
-    assert asyncio.run(judged())["latency_99"] == pytest.approx(0.03, abs=0.01)
+    assert asyncio.run(judged())["latency_99"] == pytest.approx(30, abs=5)
 
 
 def test_the_end(served):
