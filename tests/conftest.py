@@ -72,11 +72,13 @@ def pytest_sessionfinish():
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark the tests of `repeated.txt` as slow: quicker ones reach the same code (see `find_repeated.py`)."""
+    """Mark the tests of `repeated.txt` as slow: quicker ones reach the same code (see `find_repeated.py`). Run those
+    marked `slow(first=True)` first: they take longest, and no worker waits for another one at the end."""
     repeated = set((ROOT / "tests" / "repeated.txt").read_text("utf-8").splitlines())
     for item in items:
         if item.nodeid in repeated:
             item.add_marker(pytest.mark.slow)
+    items.sort(key=lambda item: not any(mark.kwargs.get("first") for mark in item.iter_markers("slow")))
 
 
 def _shared(variable: str, folder: str) -> Path | None:

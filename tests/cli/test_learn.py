@@ -10,8 +10,8 @@ import pytest
 from small_networks import SKIN
 
 from jeit.design import read_described_skin
-from jeit.touch.networks import PRESETS, read_network
-from jeit.touch.networks.learn import TrainingRuns, evaluate_network, shuffle_pairs, train_unrolled
+from jeit.touch.networks import read_network
+from jeit.touch.networks.learn import evaluate_network
 from jeit.touch.networks.linear_channels import LinearChannels
 from jeit.touch.networks.simulated_touches import TouchExamples
 from jeit.touch.networks.three_stage_network import ThreeStages
@@ -67,7 +67,7 @@ def test_unknown_preset(run, tmp_path):
     assert "--preset must be one of quick, full" in error
 
 
-@pytest.mark.slow
+@pytest.mark.slow(first=True)
 def test_the_quick_preset(run, tmp_path):
     """The network explains 0.64 of the squared depth. A network trained on the maps of other touches explains 0.12;
     linear images, and an untrained network of this design, 0.44; an untrained one of the other design is worse than
@@ -84,8 +84,8 @@ def test_the_quick_preset(run, tmp_path):
     assert report["error_of_a_ball_m"]["mean"] < 2e-3
     assert (model / "learning.png").stat().st_size > 10_000
     skin, network = read_described_skin(tmp_path / "skin.toml"), read_network(model)
-    opened = [xarray.open_zarr(model / "work" / f"{name}.zarr") for name in ("learnt", "held-out", "standing")]
-    learnt, held, judged = (TouchExamples(one["change"].to_numpy(), one["depth"].to_numpy()) for one in opened)
+    opened = [xarray.open_zarr(model / "work" / f"{name}.zarr") for name in ("learnt", "standing")]
+    learnt, judged = (TouchExamples(one["change"].to_numpy(), one["depth"].to_numpy()) for one in opened)
 
     def explained(other):
         return evaluate_network(dataclasses.replace(network, network=other), skin, judged).explained
@@ -93,10 +93,6 @@ def test_the_quick_preset(run, tmp_path):
     channels, sensed = learnt.change.shape[1], LinearChannels.from_skin(skin)
     fresh = Unrolled(channels, (48, 48), key=jax.random.key(3))
     fresh = fresh.adapted_to_skin(sensed, image_places(skin, 48, 48), skin.layout.centres, network.noise)
-    runs = TrainingRuns(PRESETS["quick"].plan, jax.random.key(0))
-    some = TouchExamples(learnt.change[::3], learnt.depth[::3])
-    lost = train_unrolled(fresh, sensed, shuffle_pairs(some), held, network.noise, runs)
     other = ThreeStages(channels, (48, 48), key=jax.random.key(3))
     assert explained(fresh) < 0.55
     assert explained(other) < 0.1
-    assert explained(lost.network) < 0.2

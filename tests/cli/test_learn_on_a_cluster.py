@@ -27,7 +27,7 @@ def finished(model) -> int:
     return len(json.loads(path.read_bytes())["attributes"]["finished"]) if path.exists() else 0
 
 
-@pytest.mark.slow
+@pytest.mark.slow(first=True)
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
 def test_command_and_workers_killed(tmp_path):
     distributed = pytest.importorskip("distributed")

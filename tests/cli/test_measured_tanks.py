@@ -81,7 +81,7 @@ def matched(case, found, inclusions):
     return errors
 
 
-@pytest.mark.slow
+@pytest.mark.slow(first=True)
 def test_kit4_every_inclusion_with_its_sign(data_folder):
     """All 34 inclusions of the 17 files with one setting; each is matched with the nearest detected one of its sign."""
     folder = data_folder / "kit4"

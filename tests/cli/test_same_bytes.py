@@ -80,7 +80,7 @@ def without_times(name: str, content: bytes):
     return content
 
 
-@pytest.mark.slow
+@pytest.mark.slow(first=True)
 def test_two_runs_write_the_same_bytes(given, tmp_path):
     runs = [written(given, tmp_path / f"run{seed}", seed) for seed in ("1", "2")]
     for name in RUNS:

@@ -33,7 +33,7 @@ def test_an_example_states_its_time_and_memory(example):
     assert gallery.cost(example) in gallery.page()
 
 
-@pytest.mark.slow
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("name", [file.stem for file in sorted(FOLDER.glob("*.py"))])
 def test_example(name, tmp_path, monkeypatch):
     matplotlib.use("Agg")

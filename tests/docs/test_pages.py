@@ -261,7 +261,7 @@ def _form(line: str) -> tuple[str, ...]:
     return (*words[:place], *words[place + 2 :])
 
 
-@pytest.mark.slow
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("about", TYPED)
 def test_commands_run_as_they_are_written(about, data_folder, tmp_path, monkeypatch, capsys):
     """What these pages have a reader type, Python and commands, in their order, in one folder that is empty but for the
