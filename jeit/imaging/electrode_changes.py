@@ -95,33 +95,36 @@ class ElectrodeChange(NamedTuple):
         return _SINGLE_CHANGE_ERROR if is_single else 0.0
 
     @property
-    def doubt(self) -> str:
-        """Description of the change, in a sentence."""
+    def description(self) -> str:
+        """What seems to have changed, without a full stop: "electrodes had moved since the reference, by about …"."""
         distances = 1e3 * np.linalg.norm(self.shift, axis=1)
         largest = int(np.argmax(distances))
         logarithm = np.log(self.contact_factor)
         contact, usual_factor = int(np.argmax(np.abs(logarithm))), float(np.exp(np.sqrt(np.mean(logarithm**2))))
-        contacts = (
-            ""
-            if usual_factor < _MIN_STATED_FACTOR
-            else f", and contact impedances had changed by a factor of about {usual_factor:.2g} (of electrode "
-            f"{contact + 1}, {self.contact_factor[contact]:.2g})"
-        )
         if np.count_nonzero(distances) + np.count_nonzero(logarithm) > 1:
-            change = (
+            contacts = (
+                ""
+                if usual_factor < _MIN_STATED_FACTOR
+                else f", and contact impedances had changed by a factor of about {usual_factor:.2g} (of electrode "
+                f"{contact + 1}, {self.contact_factor[contact]:.2g})"
+            )
+            return (
                 f"electrodes had moved since the reference, by about {np.sqrt(np.mean(distances**2)):.2g} mm (root "
                 f"mean square; electrode {largest + 1} by about {distances[largest]:.2g} mm){contacts}, or as if a "
                 "layer along the wall had changed"
             )
-        elif distances.any():
-            change = f"electrode {largest + 1} had moved by about {distances[largest]:.2g} mm since the reference"
-        else:
-            change = (
-                f"the contact impedance of electrode {contact + 1} had changed by a factor of about "
-                f"{self.contact_factor[contact]:.2g} since the reference"
-            )
+        if distances.any():
+            return f"electrode {largest + 1} had moved by about {distances[largest]:.2g} mm since the reference"
         return (
-            f"the voltages have changed as if {change}. The image shows the rest of the difference, "
+            f"the contact impedance of electrode {contact + 1} had changed by a factor of about "
+            f"{self.contact_factor[contact]:.2g} since the reference"
+        )
+
+    @property
+    def doubt(self) -> str:
+        """A sentence about the change of the electrodes, its effect on the image, and what to do."""
+        return (
+            f"the voltages have changed as if {self.description}. The image shows the rest of the difference, "
             f"{percent(self.rest)} of it (as_is=True, --as-is: all of it). Measure a new reference."
         )
 

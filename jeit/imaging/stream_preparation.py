@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -134,6 +135,43 @@ def prepare_imager(
     return imager, calibration
 
 
+class ElectrodeChangeFilter:
+    """Subtracts from the frames of a stream the part of their difference from the reference that moved electrodes
+    explain.
+
+    Electrodes that moved are searched for in the first suspicious frame, in the second, the fourth, and so on, since a
+    search takes up to a second. Once they are found, their part is subtracted from every frame of which it explains
+    much. The other suspicious frames are searched further, as electrodes may move again.
+
+    `imager`, `calibration`: see `prepare_imager`.
+    """
+
+    def __init__(self, imager: Imager, calibration: Calibration):
+        noise, mask = np.asarray(imager.noise), np.asarray(imager.mask)
+        self._changes = ElectrodeChanges.on_edge(calibration.model, float(calibration.conductivity), noise, mask)
+        self._estimator: Float[np.ndarray, "p M"] | None = None
+        self._num_suspicious = 0
+
+    def rest(self, state: StreamState, frame: Any) -> tuple[Any, ElectrodeChange | None]:
+        """Return a `frame` without what moved electrodes explain of its difference from the reference of the `state`,
+        and the change of the electrodes if it was found in this frame. A frame with a fault is returned as it is."""
+        changes, difference = self._changes, None if self._changes is None else _ordinary_change(state, frame)
+        if changes is None or difference is None:
+            return frame, None
+        due_to_electrodes, change = np.zeros(len(difference)), None
+        if self._estimator is not None:
+            due_to_electrodes = changes.voltages(difference[None], self._estimator)[0]
+        if not due_to_electrodes.any() and changes.are_suspicious(difference[None])[0]:
+            self._num_suspicious += 1
+            is_power_of_two = self._num_suspicious.bit_count() == 1
+            new_estimator = changes.estimator(difference) if is_power_of_two else None
+            change = None if new_estimator is None else changes.find(difference, new_estimator)
+            if new_estimator is not None and change is not None:
+                self._estimator = new_estimator
+                due_to_electrodes = changes.voltages(difference[None], new_estimator)[0]
+        return np.asarray(frame) - due_to_electrodes, change
+
+
 def image_stream(
     imager: Imager,
     calibration: Calibration,
@@ -141,36 +179,19 @@ def image_stream(
     found: Callable[[int, ElectrodeChange], None],
 ) -> Iterator[FrameImage]:
     """Yield the image of each frame as `jeit.inverse.stream` does, without the part of its difference from the
-    reference that moved electrodes explain.
+    reference that moved electrodes explain (`ElectrodeChangeFilter`).
 
-    Electrodes that moved are searched for in the first suspicious frame, in the second, the fourth, and so on, since a
-    search takes up to a second. Once they are found, `found` is called with the number of the frame and the change of
-    the electrodes, and their part is subtracted from every frame of which it explains much. The other suspicious frames
-    are searched further, as electrodes may move again.
-
-    `imager`, `calibration`: see `prepare_imager`; `frames`: see `jeit.inverse.stream`.
+    `imager`, `calibration`: see `prepare_imager`; `frames`: see `jeit.inverse.stream`; `found`: function called with
+    the number of a frame and a change of the electrodes when it is found.
     """
-    state, estimator, num_suspicious = StreamState(imager), None, 0
-    noise, mask = np.asarray(imager.noise), np.asarray(imager.mask)
-    changes = ElectrodeChanges.on_edge(calibration.model, float(calibration.conductivity), noise, mask)
+    state, electrode_changes = StreamState(imager), ElectrodeChangeFilter(imager, calibration)
     for number, frame in enumerate(frames):
         start_time = time.perf_counter()
-        difference = None if changes is None else _ordinary_change(state, frame)
-        if changes is not None and difference is not None:
-            due_to_electrodes = np.zeros(len(difference))
-            if estimator is not None:
-                due_to_electrodes = changes.voltages(difference[None], estimator)[0]
-            if not due_to_electrodes.any() and changes.are_suspicious(difference[None])[0]:
-                num_suspicious += 1
-                is_power_of_two = num_suspicious.bit_count() == 1
-                new_estimator = changes.estimator(difference) if is_power_of_two else None
-                change = None if new_estimator is None else changes.find(difference, new_estimator)
-                if new_estimator is not None and change is not None:
-                    found(number, change)
-                    estimator, due_to_electrodes = new_estimator, changes.voltages(difference[None], new_estimator)[0]
-            frame = np.asarray(frame) - due_to_electrodes
+        rest, change = electrode_changes.rest(state, frame)
+        if change is not None:
+            found(number, change)
         seconds = time.perf_counter() - start_time
-        image = state.image(number, frame)
+        image = state.image(number, rest)
         yield replace(image, latency=image.latency + seconds)
 
 

@@ -3,6 +3,7 @@ and left out of the image; bodies are not taken for moved electrodes."""
 
 import functools
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,6 +18,7 @@ from jeit.imaging.preparation import prepare_difference
 from jeit.imaging.stream_preparation import StreamSettings, image_stream, prepare_imager
 from jeit.inverse import stream
 from jeit.layout import ring
+from jeit.live import ConductivityView, LiveFrame
 from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
 from jeit.report.image import report_image
@@ -242,6 +244,24 @@ def test_a_stream_searches_fewer_and_fewer_suspicious_frames(monkeypatch):
     assert len(images) == 9
     assert len(searched) == 4  # of the suspicious frames 1, 2, 4 and 8
     assert min(images[number].latency for number in (0, 1, 3, 7)) >= 0.02  # which contains the search
+
+
+def test_a_live_picture_leaves_out_what_moved_electrodes_explain():
+    """Until a new reference is measured; an event states the movement once."""
+    settings = StreamSettings("one-step", num_points=600)
+    view, view_as_is = (
+        ConductivityView.prepare(frame("none", 0.0, seed=2), replace(settings, as_is=as_is)) for as_is in (False, True)
+    )
+    moved = LiveFrame(0, 0.0, 0.0, np.asarray(frame("none", 1.0).voltages)[0])
+    picture, picture_as_is = view.picture(moved), view_as_is.picture(moved)
+    assert np.nanmax(np.abs(picture.pixels)) < 0.3 * np.nanmax(np.abs(picture_as_is.pixels))
+    (event,) = picture.events
+    assert event.startswith("Measure a new reference: the voltages have changed as if electrodes had moved since")
+    assert picture_as_is.events == view.picture(moved).events == ()
+    np.testing.assert_array_equal(view.image(moved)[1].pixels, picture_as_is.pixels)
+    view.set_reference(moved.values[None])
+    assert view.picture(moved).status == "unchanged"
+    assert view.picture(replace(moved, values="no numbers")).pixels is None
 
 
 def test_an_implausible_displacement_of_one_electrode_is_not_taken_for_it():

@@ -4,6 +4,7 @@ electrodes, channels and raster of a body, which a page draws."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -13,7 +14,7 @@ from jeit.data import Measurement
 from jeit.electrodes import AbstractElectrodes
 from jeit.image import Raster
 from jeit.image.inclusions import StrongestRegion
-from jeit.imaging.stream_preparation import StreamSettings, prepare_imager
+from jeit.imaging.stream_preparation import ElectrodeChangeFilter, StreamSettings, prepare_imager
 from jeit.inverse import Imager
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.streaming.stream import FrameImage, FrameStatus, StreamState
@@ -164,7 +165,8 @@ class ConductivityView(AbstractView):
     """View of the change of conductivity from the undisturbed body: the images of `jeit.inverse.stream`.
 
     Images are in S/m (2-D: S). A marker shows the centroid of the strongest change, unless the frame differs from the
-    reference by noise only. `ConductivityView.prepare` creates the view from a measurement of the undisturbed body.
+    reference by noise only. What moved electrodes explain of a frame is left out of its picture, and an event states
+    how far they have moved. `ConductivityView.prepare` creates the view from a measurement of the undisturbed body.
 
     **Arguments:**
 
@@ -172,6 +174,7 @@ class ConductivityView(AbstractView):
     - `calibration`: calibrated model of the body, as returned by `jeit.imaging.prepare_imager`.
     - `title`: title of the page.
     - `notes`: remarks for the page.
+    - `as_is`: leave the effects of moved electrodes in the pictures.
 
     Raises `ValueError` for arguments of a wrong type, and for a curved surface in space, which has no plane image.
 
@@ -184,15 +187,22 @@ class ConductivityView(AbstractView):
     """
 
     def __init__(
-        self, imager: Imager, calibration: Calibration, *, title: str = "Conductivity change", notes: Sequence[str] = ()
+        self,
+        imager: Imager,
+        calibration: Calibration,
+        *,
+        title: str = "Conductivity change",
+        notes: Sequence[str] = (),
+        as_is: bool = False,
     ):
         check_kind("imager", imager, Imager, "an Imager, as of prepare_imager(reference)[0]")
         check_kind("calibration", calibration, Calibration, "a Calibration, as of prepare_imager(reference)[1]")
         model = calibration.model
-        self.imager, self.background = imager, float(calibration.conductivity)
+        self.imager, self.calibration, self.as_is = imager, calibration, as_is
+        self.background = float(calibration.conductivity)
         self.grid = PixelGrid(model.mesh)
         self._strongest = StrongestRegion(model.mesh)
-        self._state = StreamState(imager)
+        self._state, self._electrode_changes = StreamState(imager), ElectrodeChangeFilter(imager, calibration)
         is_plane = model.mesh.dimension == 2
         self.scene = scene_of(
             model.mesh,
@@ -219,14 +229,24 @@ class ConductivityView(AbstractView):
         Raises `ValueError` if `jeit.imaging.prepare_imager` does.
         """
         imager, calibration = prepare_imager(reference, settings, progress=progress)
-        return cls(imager, calibration, title=f"Conductivity change, {reference.name}", notes=reference.notes)
+        as_is = settings is not None and settings.as_is
+        title = f"Conductivity change, {reference.name}"
+        return cls(imager, calibration, title=title, notes=reference.notes, as_is=as_is)
 
     def picture(self, frame: LiveFrame) -> Picture:
-        """Compute the image of a frame; see `AbstractView.picture`."""
-        return self.image(frame)[1]
+        """Compute the image of a frame without the effect of moved electrodes; see `AbstractView.picture`. A search for
+        moved electrodes takes up to a second."""
+        rest, change = (frame.values, None) if self.as_is else self._electrode_changes.rest(self._state, frame.values)
+        picture = self.image(replace(frame, values=rest))[1]
+        if change is None:
+            return picture
+        event = (
+            f"Measure a new reference: the voltages have changed as if {change.description}. Pictures show the rest."
+        )
+        return replace(picture, events=(event,))
 
     def image(self, frame: LiveFrame) -> tuple[FrameImage, Picture]:
-        """Compute the image of a frame on the cells of the mesh, and the picture for the page."""
+        """Compute the image of a frame as it is on the cells of the mesh, and the picture for the page."""
         frame_image = self._state.image(frame.number, frame.values)
         if frame_image.conductivity is None:
             return frame_image, Picture(None, status=frame_image.status, reason=frame_image.reason)
@@ -243,6 +263,7 @@ class ConductivityView(AbstractView):
         images."""
         self.imager = self.imager.with_reference(mean_frame(frames))
         self._state = StreamState(self.imager)
+        self._electrode_changes = ElectrodeChangeFilter(self.imager, self.calibration)
 
 
 def mean_frame(frames: Float[np.ndarray, "N M"]) -> Float[np.ndarray, " M"]:
