@@ -239,7 +239,9 @@ class PreparedDifference:
         model_error = model_error and model_error._replace(drift=uncertainty.drift)
         share = max(self._misfit, uncertainty.other)
         strength = float(np.hypot(self._field_error, _DISCRETISATION_DEVIATION[self.mesh.dimension]))
-        return Accuracy(self._noise_with_error_share(share), model_error, uncertainty.size, strength)
+        # How far electrodes move does not depend on how well their positions in the reference are known.
+        movement = Uncertainty().position_on(self.mesh)
+        return Accuracy(self._noise_with_error_share(share), model_error, uncertainty.size, strength, movement)
 
     @property
     def modelled_share(self) -> float:

@@ -264,6 +264,14 @@ def test_a_live_picture_leaves_out_what_moved_electrodes_explain():
     assert view.picture(replace(moved, values="no numbers")).pixels is None
 
 
+def test_a_strong_body_is_outlined_although_electrodes_have_moved():
+    """The rest of the voltages, which the outline cannot explain, is explained by the movement."""
+    result = image_difference(frame("strong", 1.0), frame("none", 0.0, seed=2), ImagingSettings(num_points=600))
+    (body,) = result.inclusions
+    assert np.linalg.norm(np.array(body.centroid) - CENTRE) < 3e-3
+    assert result.shapes is not None
+
+
 def test_an_implausible_displacement_of_one_electrode_is_not_taken_for_it():
     prepared = prepare_difference(frame("none", 1.0), frame("none", 0.0, seed=2), num_points=600, as_is=True)
     changes = prepared.electrode_changes

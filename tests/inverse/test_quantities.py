@@ -5,6 +5,7 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 import pytest
 
@@ -14,10 +15,11 @@ from jeit.data import Measurement
 from jeit.electrodes.face_patches import body_mesh
 from jeit.image import Inclusion
 from jeit.inverse.channels import Data
+from jeit.inverse.nonlinear.problem import independent_data
 from jeit.inverse.placement import ModelError
 from jeit.inverse.shapes import Accuracy, StarPrior, alternatives, reconstruct_shapes
 from jeit.inverse.shapes.bodies import Bodies
-from jeit.inverse.shapes.problem import ShapeProblem, SmoothField
+from jeit.inverse.shapes.problem import MovedElectrodes, ShapeProblem, SmoothField
 from jeit.inverse.shapes.quantities import _FixedContrastFit, _summary, centroid_radius
 from jeit.inverse.shapes.search import _FitSetting
 from jeit.mesh import centroids, measures
@@ -179,10 +181,42 @@ def test_other_weights_of_the_data_keep_the_smooth_field():
     jacobian, weights = random.normal(size=(4, 3)), (np.ones(4), random.uniform(1, 3, 4))
     data = [Data(np.zeros(4), one, np.eye(4), np.eye(4), 0.0) for one in weights]  # pyright: ignore
     alone = ShapeProblem(None, data[0], np.ones(2))  # pyright: ignore
-    setting = _FitSetting(alone, SmoothField(None, jacobian, np.ones(2), alone))  # pyright: ignore
+    setting = _FitSetting(alone, SmoothField(jacobian, alone, (), None, np.ones(2)))  # pyright: ignore
     found = setting.weighted(data[1]).problem(0.5).data
     volts = np.asarray(found.covariance) / np.outer(weights[1], weights[1])
     np.testing.assert_allclose(volts, np.diag(1 / weights[1] ** 2) + 0.25 * jacobian @ jacobian.T, rtol=1e-12)
+
+
+def test_changes_of_electrodes_are_errors_of_the_channels_and_are_estimated():
+    """Displacements and contact impedances that change the voltages of an empty sheet, against models of the changed
+    electrodes."""
+    points = ring(0.1, 8)
+    electrodes = BoundaryElectrodes(points, 0.02, 0.01)
+    model = ForwardModel(Disk(0.1).mesh(num_points=700), electrodes, adjacent(8, driven_electrodes=True))
+    rest = np.asarray(model.voltages(SIGMA))
+    independent, data = independent_data(model, rest, np.full(len(rest), True), 1e-4 * np.abs(rest), at_once=True)
+    problem = ShapeProblem(independent, data, np.full(model.mesh.num_cells, SIGMA))
+    changes = MovedElectrodes.create(problem, 2e-3)
+    assert changes is not None
+    assert MovedElectrodes.create(problem, 0.0) is None
+    assert changes.jacobian.shape == (len(data.weight), 16)
+    position, angle = np.array(points), np.arctan2(*points[2][::-1]) + 2e-3
+    position[2] = 0.1 * np.cos(angle), 0.1 * np.sin(angle)
+    for number, share, changed in (
+        (2, 0.15, eqx.tree_at(lambda one: one.position, electrodes, position)),
+        (8 + 5, 0.02, electrodes.with_contact_impedance(0.01 * np.exp(0.03 * (np.arange(8) == 5)))),
+    ):
+        moved = np.asarray(model.with_electrodes(changed).voltages(SIGMA))
+        # A tenth of a standard deviation: 0.2 mm counter-clockwise, or 3 % of an impedance.
+        expected = 0.1 * np.asarray(changes.jacobian)[:, number]
+        measured = independent_data(model, moved, np.full(len(rest), True), 1e-4 * np.abs(rest), at_once=True)[1]
+        difference = np.asarray(data.weight) * (np.asarray(measured.voltages) - np.asarray(data.voltages))
+        assert np.linalg.norm(difference - expected) < share * np.linalg.norm(difference)
+        fit: Any = SimpleNamespace(rows=(-difference, None))
+        estimate = changes.voltages(1.0, fit, model.protocol)
+        assert np.linalg.norm(estimate - (moved - rest)) < share * np.linalg.norm(moved - rest)
+        assert changes.likeliest_level(fit) > 0
+    assert changes.likeliest_level(SimpleNamespace(rows=(np.zeros(len(data.weight)), None))) == 0  # pyright: ignore
 
 
 def test_errors_are_scaled_to_the_misfit_of_a_fit():

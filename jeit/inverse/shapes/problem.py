@@ -1,10 +1,13 @@
-"""Nonlinear least squares problem of bodies, optionally with a smooth conductivity field in addition to the bodies.
+"""Nonlinear least squares problem of bodies, optionally with other changes in addition to the bodies.
 
-The smooth field represents other changes of conductivity in a solid: salt that has sunk from a ball of agar to the
-floor, uneven temperature of the bath, or changes of contacts. Without the field, bodies would be distorted to explain
-these changes.
+In a solid, a smooth conductivity field represents other changes of conductivity: salt that has sunk from a ball of agar
+to the floor, uneven temperature of the bath, or changes of contacts. Without the field, bodies would be distorted to
+explain these changes.
 
     log σ/σ₀ = bodies + level · field,    field ~ N(0, Γ), where Γ is the covariance of a smooth image's prior.
+
+In a sheet, the other changes are those of the electrodes between the two frames: displacements and contact impedances,
+normal with the covariance Γ. Without them, further bodies at the edge would explain these changes.
 
 The voltages that the bodies do not explain have the covariance C + level² J Γ Jᵀ, with the noise covariance C and the
 Jacobian J at the background. The level is chosen by the evidence. Kaipio and Somersalo, Journal of Computational and
@@ -32,34 +35,122 @@ import scipy.linalg
 from jaxtyping import Float
 
 from jeit.arguments import check_kind
+from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
-from jeit.forward.changes import ConductivityChange, SolvedFields, solved_fields
+from jeit.forward.changes import ConductivityChange, PlacementSensitivity, SolvedFields, solved_fields
+from jeit.forward.model import select_channels
 from jeit.inverse.channels import Data
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes.bodies import Bodies
+from jeit.protocol import Protocol
 from jeit_solvers import Descent, QuadraticModel, check_not_abandoned, ridge_model
 from jeit_solvers.engines import on_host
 
-# Levels of the smooth field that are tried, in units of the standard deviation of the smooth image's prior.
-_LEVELS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)
+# Levels of the other changes that are tried, in units of their prior standard deviations: of a smooth field, and of
+# changes of the electrodes.
+_FIELD_LEVELS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)
+_ELECTRODE_LEVELS = _FIELD_LEVELS[:-1]
+# Standard deviation of the change of the logarithm of each contact impedance, at level 1.
+_CONTACT_DEVIATION = 0.3
 # Number of conductivities of which a problem keeps the fields.
 _NUM_RECENT_FIELDS = 6
 
 
 @dataclass(frozen=True)
-class SmoothField:
+class OtherChanges:
+    """Changes in addition to the bodies, which are modelled as normal random coefficients.
+
+    **Fields**: `jacobian` (r, n): derivatives of the weighted channels of `bodies_problem` with respect to the
+    coefficients of unit variance, at the background; `bodies_problem`: the problem of bodies without these changes;
+    `levels`: factors of the coefficients among which the evidence chooses.
+    """
+
+    jacobian: Float[np.ndarray, "r n"]
+    bodies_problem: ShapeProblem
+    levels: tuple[float, ...]
+
+    def problem_at(self, level: float) -> ShapeProblem:
+        """The problem of bodies with the changes of this `level` as additional noise."""
+        return self.bodies_problem.with_errors(level * self.jacobian)
+
+    def likeliest_level(self, fit: Fit) -> float:
+        """Level of the changes with the largest evidence, given the voltages that the bodies of a `fit` do not
+        explain."""
+        residual = self._residual(fit)
+
+        def surprise(level: float) -> float:
+            problem = self.problem_at(level)
+            return 0.5 * float(residual @ problem.data.precision @ residual) + problem.half_log_determinant
+
+        return min(self.levels, key=surprise)
+
+    def conductivity(self, level: float, fit: Fit) -> Any:
+        """Posterior mean of the part of the changes that is of conductivity, in log σ/σ₀ (m,), given the voltages that
+        the bodies of a `fit` do not explain; 0 if no part is."""
+        return 0.0
+
+    def voltages(self, level: float, fit: Fit, protocol: Protocol) -> Any:
+        """Posterior mean of the changes of the voltages (M,) of a `protocol`, volts, that are not due to conductivity,
+        given the voltages that the bodies of a `fit` do not explain; 0 if there are none."""
+        return 0.0
+
+    def _mean_coefficients(self, level: float, fit: Fit) -> Any:
+        """Posterior mean (n,) of the coefficients times the `level`."""
+        precision = self.problem_at(level).data.precision
+        return -(level**2) * self.jacobian.T @ (precision @ self._residual(fit))
+
+    def _residual(self, fit: Fit) -> Float[np.ndarray, " r"]:
+        """Residual of the weighted voltages: voltages predicted for the bodies of a `fit` minus measured voltages."""
+        return fit.rows[0][: len(self.jacobian)]
+
+
+@dataclass(frozen=True)
+class MovedElectrodes(OtherChanges):
+    """Displacements of electrodes on the edge of a sheet, and changes of their contact impedances, between two frames.
+
+    **Field** besides those of `OtherChanges`: `impedance_changes` (n, L, L): changes of the transfer impedances of L
+    electrodes, ohms, for coefficients of unit variance.
+    """
+
+    impedance_changes: Float[np.ndarray, "n L L"]
+
+    @classmethod
+    def create(cls, bodies_problem: ShapeProblem, deviation: float) -> MovedElectrodes | None:
+        """Create the changes with displacements of a standard `deviation`, metres, for a problem of bodies. None for
+        other electrodes, which move in two directions and thereby explain most of what bodies do, and if `deviation` is
+        0."""
+        model: Any = bodies_problem.model
+        if not isinstance(model.electrodes, BoundaryElectrodes) or model.mesh.dimension != 2 or deviation == 0:
+            return None
+        fields, impedance = map(np.asarray, on_host(model.fields(bodies_problem.background)))
+        derivatives = PlacementSensitivity(model.mesh, model.electrodes)(fields, impedance)
+        num_contacts = model.electrodes.num_electrodes
+        deviations = np.repeat([deviation, _CONTACT_DEVIATION], [len(derivatives) - num_contacts, num_contacts])
+        changes = deviations[:, None, None] * derivatives
+        jacobian = np.asarray(bodies_problem.data.weight)[:, None] * _channels_of(model.protocol, changes)
+        return cls(jacobian, bodies_problem, _ELECTRODE_LEVELS, changes)
+
+    def voltages(self, level: float, fit: Fit, protocol: Protocol) -> Float[np.ndarray, " M"]:
+        return _channels_of(protocol, self.impedance_changes) @ self._mean_coefficients(level, fit)
+
+
+def _channels_of(protocol: Protocol, impedances: Float[np.ndarray, "n L L"]) -> Float[np.ndarray, "M n"]:
+    """Voltages (M, n) of the channels of a protocol for each of n transfer impedances."""
+    protocol = on_host(protocol)
+    return np.stack([np.asarray(select_channels(protocol, impedance)) for impedance in impedances], axis=1)
+
+
+@dataclass(frozen=True)
+class SmoothField(OtherChanges):
     """Smooth conductivity field in addition to the bodies, modelled as a normal random field.
 
-    **Fields**: `image`: a smooth reconstruction from the same channels, whose basis is also the basis of the field;
-    `jacobian` (r, n): derivatives of the channels of `bodies_problem` with respect to the field's coefficients of unit
-    variance, at the background; `scale` (m,): derivative of log σ with respect to the variable of the image's link;
-    `bodies_problem`: the problem of bodies without the field.
+    **Fields** besides those of `OtherChanges`, whose coefficients are those of the field: `image`: a smooth
+    reconstruction from the same channels, whose basis is also the basis of the field; `scale` (m,): derivative of log σ
+    with respect to the variable of the image's link.
     """
 
     image: Reconstruction
-    jacobian: Float[np.ndarray, "r n"]
     scale: Float[np.ndarray, " m"]
-    bodies_problem: ShapeProblem
 
     @classmethod
     def create(cls, image: Reconstruction, bodies_problem: ShapeProblem) -> SmoothField:
@@ -82,33 +173,12 @@ class SmoothField:
         _, weighted_jacobian = image.inversion.linearise(zero_coefficients)
         weight_ratio = np.asarray(bodies_problem.data.weight) / image.inversion.data.weight
         scale = np.asarray(inversion.link.slope(inversion.reference)) / bodies_problem.background
-        return cls(image, weight_ratio[:, None] * weighted_jacobian, scale, bodies_problem)
+        return cls(weight_ratio[:, None] * weighted_jacobian, bodies_problem, _FIELD_LEVELS, image, scale)
 
-    def problem_at(self, level: float) -> ShapeProblem:
-        """The problem of bodies with the smooth field of this `level` as additional noise."""
-        return self.bodies_problem.with_errors(level * self.jacobian)
-
-    def likeliest_level(self, fit: Fit) -> float:
-        """Level of the smooth field with the largest evidence, given the voltages that the bodies of a `fit` do not
-        explain."""
-        residual = self._residual(fit)
-
-        def surprise(level: float) -> float:
-            problem = self.problem_at(level)
-            return 0.5 * float(residual @ problem.data.precision @ residual) + problem.half_log_determinant
-
-        return min(_LEVELS, key=surprise)
-
-    def estimate(self, level: float, fit: Fit) -> Float[np.ndarray, " m"]:
+    def conductivity(self, level: float, fit: Fit) -> Float[np.ndarray, " m"]:
         """Posterior mean (m,) of the smooth field, level · field in log σ/σ₀, given the voltages that the bodies of a
         `fit` do not explain."""
-        precision = self.problem_at(level).data.precision
-        coefficients: Any = -(level**2) * self.jacobian.T @ (precision @ self._residual(fit))
-        return self.scale * np.asarray(self.image.inversion.basis.expand(coefficients))
-
-    def _residual(self, fit: Fit) -> Float[np.ndarray, " r"]:
-        """Residual of the weighted voltages: voltages predicted for the bodies of a `fit` minus measured voltages."""
-        return fit.rows[0][: len(self.jacobian)]
+        return self.scale * np.asarray(self.image.inversion.basis.expand(self._mean_coefficients(level, fit)))
 
 
 class Fit(NamedTuple):

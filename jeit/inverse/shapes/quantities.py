@@ -59,7 +59,8 @@ class Accuracy(NamedTuple):
     """Accuracy of a difference of two frames. **Fields**: `noise` (M,): standard deviation of the channels, volts, of
     all errors except `model_error`; `model_error`: errors due to unknown electrode positions and contact impedances, or
     None; `size`: relative standard deviation of the lengths of the described domain; `strength`: relative standard
-    deviation of all strengths due to errors of the background and the fields.
+    deviation of all strengths due to errors of the background and the fields; `movement`: maximum standard deviation of
+    displacements, metres, of electrodes on the edge of a sheet between the two frames; 0: they are at rest.
 
     **Example:**
 
@@ -72,6 +73,7 @@ class Accuracy(NamedTuple):
     model_error: ModelError | None = None
     size: float = Uncertainty().size
     strength: float = 0.0
+    movement: float = 0.0
 
 
 def with_quantities(

@@ -30,7 +30,7 @@ from jeit.inverse.shapes.number_and_kinds import (
     improve_fit,
     remove_unsupported,
 )
-from jeit.inverse.shapes.problem import Fit, ShapeProblem, SmoothField
+from jeit.inverse.shapes.problem import Fit, MovedElectrodes, OtherChanges, ShapeProblem, SmoothField
 from jeit.inverse.shapes.quantities import Accuracy, include_deviation, with_quantities
 from jeit.inverse.shapes.reconstruction import FinerImage, ShapeReconstruction
 from jeit.inverse.shapes.star import StarPrior, Stars
@@ -93,7 +93,8 @@ def reconstruct_shapes(
       besides the bodies are then modelled as a `SmoothField`, whose level is chosen by the evidence, and only bodies
       that are detected in addition to this field are fitted.
     - `accuracy`: errors of the data, used in place of `noise` to estimate the `quantities` of each body. None: no
-      quantities.
+      quantities. In a sheet without a `smooth` image, changes of its edge's electrodes (`Accuracy.movement`) are
+      modelled in addition to the bodies, as far as the evidence supports them.
     - `progress`: function called with the name of each stage as it begins. Stages take up to a minute in a solid.
 
     Raises `ValueError` for invalid or inconsistent arguments, and if `smooth` is not an image of the same channels with
@@ -127,10 +128,14 @@ def reconstruct_shapes(
     coefficients = bodies.of_radii(radius)
     if isinstance(prior, EllipsoidPrior) and prior.kinds == "columns":
         bodies, coefficients = bodies.with_other_kind(range(len(radius)), coefficients)
-    setting = _FitSetting(problem, None if smooth is None else SmoothField.create(smooth, problem))
+    if smooth is None:
+        other_changes = MovedElectrodes.create(problem, 0.0 if accuracy is None else accuracy.movement)
+    else:
+        other_changes = SmoothField.create(smooth, problem)
+    setting = _FitSetting(problem, other_changes)
     level, report = 0.0, progress or (lambda stage: None)
     report("bodies")
-    if smooth is not None:
+    if other_changes is not None:
         level, ball_fit, _ = _add_bodies(setting, *bodies.with_modes(1, coefficients))
         bodies, coefficients = ball_fit.bodies.with_modes(prior.modes, ball_fit.coefficients)
         problem = setting.problem(level)
@@ -143,11 +148,11 @@ def reconstruct_shapes(
     else:
         report("bodies, how many")
         state = state._replace(found=improve_fit(problem, result, least_rise))
-    (setting, level, (free_fit, rises, doubtful)), smooth_field = state, state.setting.smooth_field
+    (setting, level, (free_fit, rises, doubtful)), other_changes = state, state.setting.other_changes
     problem = setting.problem(level)
     fitted = _with_common_contrast(problem, free_fit)
     bodies, coefficients = fitted.bodies, fitted.coefficients
-    field = 0.0 if smooth_field is None else smooth_field.estimate(level, fitted)
+    field = 0.0 if other_changes is None else other_changes.conductivity(level, fitted)
     mesh_bodies = bodies.on(model.mesh) if isinstance(bodies, Ellipsoids) else bodies
     conductivity = background * np.exp(mesh_bodies.display_image(coefficients) + field)
     predicted, image = np.asarray(model.voltages(conductivity if finer_model is None else background)), None
@@ -156,6 +161,8 @@ def reconstruct_shapes(
         image = FinerImage(
             finer_model.problem.model, as_array(finer_model.conductivity(bodies.display_image(coefficients), field))
         )
+    if other_changes is not None:
+        predicted = predicted + other_changes.voltages(level, fitted, model.protocol)
     alternates, deviations = alternatives(problem, fitted), contrast_deviations(problem, fitted, free_fit)
     normalised_residual = ((predicted - np.asarray(measured)) / np.asarray(deviation))[used]
     order = np.argsort(-np.asarray(rises), kind="stable")
@@ -201,52 +208,52 @@ def _check_start(start, dimension: int):
 
 
 class _FitSetting(NamedTuple):
-    """Setting in which bodies are fitted: the problem of bodies without a smooth field, and the smooth field, or None
-    if there is none."""
+    """Setting in which bodies are fitted: the problem of bodies alone, and other changes besides the bodies, or None if
+    there are none."""
 
     bodies_problem: ShapeProblem
-    smooth_field: SmoothField | None
+    other_changes: OtherChanges | None
 
     def problem(self, level: float) -> ShapeProblem:
-        """The problem of bodies, with the smooth field of this `level` if there is a field."""
-        return self.bodies_problem if self.smooth_field is None else self.smooth_field.problem_at(level)
+        """The problem of bodies, with other changes of this `level` if there are any."""
+        return self.bodies_problem if self.other_changes is None else self.other_changes.problem_at(level)
 
     def on(self, bodies_problem: ShapeProblem) -> _FitSetting:
         """Copy of the setting with the problem `bodies_problem` on another mesh."""
         return _FitSetting(
-            bodies_problem, self.smooth_field and replace(self.smooth_field, bodies_problem=bodies_problem)
+            bodies_problem, self.other_changes and replace(self.other_changes, bodies_problem=bodies_problem)
         )
 
     def weighted(self, data: Data) -> _FitSetting:
         """Copy of the setting with the weights and errors of `data`."""
-        bodies_problem, smooth_field = replace(self.bodies_problem, data=data), self.smooth_field
-        if smooth_field is not None:
+        bodies_problem, other_changes = replace(self.bodies_problem, data=data), self.other_changes
+        if other_changes is not None:
             weight_ratio = np.asarray(data.weight) / np.asarray(self.bodies_problem.data.weight)
-            smooth_field = replace(
-                smooth_field, jacobian=weight_ratio[:, None] * smooth_field.jacobian, bodies_problem=bodies_problem
+            other_changes = replace(
+                other_changes, jacobian=weight_ratio[:, None] * other_changes.jacobian, bodies_problem=bodies_problem
             )
-        return _FitSetting(bodies_problem, smooth_field)
+        return _FitSetting(bodies_problem, other_changes)
 
     def fit_level(self, bodies: Bodies, coefficients, level: float, steps: int) -> tuple[float, Fit, float]:
-        """Alternate between fitting the bodies and lowering the smooth field's level, until no lower level is likelier.
+        """Alternate between fitting the bodies and lowering the level of other changes, until no lower one is likelier.
 
         Returns the level, the fit of the bodies and -log evidence. The level decreases from `level`, because bodies
-        fitted with too low a level would be distorted to explain changes that belong to the field.
+        fitted with too low a level would be distorted to explain other changes.
         """
         while True:
             problem = self.problem(level)
             fitted = problem.fit(bodies, coefficients, steps, COARSE_TOLERANCE)
-            best_level = level if self.smooth_field is None else self.smooth_field.likeliest_level(fitted)
+            best_level = level if self.other_changes is None else self.other_changes.likeliest_level(fitted)
             if best_level >= level:
                 return level, fitted, problem.surprise(fitted) + problem.half_log_determinant
             level, coefficients = best_level, fitted.coefficients
 
 
 def _add_bodies(setting: _FitSetting, bodies: Bodies, coefficients, num_sure: int = 0) -> tuple[float, Fit, list[int]]:
-    """Add bodies one by one to a smooth field, and retain each body that the data support in addition to earlier ones.
+    """Add bodies one by one to other changes, and retain each body that the data support in addition to earlier ones.
 
-    Returns the level of the field, the fit, and the indices of the retained bodies. The first `num_sure` bodies are
-    beyond doubt and are fitted together, because one of two bodies, fitted alone, would move to a place between the
+    Returns the level of the other changes, the fit, and the indices of the retained bodies. The first `num_sure` bodies
+    are beyond doubt and are fitted together, because one of two bodies, fitted alone, would move to a place between the
     two.
     """
     rows = bodies.rows(coefficients)
@@ -264,7 +271,7 @@ def _add_bodies(setting: _FitSetting, bodies: Bodies, coefficients, num_sure: in
 
 
 class _SearchState(NamedTuple):
-    """State of the search: result `found` of fitting the bodies in a `setting`, with the smooth field at its
+    """State of the search: result `found` of fitting the bodies in a `setting`, with other changes at their
     `level`."""
 
     setting: _FitSetting
