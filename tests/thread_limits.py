@@ -14,8 +14,8 @@ def libraries_found_once():
 
     The search reads all memory maps of the process, and compiled code makes tens of thousands of them.
     """
-    with resource_limits.one_thread(), pytest.MonkeyPatch.context() as patch:
+    with resource_limits.limit_to_one_thread(), pytest.MonkeyPatch.context() as patch:
         controller = ThreadpoolController()
         for module in (resource_limits, learnt_skin):
-            patch.setattr(module, "one_thread", lambda: controller.limit(limits=1))
+            patch.setattr(module, "limit_to_one_thread", lambda: controller.limit(limits=1))
         yield

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from benchmarks.harness.machine import CORES
 from benchmarks.problems.fabric import REPETITIONS, Fabric
 from jeit.touch.learnt.methods import CLASSIFIERS, log_odds
-from jeit.touch.learnt.resource_limits import one_thread
+from jeit.touch.learnt.resource_limits import limit_to_one_thread
 
 # Indices of the sixths of the observations that are held out, and maximum number of tested observations of a sixth.
 HELD_OUT, MOST = (2, 5), 2000
@@ -37,7 +37,7 @@ class Learnt:
         `label`."""
         mean, deviation = features.mean(axis=0), features.std(axis=0)
         start = time.perf_counter()
-        with one_thread():
+        with limit_to_one_thread():
             model = CLASSIFIERS[name]((features - mean) / deviation, label)
         return cls(model, mean, deviation, time.perf_counter() - start)
 
@@ -92,7 +92,7 @@ def held_out(name: str, features, label, repetition) -> tuple[float, float]:
         predicted = Learnt.by(name, features[~held], label[~held]).predict(features[asked])
         return 100 * float(np.mean(predicted == label[asked]))
 
-    with one_thread(), ThreadPoolExecutor(CORES) as pool:
+    with limit_to_one_thread(), ThreadPoolExecutor(CORES) as pool:
         found = np.reshape(list(pool.map(right, product((random, repetition), HELD_OUT))), (2, -1)).mean(axis=1)
     return float(found[0]), float(found[1])
 

@@ -24,7 +24,7 @@ from jeit.touch.simulate import (
     ball_indenter,
     relative_changes,
 )
-from jeit.touch.simulate.contact.indents import relative_to
+from jeit.touch.simulate.contact.indents import relative_voltage_changes
 
 CELL, SKINS = 3e-3, 5
 TIP, TIP_DEPTH, PLACES = 0.015, 7.5e-3, 15
@@ -81,7 +81,7 @@ class JudgedSkins:
             if after is not None:
                 rest, later = (np.asarray(one.model.voltages(one.model_conductivity)) for one in (skin, after))
                 pressed = later + found[list(own)] * np.maximum(np.abs(later), 1e-3 * np.abs(later).max())
-                found[list(own)] = relative_to(rest, pressed)
+                found[list(own)] = relative_voltage_changes(rest, pressed)
         return found
 
 

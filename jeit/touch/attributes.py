@@ -72,9 +72,9 @@ def weber_ratio(load: ArrayLike, response: ArrayLike) -> tuple[Float[np.ndarray,
             f"load: give {_MIN_LOADS} loads or more, each {_MIN_REPETITIONS} times or more; there are {len(loads)}, "
             f"one of them {counts.min()} times."
         )
-    means = np.bincount(load_indices, response) / counts
-    deviations = np.sqrt(np.bincount(load_indices, (response - means[load_indices]) ** 2) / (counts - 1))
-    slopes = np.gradient(means, loads) * (1.0 if means[-1] >= means[0] else -1.0)
+    mean_responses = np.bincount(load_indices, response) / counts
+    deviations = np.sqrt(np.bincount(load_indices, (response - mean_responses[load_indices]) ** 2) / (counts - 1))
+    slopes = np.gradient(mean_responses, loads) * (1.0 if mean_responses[-1] >= mean_responses[0] else -1.0)
     with np.errstate(divide="ignore"):
         return loads, np.where(slopes > 0, deviations / (np.maximum(slopes, 0.0) * loads), np.inf)
 
@@ -113,14 +113,16 @@ def detection_threshold(amount: ArrayLike, detected: ArrayLike) -> float:
         raise ValueError(f"detected must be true or false for each trial; it is {detected.dtype}.")
     amount, detected = _check_pair("amount", amount, "detected", detected.astype(float))
     amounts, amount_indices, counts = np.unique(amount, return_inverse=True, return_counts=True)
-    shares = isotonic_regression(np.bincount(amount_indices, detected) / counts, weights=counts).x
-    first_above = int(np.argmax(shares >= 0.5))
-    if shares[first_above] < 0.5:
+    detection_rates = isotonic_regression(np.bincount(amount_indices, detected) / counts, weights=counts).x
+    first_index = int(np.argmax(detection_rates >= 0.5))
+    if detection_rates[first_index] < 0.5:
         return float("inf")
-    if not first_above:
+    if not first_index:
         return float(amounts[0])
-    fraction = (0.5 - shares[first_above - 1]) / (shares[first_above] - shares[first_above - 1])
-    return float(amounts[first_above - 1] + fraction * (amounts[first_above] - amounts[first_above - 1]))
+    fraction = (0.5 - detection_rates[first_index - 1]) / (
+        detection_rates[first_index] - detection_rates[first_index - 1]
+    )
+    return float(amounts[first_index - 1] + fraction * (amounts[first_index] - amounts[first_index - 1]))
 
 
 def contact_area(area: ArrayLike, found: ArrayLike) -> ContactArea:
@@ -131,9 +133,9 @@ def contact_area(area: ArrayLike, found: ArrayLike) -> ContactArea:
     area, found = _check_pair("area", area, "found", found)
     if len(area) < 2 or (area == area[0]).all():
         raise ValueError("area: give two different areas, or more.")
-    gain, least = np.polyfit(area, found, 1)
+    gain, intercept = np.polyfit(area, found, 1)
     has_variation = found.std() > 0
-    return ContactArea(float(gain), float(least), float(np.corrcoef(area, found)[0, 1]) if has_variation else 0.0)
+    return ContactArea(float(gain), float(intercept), float(np.corrcoef(area, found)[0, 1]) if has_variation else 0.0)
 
 
 def response_times(seconds: ArrayLike, response: ArrayLike) -> tuple[float, float]:
@@ -163,12 +165,12 @@ def response_times(seconds: ArrayLike, response: ArrayLike) -> tuple[float, floa
 
 
 def _check_pair(
-    first_name: str, first: ArrayLike, second_name: str, second: ArrayLike
+    first_name: str, first_array: ArrayLike, second_name: str, second_array: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray]:
     """Convert two arrays to numbers, and check that both are (n,) and finite."""
     first_values, second_values = (
-        real_array(first_name, first, "numbers (n,)"),
-        real_array(second_name, second, "numbers (n,)"),
+        real_array(first_name, first_array, "numbers (n,)"),
+        real_array(second_name, second_array, "numbers (n,)"),
     )
     if first_values.ndim != 1 or first_values.shape != second_values.shape or not first_values.size:
         raise ValueError(
@@ -332,18 +334,25 @@ def touch_attributes(
         np.pi / 4 * (relative_diameters * diameter) ** 2,
         [contacts[0].area if contacts else 0.0 for contacts in contacts_of_touches],
     )
-    rise = fall = None
+    rise_time = fall_time = None
     if recording is not None:
         report("times")
         seconds = real_array("recording", recording[0], "seconds (T,), and frames (T, M)")
         frames = _check_frames(recording[1], len(np.atleast_1d(seconds)), linear)
-        rise, fall = response_times(seconds, [_strongest_peak(contacts) for contacts in find_in_frames(frames)])
-    return TouchAttributes(loads_applied, weber, localisation, two_points, area, rise, fall)
+        rise_time, fall_time = response_times(
+            seconds, [_strongest_peak(contacts) for contacts in find_in_frames(frames)]
+        )
+    return TouchAttributes(loads_applied, weber, localisation, two_points, area, rise_time, fall_time)
 
 
-def _check_frames(frames_given, num_touches: int, linear: LinearReconstruction) -> Float[np.ndarray, "n M"]:
+def _check_frames(
+    frames_given, num_touches: int, linear_reconstruction: LinearReconstruction
+) -> Float[np.ndarray, "n M"]:
     """Convert frames to an array. Raises `ValueError` unless they are finite (touches, M channels)."""
-    frames, required_shape = real_array("frames", frames_given, "volts (n, M)"), (num_touches, linear.num_measurements)
+    frames, required_shape = (
+        real_array("frames", frames_given, "volts (n, M)"),
+        (num_touches, linear_reconstruction.num_measurements),
+    )
     if frames.shape != required_shape or not np.isfinite(frames).all():
         raise ValueError(
             f"frames must be finite volts {required_shape}, one for each touch; they have shape {frames.shape}."

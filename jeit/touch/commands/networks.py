@@ -65,8 +65,8 @@ def image_by_network(
         raise ValueError(f"--model is for --method network, not {method or 'the default'}; leave one out.")
     if model is None:
         raise ValueError("--method network needs --model, the folder of 'jeit learn image'.")
-    if given_options := [name for name, value in unused_options.items() if value is not None]:
-        raise ValueError(f"--{given_options[0]} has no use with --method network; leave it out.")
+    if ineffective_options := [name for name, value in unused_options.items() if value is not None]:
+        raise ValueError(f"--{ineffective_options[0]} has no use with --method network; leave it out.")
     data, reference, kind, description = inputs
     console = plain_console()
     with Stopping() as stopping, Steps(console, quiet=quiet) as step:
@@ -88,7 +88,7 @@ def image_by_network(
         else:
             frame_index = None if streamed else 0 if frame is None else frame
             frame_file = _read_frame_file(
-                "DATA", data, kind, description, network, frame_index, is_table=is_table, same_format_as=reference
+                "DATA", data, kind, description, network, frame_index, is_table=is_table, format_example=reference
             )
             frames, numbers, untouched_frames = (
                 frame_file.frames,
@@ -116,11 +116,13 @@ def image_by_network(
             )
     if quiet:
         return
-    deepest, latency = summary.deepest, 1e3 * np.median(summary.latency)
+    deepest_frame, latency = summary.deepest, 1e3 * np.median(summary.latency)
     console.print(f"\n{counted(summary.imaged, 'frame')} imaged, median {latency:.2f} ms each")
-    if deepest.depth > network.floor:
-        x, y = 1e3 * deepest.middle
-        console.print(f"deepest: {1e3 * deepest.depth:.2f} mm at ({x:.1f}, {y:.1f}) mm, in frame {deepest.number}")
+    if deepest_frame.depth > network.floor:
+        x, y = 1e3 * deepest_frame.middle
+        console.print(
+            f"deepest: {1e3 * deepest_frame.depth:.2f} mm at ({x:.1f}, {y:.1f}) mm, in frame {deepest_frame.number}"
+        )
     else:
         console.print(f"untouched: nothing is deeper than noise makes it, {1e3 * network.floor:.2g} mm")
     say_written(console, output / "frames.csv", "depth.npz", "depth.png", "report.json")
@@ -135,12 +137,12 @@ def _read_frame_file(
     frame: int | str | None,
     *,
     is_table: bool,
-    same_format_as: Path | None = None,
+    format_example: Path | None = None,
 ) -> _FrameFile:
     """Read all frames of a file, or only the frame with the number `frame`.
 
     A table without a description, or any file if `is_table`, has one frame in each row, with its channels in the order
-    of the network. Its units and columns are those of the file `same_format_as` if that file has a description, unless
+    of the network. Its units and columns are those of the file `format_example` if that file has a description, unless
     `is_table`.
     """
     import numpy as np
@@ -153,7 +155,7 @@ def _read_frame_file(
 
     has_description = kind is not None or description is not None or table.find_description(path) is not None
     if is_table or (table.recognises(path) and not has_description):
-        description_file = None if same_format_as is None or is_table else table.find_description(same_format_as)
+        description_file = None if format_example is None or is_table else table.find_description(format_example)
         recording = read_frame_recording(path, None if description_file is None else load_description(description_file))
         frames, untouched_frames = recording.frames, recording.reference
         if frames.shape[1] != network.made_for["channels"]:

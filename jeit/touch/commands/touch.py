@@ -96,27 +96,27 @@ def contacts(
         if seconds is None:
             seconds = np.arange(len(recorded.frames)) / (rate or _DEFAULT_RATE)
         with naming_options({"untouched": "--untouched"}):
-            still = (
+            untouched_voltages = (
                 untouched_frames(recorded, seconds, untouched)
                 if reference is None
                 else read_frame_recording(reference, description).frames
             )
         step("prepare")
-        images = TouchImages.prepare(description, still, progress=step.report)
+        images = TouchImages.prepare(description, untouched_voltages, progress=step.report)
         step("find")
-        found = find_recorded_contacts(
-            images, recorded.frames, seconds, still, sign=-1 if lowers else 1, weakest=weakest
+        recorded_contacts = find_recorded_contacts(
+            images, recorded.frames, seconds, untouched_voltages, sign=-1 if lowers else 1, weakest=weakest
         )
         step("write")
-        write_contacts(found, images, output, name=recording.name)
+        write_contacts(recorded_contacts, images, output, name=recording.name)
     if quiet:
         return
-    console.print(f"\n{counted(len(seconds), 'frame')}: {counted(len(found.touches), 'touch')}")
+    console.print(f"\n{counted(len(seconds), 'frame')}: {counted(len(recorded_contacts.touches), 'touch')}")
     if recorded.seconds is None and rate is None:
         console.print(f"  note: no times are known: {_DEFAULT_RATE:g} frames a second are assumed; see --rate")
-    for note in found.notes:
+    for note in recorded_contacts.notes:
         console.print(f"  note: {note}", soft_wrap=True)
-    _print_touches(console, found.touches, images.background)
+    _print_touches(console, recorded_contacts.touches, images.background)
     say_written(console, output / "contacts.csv", "report.json", "contacts.png")
 
 
@@ -271,9 +271,11 @@ def _print_touches(console, touches, background: float) -> None:
     for column in table.columns:
         column.justify = "right"
     for path in touches[:_MAX_PRINTED_TOUCHES]:
-        places = [f"({1e3 * x:+.1f}, {1e3 * y:+.1f})" for x, y in path.position[[0, -1]]]
+        positions_mm = [f"({1e3 * x:+.1f}, {1e3 * y:+.1f})" for x, y in path.position[[0, -1]]]
         peak = path.peak[abs(path.peak).argmax()] / background
-        table.add_row(str(path.number), f"{path.onset:.2f}", f"{path.offset:.2f}", *places, f"{100 * peak:+.0f} %")
+        table.add_row(
+            str(path.number), f"{path.onset:.2f}", f"{path.offset:.2f}", *positions_mm, f"{100 * peak:+.0f} %"
+        )
     if touches:
         console.print()
         console.print(table)

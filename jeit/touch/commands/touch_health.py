@@ -96,7 +96,7 @@ def health(
         seconds = seconds_of(checked_recording, rate)
         times = np.arange(len(checked_recording.frames), dtype=float) if seconds is None else seconds
         with naming_options({"frames": f"'{recording}'"}):
-            doubts = doubts_of(healthy_state, healthy_recording, checked_recording.frames)
+            warnings = doubts_of(healthy_state, healthy_recording, checked_recording.frames)
         state = healthy_state
         for first_frame in range(0, len(times), _FRAMES_PER_MESSAGE):
             step.report(f"{first_frame:,} of {counted(len(times), 'frame')}")
@@ -107,13 +107,19 @@ def health(
             )
         step("write")
         write_health(
-            state, times, checked_recording.frames, output, name=recording.name, timed=seconds is not None, notes=doubts
+            state,
+            times,
+            checked_recording.frames,
+            output,
+            name=recording.name,
+            timed=seconds is not None,
+            notes=warnings,
         )
     if quiet:
         return
     unit = "frame" if seconds is None else "s"
     console.print(f"\n{counted(state.frames, 'frame')}: {counted(len(state.events), 'event')}")
-    for note in doubts:
+    for note in warnings:
         console.print(f"  note: {note}", soft_wrap=True)
     for event in state.events:
         electrode_text = "" if event.electrode is None else f" {event.electrode + 1}"

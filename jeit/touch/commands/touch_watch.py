@@ -67,13 +67,13 @@ def gestures(
     if quiet:
         return
     model, standing = learnt.model, learnt.model.standing
-    people = len(set(gesture_set.person.tolist()))
-    rows = [("recordings", f"{len(gesture_set)}, of {people} {'people' if people > 1 else 'person'}")]
+    num_people = len(set(gesture_set.person.tolist()))
+    rows = [("recordings", f"{len(gesture_set)}, of {num_people} {'people' if num_people > 1 else 'person'}")]
     rows += [("gestures", ", ".join(model.names)), ("classifier", f"{model.method} on {model.form}")]
     if standing is not None:
         is_right = standing.held_out == standing.right
-        shares = ", ".join(f"{name} {100 * is_right[standing.right == name].mean():.0f}" for name in model.names)
-        rows.append(("right, held out", f"{100 * is_right.mean():.1f} % ({shares})"))
+        accuracies = ", ".join(f"{name} {100 * is_right[standing.right == name].mean():.0f}" for name in model.names)
+        rows.append(("right, held out", f"{100 * is_right.mean():.1f} % ({accuracies})"))
     rows += [("note", note) for note in model.notes]
     console.print()
     console.print(name_value_table(f"Learnt from {recordings.name}", rows))
@@ -173,7 +173,7 @@ def watch(
         if live_frames is not None and not quiet:
             console.print("  ready: the skin may be touched")
 
-        def show(frame) -> None:
+        def show_frame(frame) -> None:
             if frame.note and not quiet:
                 console.print(f"  note: {frame.note}", soft_wrap=True)
             # In a live stream, a touch is printed once it is classified; in a file, once it has ended, with its final
@@ -182,37 +182,39 @@ def watch(
             for touch in () if quiet else finished_touches:
                 console.print(_describe_touch(touch))
 
-        written = write_watch(watch.follow(stopping.until(frames)), watch, output, name=stream, progress=show)
+        written_watch = write_watch(
+            watch.follow(stopping.until(frames)), watch, output, name=stream, progress=show_frame
+        )
     if not quiet:
-        _print_summary(console, written, live_frames, output)
+        _print_summary(console, written_watch, live_frames, output)
     if stopping.signal == signal.SIGTERM:
         raise typer.Exit(128 + signal.SIGTERM)
 
 
-def _print_summary(console, written, live_frames, output: Path) -> None:
+def _print_summary(console, written_watch, live_frames, output: Path) -> None:
     """Print a summary of the classified touches, the delays and the refused frames of a stream."""
     import numpy as np
 
     from jeit.arguments import counted
     from jeit.cli.console import say_written
 
-    frame_counts = ", ".join(f"{number} {status}" for status, number in sorted(written.counts.items()))
-    num_unlike = sum(touch.unlike for touch in written.touches)
-    console.print(f"\n{counted(len(written.seconds), 'frame')}: {frame_counts}")
-    console.print(f"{counted(len(written.touches), 'touch')}, {num_unlike} of them unlike any learnt from")
-    if written.latency.size:
-        median_latency, high_latency = 1e3 * np.quantile(written.latency, (0.5, 0.99))
+    frame_counts = ", ".join(f"{number} {status}" for status, number in sorted(written_watch.counts.items()))
+    num_unlike = sum(touch.unlike for touch in written_watch.touches)
+    console.print(f"\n{counted(len(written_watch.seconds), 'frame')}: {frame_counts}")
+    console.print(f"{counted(len(written_watch.touches), 'touch')}, {num_unlike} of them unlike any learnt from")
+    if written_watch.latency.size:
+        median_latency, high_latency = 1e3 * np.quantile(written_watch.latency, (0.5, 0.99))
         console.print(
             f"named within {median_latency:.1f} ms of the frame after (median), 99 % within {high_latency:.1f} ms"
         )
     if live_frames is not None and live_frames.left_out:
         console.print(f"{counted(live_frames.left_out, 'frame')} left out that had come before they could be read")
-    if written.first_reason:
-        console.print(f"first refusal: {written.first_reason}", soft_wrap=True)
+    if written_watch.first_reason:
+        console.print(f"first refusal: {written_watch.first_reason}", soft_wrap=True)
     say_written(console, output / "events.csv", "paths.csv", "report.json", "timeline.png")
 
 
-def _read_recording(path: Path, description, untouched, span: float, rate: float):
+def _read_recording(path: Path, description, untouched, untouched_duration: float, rate: float):
     """Read a recording: return its frames with their times, the frames of the untouched skin, and the frame rate."""
     import numpy as np
 
@@ -227,7 +229,7 @@ def _read_recording(path: Path, description, untouched, span: float, rate: float
         rate = 1 / float(np.median(np.diff(seconds)))
     if untouched is None:
         with naming_options({"untouched": "--untouched"}):
-            untouched = untouched_frames(recording, seconds, span)
+            untouched = untouched_frames(recording, seconds, untouched_duration)
     return zip(seconds.tolist(), recording.frames, strict=True), untouched, rate
 
 

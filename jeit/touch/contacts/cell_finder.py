@@ -39,8 +39,8 @@ def gaussian_means(mesh: Mesh, length: float | None) -> sparse.csr_array:
     tree = KDTree(centres)
     distances = tree.sparse_distance_matrix(tree, _CUTOFF_DEVIATIONS * length, output_type="coo_matrix")
     weights = np.exp(-((distances.data / length) ** 2) / 2) * areas[distances.col]
-    means = sparse.csr_array((weights, (distances.row, distances.col)), shape=distances.shape)
-    return sparse.csr_array(sparse.diags_array(1 / means.sum(axis=1)) @ means)
+    weighted_sums = sparse.csr_array((weights, (distances.row, distances.col)), shape=distances.shape)
+    return sparse.csr_array(sparse.diags_array(1 / weighted_sums.sum(axis=1)) @ weighted_sums)
 
 
 def outline_of_cells(points: Float[np.ndarray, "n d"], cells: Int[np.ndarray, "c 3"]) -> Float[np.ndarray, "k d"]:

@@ -157,11 +157,11 @@ def _clipped_deviation(values: Float[np.ndarray, " m"]) -> float:
     remaining_values = values
     for _ in range(_MAX_ROUNDS):
         median = np.median(remaining_values)
-        spread = _DEVIATION_PER_MEDIAN * np.median(np.abs(remaining_values - median))
-        values_within = values[np.abs(values - median) <= _CLIPPING_DEVIATIONS * spread]
-        if len(values_within) == len(remaining_values):
+        robust_deviation = _DEVIATION_PER_MEDIAN * np.median(np.abs(remaining_values - median))
+        kept_values = values[np.abs(values - median) <= _CLIPPING_DEVIATIONS * robust_deviation]
+        if len(kept_values) == len(remaining_values):
             break
-        remaining_values = values_within
+        remaining_values = kept_values
     return float(_CLIPPED_DEVIATION * remaining_values.std())
 
 

@@ -232,19 +232,19 @@ class RasterFinder(AbstractFinder):
         )
 
     def _membership_noise(
-        self, cell_indices: np.ndarray, excess: np.ndarray, noise: ImageNoise
+        self, cell_indices: np.ndarray, pixel_excess: np.ndarray, noise: ImageNoise
     ) -> tuple[np.ndarray, np.ndarray]:
         """Compute the uncertainty of cells' membership in a contact: slope (m,) against the cell's value, and standard
         deviation (m,) of the independent part.
 
         A cell is wholly inside or outside a contact (membership 1 or 0). Suppose that the smoothed value of a cell
-        exceeds the threshold by `excess` on average, with standard deviation σ. The cell is then inside with
+        exceeds the threshold by `pixel_excess` on average, with standard deviation σ. The cell is then inside with
         probability p = Φ(z), z = excess / σ, where Φ and φ are the normal distribution and its density. On average, the
         cell's membership changes with its value at the rate φ(z) / σ. The remaining part of the membership has the
         standard deviation √(p (1 − p) − φ(z)²), independently for each cell.
         """
         num_pixels = np.bincount(cell_indices, minlength=self.num_cells)
-        mean_excess = np.bincount(cell_indices, excess, minlength=self.num_cells) / np.maximum(num_pixels, 1)
+        mean_excess = np.bincount(cell_indices, pixel_excess, minlength=self.num_cells) / np.maximum(num_pixels, 1)
         deviation = np.maximum(noise.smoothed(self.smoothing), np.finfo(float).tiny)
         normalised_excess = mean_excess / deviation
         probability, density = ndtr(normalised_excess), np.exp(-(normalised_excess**2) / 2) / np.sqrt(2 * np.pi)

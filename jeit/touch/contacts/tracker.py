@@ -215,9 +215,12 @@ def track_contacts(
     """
     requirement = "a list with those of every frame, each a list"
     check_kind("contacts", contacts, (list, tuple, np.ndarray), requirement)
-    for index, frame_contacts in enumerate(contacts):
+    for frame_index, frame_contacts in enumerate(contacts):
         check_kind(
-            f"contacts[{index}]", frame_contacts, (list, tuple, np.ndarray), "a list of contacts, those of one frame"
+            f"contacts[{frame_index}]",
+            frame_contacts,
+            (list, tuple, np.ndarray),
+            "a list of contacts, those of one frame",
         )
     times = real_array("times", times, "seconds (F,), one for each frame")
     if times.shape != (len(contacts),):
@@ -229,17 +232,17 @@ def track_contacts(
     return tracker.touches
 
 
-def without_side_lobes(touches: list[TouchPath], weakest: float) -> list[TouchPath]:
+def remove_side_lobes(touches: list[TouchPath], weakest: float) -> list[TouchPath]:
     """Return the touches whose maximum peak is at least `weakest` times that of every touch at the same time.
 
     A linear image of a contact has side lobes, which look like weaker contacts.
     """
 
-    def largest_simultaneous_peak(touch: TouchPath) -> float:
-        beside = [one for one in touches if one.onset <= touch.offset and touch.onset <= one.offset]
-        return max(float(np.abs(one.peak).max()) for one in beside)
+    def find_max_simultaneous_peak(touch: TouchPath) -> float:
+        simultaneous_touches = [one for one in touches if one.onset <= touch.offset and touch.onset <= one.offset]
+        return max(float(np.abs(one.peak).max()) for one in simultaneous_touches)
 
-    return [touch for touch in touches if np.abs(touch.peak).max() >= weakest * largest_simultaneous_peak(touch)]
+    return [touch for touch in touches if np.abs(touch.peak).max() >= weakest * find_max_simultaneous_peak(touch)]
 
 
 def _update_touch(touch: _TrackedTouch, time: float, contact: Contact) -> _TrackedTouch:

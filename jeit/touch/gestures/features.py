@@ -24,11 +24,11 @@ FEATURES = {
 
 # Number of instants, evenly spaced from onset to end of a touch, at which the maximum change P is sampled.
 _NUM_INSTANTS = 16
-_FURTHER_FEATURES = (
+_ADDITIONAL_FEATURES = (
     "area", "area spread", "path length", "farthest", "speed", "fastest", "straightness", "peaks", "rise", "decay",
     "roughness", "pauses", "centre of gravity", "breadth",
 )  # fmt: skip
-COURSE_FEATURES = (*FEATURES, *_FURTHER_FEATURES, *(f"course {instant + 1}" for instant in range(_NUM_INSTANTS)))
+COURSE_FEATURES = (*FEATURES, *_ADDITIONAL_FEATURES, *(f"course {instant + 1}" for instant in range(_NUM_INSTANTS)))
 """Names of the features of `course_features`: the seven features, further features of the time course, and samples of
 P."""
 
@@ -80,8 +80,10 @@ def touch_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> Touc
     print(features)
     ```
     """
-    courses = _time_courses(touches)
-    values = np.array([_seven_features(course) for course in courses]).reshape(len(courses), len(FEATURES))
+    time_courses = _time_courses(touches)
+    values = np.array([_seven_features(time_course) for time_course in time_courses]).reshape(
+        len(time_courses), len(FEATURES)
+    )
     return TouchFeatures(values, tuple(FEATURES), tuple(FEATURES.values()))
 
 
@@ -96,10 +98,10 @@ def course_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> Tou
     divided by the duration and weighted by P; P / max P at instants evenly spaced in time. Raises `ValueError` if
     `touches` is not a list of touches.
     """
-    courses = _time_courses(touches)
+    time_courses = _time_courses(touches)
     seven_features = touch_features(touches)
-    values = np.array([_further_features(course) for course in courses]).reshape(
-        len(courses), len(_FURTHER_FEATURES) + _NUM_INSTANTS
+    values = np.array([_additional_features(time_course) for time_course in time_courses]).reshape(
+        len(time_courses), len(_ADDITIONAL_FEATURES) + _NUM_INSTANTS
     )
     units = ("m²", "1", "m", "m", "m/s", "m/s", "1", "1", "s", "s", "1", "1", "1", "1", *["1"] * _NUM_INSTANTS)
     return TouchFeatures(np.hstack([seven_features.values, values]), COURSE_FEATURES, (*seven_features.units, *units))
@@ -114,10 +116,12 @@ def sequence_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> T
     movement, with the sign that makes the largest displacement positive. Raises `ValueError` if `touches` is not a list
     of touches.
     """
-    courses = _time_courses(touches)
+    time_courses = _time_courses(touches)
     course_values = course_features(touches)
     num_columns = NUM_SEQUENCE_INSTANTS * len(SEQUENCE_VALUES)
-    values = np.array([_sample_course(course).ravel() for course in courses]).reshape(len(courses), num_columns)
+    values = np.array([_sample_time_course(time_course).ravel() for time_course in time_courses]).reshape(
+        len(time_courses), num_columns
+    )
     units = ("image", "1", "image", "m²", "1", "m/s", "m", "m") * NUM_SEQUENCE_INSTANTS
     return TouchFeatures(np.hstack([course_values.values, values]), SEQUENCE_FEATURES, (*course_values.units, *units))
 
@@ -129,48 +133,48 @@ def _time_courses(touches) -> list[ChangeCourse]:
     return [touch.course for touch in touches]
 
 
-def _seven_features(course: ChangeCourse) -> list[float]:
+def _seven_features(time_course: ChangeCourse) -> list[float]:
     """Compute the seven features of one touch from its time course, in the order of `FEATURES`."""
-    peak_frame = int(course.peak.argmax())
-    intervals = np.diff(course.seconds)
-    rate = np.mean(np.abs(np.diff(course.peak)) / intervals) if intervals.size else 0.0
+    peak_frame = int(time_course.peak.argmax())
+    intervals = np.diff(time_course.seconds)
+    rate = np.mean(np.abs(np.diff(time_course.peak)) / intervals) if intervals.size else 0.0
     return [
-        course.peak[peak_frame],
-        course.least.min(),
-        course.half_share[peak_frame],
-        course.mean[peak_frame],
-        course.seconds[-1] - course.seconds[0],
+        time_course.peak[peak_frame],
+        time_course.least.min(),
+        time_course.half_share[peak_frame],
+        time_course.mean[peak_frame],
+        time_course.seconds[-1] - time_course.seconds[0],
         float(rate),
-        float(np.linalg.norm(course.centroid[-1] - course.centroid[0])),
+        float(np.linalg.norm(time_course.centroid[-1] - time_course.centroid[0])),
     ]
 
 
-def _further_features(course: ChangeCourse) -> list[float]:
+def _additional_features(time_course: ChangeCourse) -> list[float]:
     """Compute the features of one touch that follow the first seven in `COURSE_FEATURES`, in this order."""
-    has_centroid = np.isfinite(course.centroid[:, 0])  # a frame below the level has no centroid
-    centroids, seconds = course.centroid[has_centroid], course.seconds[has_centroid]
+    has_centroid = np.isfinite(time_course.centroid[:, 0])  # a frame below the level has no centroid
+    centroids, seconds = time_course.centroid[has_centroid], time_course.seconds[has_centroid]
     steps = np.linalg.norm(np.diff(centroids, axis=0), axis=1)
     path_length, displacement = float(steps.sum()), float(np.linalg.norm(centroids[-1] - centroids[0]))
-    duration = max(course.seconds[-1] - course.seconds[0], 1e-9)
+    duration = max(time_course.seconds[-1] - time_course.seconds[0], 1e-9)
     speeds = steps / np.diff(seconds) if steps.size else np.zeros(1)
-    relative_peaks = course.peak / course.peak.max()
+    relative_peaks = time_course.peak / time_course.peak.max()
     peak_frame = int(relative_peaks.argmax())
-    relative_times = (course.seconds - course.seconds[0]) / duration
+    relative_times = (time_course.seconds - time_course.seconds[0]) / duration
     weights = relative_peaks / relative_peaks.sum()
     mean_time = float(weights @ relative_times)
     differences = np.diff(relative_peaks)
     peak_frames = np.flatnonzero((differences[:-1] > 0) & (differences[1:] <= 0)) + 1
     return [
-        float(course.area[has_centroid].mean()),
-        float(course.area[has_centroid].std() / course.area[has_centroid].mean()),
+        float(time_course.area[has_centroid].mean()),
+        float(time_course.area[has_centroid].std() / time_course.area[has_centroid].mean()),
         path_length,
         float(np.linalg.norm(centroids - centroids[0], axis=1).max()),
         path_length / duration,
         float(np.quantile(speeds, 0.9)),
         displacement / max(path_length, 1e-9),
         float(max(np.count_nonzero(relative_peaks[peak_frames] > 0.5), 1)),
-        float(course.seconds[peak_frame] - course.seconds[0]),
-        float(course.seconds[-1] - course.seconds[peak_frame]),
+        float(time_course.seconds[peak_frame] - time_course.seconds[0]),
+        float(time_course.seconds[-1] - time_course.seconds[peak_frame]),
         float(np.abs(differences).sum()),
         float(np.mean(relative_peaks < 0.5)),
         mean_time,
@@ -179,35 +183,39 @@ def _further_features(course: ChangeCourse) -> list[float]:
     ]
 
 
-def _sample_course(course: ChangeCourse) -> Float[np.ndarray, "T c"]:
+def _sample_time_course(time_course: ChangeCourse) -> Float[np.ndarray, "T c"]:
     """Sample the quantities `SEQUENCE_VALUES` at `NUM_SEQUENCE_INSTANTS` instants of a touch."""
-    seconds = course.seconds
-    instants = np.linspace(seconds[0], seconds[-1], NUM_SEQUENCE_INSTANTS)
-    has_centroid = np.isfinite(course.centroid[:, 0])  # a frame below the level has no centroid
+    seconds = time_course.seconds
+    sample_times = np.linspace(seconds[0], seconds[-1], NUM_SEQUENCE_INSTANTS)
+    has_centroid = np.isfinite(time_course.centroid[:, 0])  # a frame below the level has no centroid
     centroids = np.stack(
-        [np.interp(instants, seconds[has_centroid], coordinate[has_centroid]) for coordinate in course.centroid.T],
+        [
+            np.interp(sample_times, seconds[has_centroid], coordinate[has_centroid])
+            for coordinate in time_course.centroid.T
+        ],
         axis=1,
     )
     steps = np.linalg.norm(np.diff(centroids, axis=0, prepend=centroids[:1]), axis=1)
     speed = steps / max((seconds[-1] - seconds[0]) / (NUM_SEQUENCE_INSTANTS - 1), 1e-9)
     centred_path = centroids - centroids.mean(axis=0)
-    positions_along = centred_path @ np.linalg.svd(centred_path, full_matrices=False)[2][0]
-    positions_along = positions_along - positions_along[0]
-    largest_displacement = positions_along[np.abs(positions_along).argmax()]
-    change, mean, area, half = (
-        np.interp(instants, seconds, values) for values in (course.peak, course.mean, course.area, course.half_share)
+    positions_on_axis = centred_path @ np.linalg.svd(centred_path, full_matrices=False)[2][0]
+    positions_on_axis = positions_on_axis - positions_on_axis[0]
+    largest_displacement = positions_on_axis[np.abs(positions_on_axis).argmax()]
+    change, mean, area, half_share = (
+        np.interp(sample_times, seconds, values)
+        for values in (time_course.peak, time_course.mean, time_course.area, time_course.half_share)
     )
     distance = np.linalg.norm(centroids - centroids[0], axis=1)
     return np.stack(
         [
             change,
-            change / course.peak.max(),
+            change / time_course.peak.max(),
             mean,
             area,
-            half,
+            half_share,
             speed,
             distance,
-            np.sign(largest_displacement) * positions_along,
+            np.sign(largest_displacement) * positions_on_axis,
         ],
         axis=1,
     )

@@ -74,7 +74,7 @@ def learn_gestures(
     untouched_changes = images.changes(recordings.untouched)
     level, sign = _touch_level_and_sign(images, untouched_changes, recordings)
     touches: list[StreamTouch] = []
-    with_touch, without_touch = [], []
+    indices_with_touch, indices_without_touch = [], []
     for recording_index, (seconds, changes) in enumerate(
         _times_and_changes(images, recordings, range(len(recordings)))
     ):
@@ -83,13 +83,13 @@ def learn_gestures(
         recording_touches = find_touches(level, seconds, sign * changes) if len(seconds) else []
         if recording_touches:
             touches.append(max(recording_touches, key=lambda touch: touch.offset - touch.onset))
-            with_touch.append(recording_index)
+            indices_with_touch.append(recording_index)
         else:
-            without_touch.append(recording_index)
-    if len(without_touch) > len(with_touch):
+            indices_without_touch.append(recording_index)
+    if len(indices_without_touch) > len(indices_with_touch):
         raise ValueError(
-            f"recordings: {len(without_touch)} of {len(recordings)} have no touch that exceeds the untouched skin's "
-            "noise and drift; touch more firmly, or record the untouched skin just before."
+            f"recordings: {len(indices_without_touch)} of {len(recordings)} have no touch that exceeds the untouched "
+            "skin's noise and drift; touch more firmly, or record the untouched skin just before."
         )
     rate = 1 / float(
         np.median([np.median(np.diff(touch.course.seconds)) for touch in touches if len(touch.course) > 1])
@@ -97,15 +97,17 @@ def learn_gestures(
     protocol = images.calibration.model.protocol
     model = GestureModel.fit(
         touches,
-        recordings.gesture[with_touch],
-        people=recordings.person[with_touch],
+        recordings.gesture[indices_with_touch],
+        people=recordings.person[indices_with_touch],
         method=method,
         form=form,
         reading=Reading(level.level, images.background, sign, rate, images.num_channels, protocol.name),
-        notes=(f"{counted(len(without_touch), 'recording')} without a touch left out.",) if without_touch else (),
+        notes=(f"{counted(len(indices_without_touch), 'recording')} without a touch left out.",)
+        if indices_without_touch
+        else (),
         progress=report,
     )
-    return LearntGestures(model, images, tuple(without_touch))
+    return LearntGestures(model, images, tuple(indices_without_touch))
 
 
 def _touch_level_and_sign(images: TouchImages, untouched: np.ndarray, recordings: GestureSet) -> tuple[TouchLevel, int]:

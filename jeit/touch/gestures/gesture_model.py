@@ -206,10 +206,10 @@ class GestureModel:
             raise ValueError(f"form: '{method}' takes {' or '.join(feature_forms(method))}; '{form}' was requested.")
         results.sort(key=lambda result: result[0])
         _, chosen_method, feature_form, odds = results[0]
-        values, courses = FEATURE_FORMS[feature_form](touches).values, course_features(touches).values
-        tried = [(f"{name} on {feature_form}", error) for error, name, feature_form, _ in results]
-        scale, known_scale = Scale.from_features(values), Scale.from_features(courses)
-        known = known_scale(courses)
+        values, course_values = FEATURE_FORMS[feature_form](touches).values, course_features(touches).values
+        method_errors = [(f"{name} on {feature_form}", error) for error, name, feature_form, _ in results]
+        scale, known_scale = Scale.from_features(values), Scale.from_features(course_values)
+        scaled_courses = known_scale(course_values)
         return cls(
             names=tuple(str(name) for name in names),
             method=chosen_method,
@@ -217,11 +217,11 @@ class GestureModel:
             scale=scale,
             model=GESTURE_CLASSIFIERS[chosen_method](scale(values), class_indices),
             sharpness=fit_sharpness(odds, class_indices),
-            known=known,
+            known=scaled_courses,
             known_scale=known_scale,
-            farthest=_held_out_distance(known, folds),
+            farthest=_max_held_out_distance(scaled_courses, folds),
             reading=reading,
-            standing=Standing(tried[0][0], tried, names[odds.argmax(axis=1)], label_array),
+            standing=Standing(method_errors[0][0], method_errors, names[odds.argmax(axis=1)], label_array),
             notes=tuple(model_notes),
         )
 
@@ -243,10 +243,12 @@ class GestureModel:
             )
         odds = np.full((len(values), len(self.names)), -1e3)
         odds[:, self.model.classes_] = log_odds(self.model, self.scale(values))
-        shares = probabilities(odds, self.sharpness)
+        class_probabilities = probabilities(odds, self.sharpness)
         distances = _nearest_distance(self.known, self.known_scale(course_features(touches).values))
-        gestures = np.array(self.names)[shares.argmax(axis=1)]
-        return Gestures(gestures, shares.max(axis=1), shares, self.names, distances > self.farthest)
+        gestures = np.array(self.names)[class_probabilities.argmax(axis=1)]
+        return Gestures(
+            gestures, class_probabilities.max(axis=1), class_probabilities, self.names, distances > self.farthest
+        )
 
     def write(self, path: str | Path) -> None:
         """Write the model, without its `standing`, to one file. Raises `ValueError` if `path` is a folder."""
@@ -268,10 +270,14 @@ class GestureModel:
             raise FileNotFoundError(f"'{path}': there is no such file; `jeit touch gestures` makes one.")
 
         def make(field_values: dict[str, Any]) -> "GestureModel":
-            parts: dict[str, Any] = {name: Scale(**field_values[name]) for name in ("scale", "known_scale")}
-            parts["reading"] = None if field_values["reading"] is None else Reading(**field_values["reading"])
+            converted_values: dict[str, Any] = {name: Scale(**field_values[name]) for name in ("scale", "known_scale")}
+            converted_values["reading"] = (
+                None if field_values["reading"] is None else Reading(**field_values["reading"])
+            )
             all_values: Any = (
-                field_values | parts | {"names": tuple(field_values["names"]), "notes": tuple(field_values["notes"])}
+                field_values
+                | converted_values
+                | {"names": tuple(field_values["names"]), "notes": tuple(field_values["notes"])}
             )
             return cls(**all_values)
 
@@ -314,7 +320,7 @@ def _nearest_distance(training_features: np.ndarray, features: np.ndarray) -> Fl
     return apply_in_parts(lambda rows: cdist(rows, training_features).min(axis=1), features, _CHUNK_SIZE)
 
 
-def _held_out_distance(training_features: Float[np.ndarray, "N k"], folds: Int[np.ndarray, " N"]) -> float:
+def _max_held_out_distance(training_features: Float[np.ndarray, "N k"], folds: Int[np.ndarray, " N"]) -> float:
     """Compute the 99 % quantile of the distance of a fold's touches from the nearest touch of the other folds."""
     distances = [
         _nearest_distance(training_features[folds != fold_index], training_features[folds == fold_index])

@@ -75,48 +75,48 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
         if len(self.classes_) < 2:
             raise ValueError(f"y has one class only, {describe(self.classes_[0])}; give samples of two or more.")
         class_indicators = np.eye(len(self.classes_))[class_indices]
-        score = np.zeros(class_indicators.shape)
-        stumps, steps, likelihoods = [], [], [_log_likelihood(score, class_indices)]
+        class_scores = np.zeros(class_indicators.shape)
+        stumps, steps, likelihoods = [], [], [_log_likelihood(class_scores, class_indices)]
         for _ in range(self.n_estimators):
-            stump = _fit_stumps(X, class_indicators, _softmax(score))
+            stump = _fit_stumps(X, class_indicators, _softmax(class_scores))
             increments = _stump_values(X, *stump)
             step, new_likelihood = _largest_step(
-                score, increments, class_indices, float(self.learning_rate), likelihoods[-1]
+                class_scores, increments, class_indices, float(self.learning_rate), likelihoods[-1]
             )
-            score = score + step * increments
+            class_scores = class_scores + step * increments
             stumps.append(stump)
             steps.append(step)
             likelihoods.append(new_likelihood)
-        feature, threshold, below, above = map(np.array, zip(*stumps, strict=True))
+        feature, threshold, values_below, values_above = map(np.array, zip(*stumps, strict=True))
         self.feature_, self.threshold_, self.step_ = feature.astype(int), threshold, np.array(steps)
-        self.below_, self.above_ = (self.step_[:, None] * values for values in (below, above))
+        self.below_, self.above_ = (self.step_[:, None] * values for values in (values_below, values_above))
         self.log_likelihood_ = np.array(likelihoods)
         return self
 
     def _staged_scores(self, X: Any) -> Iterator[Float[np.ndarray, "n J"]]:
         check_is_fitted(self)
         X = validate_data(self, X, dtype=np.float32, reset=False)
-        score = np.zeros((len(X), len(self.classes_)))
-        for feature, threshold, below, above in zip(
+        class_scores = np.zeros((len(X), len(self.classes_)))
+        for feature, threshold, values_below, values_above in zip(
             self.feature_, self.threshold_, self.below_, self.above_, strict=True
         ):
-            score = score + _stump_values(X, feature, threshold, below, above)
-            yield score
+            class_scores = class_scores + _stump_values(X, feature, threshold, values_below, values_above)
+            yield class_scores
 
     def staged_decision_function(self, X: Any) -> Iterator[np.ndarray]:
         """Yield the result of `decision_function` after each boosting round."""
-        for score in self._staged_scores(X):
-            yield score[:, 1] - score[:, 0] if len(self.classes_) == 2 else score
+        for class_scores in self._staged_scores(X):
+            yield class_scores[:, 1] - class_scores[:, 0] if len(self.classes_) == 2 else class_scores
 
     def staged_predict_proba(self, X: Any) -> Iterator[Float[np.ndarray, "n J"]]:
         """Yield the probabilities (n, J) of `predict_proba` after each boosting round."""
-        for score in self._staged_scores(X):
-            yield _softmax(score)
+        for class_scores in self._staged_scores(X):
+            yield _softmax(class_scores)
 
     def staged_predict(self, X: Any) -> Iterator[np.ndarray]:
         """Yield the classes (n,) of `predict` after each boosting round."""
-        for score in self._staged_scores(X):
-            yield self.classes_[score.argmax(axis=1)]
+        for class_scores in self._staged_scores(X):
+            yield self.classes_[class_scores.argmax(axis=1)]
 
     def decision_function(self, X: Any) -> np.ndarray:
         """Return the scores F (n, J), whose softmax gives the probabilities, for features (n, k); for two classes,
@@ -167,13 +167,13 @@ def _fit_stumps(X: np.ndarray, class_indicators: np.ndarray, probability: np.nda
     return feature, threshold, value_below, value_above
 
 
-def _stump_values(X: np.ndarray, feature, threshold, below, above) -> Float[np.ndarray, "n J"]:
+def _stump_values(X: np.ndarray, feature, threshold, values_below, values_above) -> Float[np.ndarray, "n J"]:
     """Return the values (n, J) that the stumps of a round add to the scores F."""
-    values = np.where(X[:, feature] <= threshold, below, above)
+    values = np.where(X[:, feature] <= threshold, values_below, values_above)
     return values - values.mean(axis=1, keepdims=True)
 
 
-def _largest_step(score, increments, class_indices, step: float, min_likelihood: float) -> tuple[float, float]:
+def _largest_step(class_scores, increments, class_indices, step: float, min_likelihood: float) -> tuple[float, float]:
     """Find the largest step of `step`, `step` / 2, `step` / 4 … that keeps the log-likelihood at `min_likelihood` or
     above.
 
@@ -181,16 +181,16 @@ def _largest_step(score, increments, class_indices, step: float, min_likelihood:
     remaining gain is below rounding errors.
     """
     for _ in range(_MAX_HALVINGS):
-        likelihood = _log_likelihood(score + step * increments, class_indices)
+        likelihood = _log_likelihood(class_scores + step * increments, class_indices)
         if likelihood >= min_likelihood:
             return step, likelihood
         step /= 2
     return 0.0, min_likelihood
 
 
-def _log_likelihood(score: np.ndarray, class_indices: np.ndarray) -> float:
+def _log_likelihood(class_scores: np.ndarray, class_indices: np.ndarray) -> float:
     """Compute the mean natural log-likelihood of the classes `class_indices` (n,) for the scores (n, J)."""
-    shifted_scores = score - score.max(axis=1, keepdims=True)
+    shifted_scores = class_scores - class_scores.max(axis=1, keepdims=True)
     return float(
         np.mean(
             shifted_scores[np.arange(len(class_indices)), class_indices] - np.log(np.exp(shifted_scores).sum(axis=1))
@@ -198,6 +198,6 @@ def _log_likelihood(score: np.ndarray, class_indices: np.ndarray) -> float:
     )
 
 
-def _softmax(score: np.ndarray) -> Float[np.ndarray, "n J"]:
-    exponentials = np.exp(score - score.max(axis=1, keepdims=True))
+def _softmax(class_scores: np.ndarray) -> Float[np.ndarray, "n J"]:
+    exponentials = np.exp(class_scores - class_scores.max(axis=1, keepdims=True))
     return exponentials / exponentials.sum(axis=1, keepdims=True)

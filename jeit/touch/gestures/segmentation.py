@@ -49,10 +49,13 @@ class ChangeCourse(Module):
         return ChangeCourse(*(getattr(self, name)[frames] for name in _FIELD_NAMES))
 
     @classmethod
-    def joined(cls, courses: "list[ChangeCourse]") -> "ChangeCourse":
+    def concatenate(cls, time_courses: "list[ChangeCourse]") -> "ChangeCourse":
         """Concatenate time courses; an empty list gives a time course without frames."""
         empty_arrays = {name: np.empty((0, 2) if name == "centroid" else 0) for name in _FIELD_NAMES}
-        arrays = {name: [empty_arrays[name], *(getattr(course, name) for course in courses)] for name in _FIELD_NAMES}
+        arrays = {
+            name: [empty_arrays[name], *(getattr(time_course, name) for time_course in time_courses)]
+            for name in _FIELD_NAMES
+        }
         return cls(*(np.concatenate(arrays[name]) for name in _FIELD_NAMES))
 
 
@@ -127,7 +130,7 @@ class TouchLevel(Module):
             raise ValueError("images have NaN or infinite values; leave out those frames, as `find_touches` does.")
         peak = images.max(axis=1, initial=-np.inf)
         is_above_level = images > self.level
-        num_above = np.maximum(is_above_level.sum(axis=1), 1)
+        num_elements_above = np.maximum(is_above_level.sum(axis=1), 1)
         weights = self.areas * np.where(is_above_level, images - self.level, 0.0)
         total_weight = weights.sum(axis=1, keepdims=True)
         centroid = weights @ self.centres / np.where(total_weight > 0, total_weight, np.nan)
@@ -136,7 +139,7 @@ class TouchLevel(Module):
             peak=peak,
             least=images.min(axis=1, initial=np.inf),
             half_share=np.mean(images >= peak[:, None] / 2, axis=1),
-            mean=np.where(is_above_level, images, 0.0).sum(axis=1) / num_above,
+            mean=np.where(is_above_level, images, 0.0).sum(axis=1) / num_elements_above,
             area=is_above_level @ self.areas,
             centroid=centroid,
         )
@@ -261,15 +264,15 @@ class TouchStream(Module):
         frame = check_images(np.asarray(image)[None], len(self.level.areas))
         if second == self.second or not np.isfinite(frame).all():
             return replace(self, lost=(self.lost[0], self.lost[1] + 1)) if self.open else self
-        course = self.level.course(np.array([float(second)]), frame)
+        time_course = self.level.course(np.array([float(second)]), frame)
         new_state, is_after_gap = self, second - self.second >= self.gap - _TIME_TOLERANCE
         if self.open and second - self.open[self.held - 1].seconds[0] >= self.gap - _TIME_TOLERANCE:
             new_state = replace(self, ended=(*self.ended, *self._current_touch()), open=(), held=0, lost=(0, 0))
-        is_above_level = bool(course.peak[0] > self.level.level)
+        is_above_level = bool(time_course.peak[0] > self.level.level)
         if is_above_level and not new_state.open:
             new_state = replace(new_state, begun_before=bool(is_after_gap))
         if is_above_level or new_state.open:
-            new_state = replace(new_state, open=(*new_state.open, course))
+            new_state = replace(new_state, open=(*new_state.open, time_course))
         if is_above_level:
             new_state = replace(new_state, held=len(new_state.open), lost=(sum(new_state.lost), 0))
         return replace(new_state, second=float(second))
@@ -283,9 +286,9 @@ class TouchStream(Module):
         if self.held < self.least:
             return ()
         # If the last frame is above the level, the touch may have continued after it.
-        cut_off = self.held == len(self.open)
-        course = ChangeCourse.joined(list(self.open[: self.held]))
-        return (StreamTouch(course, self.lost[0], self.begun_before, cut_off),)
+        is_cut_off = self.held == len(self.open)
+        time_course = ChangeCourse.concatenate(list(self.open[: self.held]))
+        return (StreamTouch(time_course, self.lost[0], self.begun_before, is_cut_off),)
 
 
 def find_touches(
@@ -327,11 +330,12 @@ def find_touches(
             f"gap is {gap:g} s, and frames are {np.median(intervals):.3g} s apart: no touch lasts for two of them. "
             "Give a greater gap."
         )
-    course = level.course(seconds[used_frames], images[used_frames])
+    time_course = level.course(seconds[used_frames], images[used_frames])
     is_after_gap = np.concatenate([[True], intervals >= gap - _TIME_TOLERANCE, [True]])
-    frames_above_level = np.flatnonzero(course.peak > level.level)
+    frames_above_level = np.flatnonzero(time_course.peak > level.level)
     frame_groups = np.split(
-        frames_above_level, 1 + np.flatnonzero(np.diff(course.seconds[frames_above_level]) >= gap - _TIME_TOLERANCE)
+        frames_above_level,
+        1 + np.flatnonzero(np.diff(time_course.seconds[frames_above_level]) >= gap - _TIME_TOLERANCE),
     )
     touches = []
     for frames in frame_groups:
@@ -339,7 +343,7 @@ def find_touches(
             continue
         first_frame, last_frame = frames[0], frames[-1]
         num_lost = int(used_frames[last_frame] - used_frames[first_frame] - (last_frame - first_frame))
-        touch_course = course.select(slice(first_frame, last_frame + 1))
+        touch_course = time_course.select(slice(first_frame, last_frame + 1))
         touches.append(
             StreamTouch(touch_course, num_lost, bool(is_after_gap[first_frame]), bool(is_after_gap[last_frame + 1]))
         )

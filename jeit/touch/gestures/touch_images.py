@@ -23,7 +23,7 @@ from jeit.inverse.nonlinear.solvers import OneStep
 from jeit.inverse.streaming.stream import FrameImage
 from jeit.mesh import Mesh
 from jeit.touch.contacts import CellFinder, Contact, ImageNoise, find_contacts, track_contacts
-from jeit.touch.contacts.tracker import TouchPath, without_side_lobes
+from jeit.touch.contacts.tracker import TouchPath, remove_side_lobes
 
 # Minimum number of frames of the untouched skin for imaging, and for an estimate of the noise of images.
 _MIN_UNTOUCHED_FRAMES, _MIN_NOISE_FRAMES = 3, 10
@@ -134,11 +134,11 @@ def untouched_frames(
     frames_with_readings = first_frames[np.isfinite(first_frames).any(axis=1)]
     if len(frames_with_readings) < _MIN_UNTOUCHED_FRAMES:
         interval = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
-        hint = f" Frames are {interval:.3g} s apart: are these milliseconds?" if interval > span else ""
+        unit_hint = f" Frames are {interval:.3g} s apart: are these milliseconds?" if interval > span else ""
         raise ValueError(
             f"untouched: the first {span:g} s of '{recording.name}' have "
             f"{counted(len(frames_with_readings), 'frame')} with a reading; {_MIN_UNTOUCHED_FRAMES} are needed of the "
-            f"untouched skin. Give a longer time, or a reference.{hint}"
+            f"untouched skin. Give a longer time, or a reference.{unit_hint}"
         )
     return frames_with_readings
 
@@ -172,9 +172,9 @@ class RecordedContacts:
     @cached_property
     def _numbers(self) -> dict[tuple[float, ...], int]:
         return {
-            (time, *place): path.number
+            (time, *position): path.number
             for path in self.touches
-            for time, place in zip(path.times.tolist(), path.position.tolist(), strict=True)
+            for time, position in zip(path.times.tolist(), path.position.tolist(), strict=True)
         }
 
 
@@ -211,34 +211,36 @@ def find_recorded_contacts(
     ```
     """
     finder = CellFinder(images.mesh, sign=sign)
-    changes, still = images.changes(frames), images.changes(untouched)
-    still = still[np.isfinite(still).all(axis=1)]
+    changes, untouched_changes = images.changes(frames), images.changes(untouched)
+    untouched_changes = untouched_changes[np.isfinite(untouched_changes).all(axis=1)]
     noise = None
-    if len(still) >= _MIN_NOISE_FRAMES and (still != still[0]).any():
-        noise = ImageNoise.of_images(still)
+    if len(untouched_changes) >= _MIN_NOISE_FRAMES and (untouched_changes != untouched_changes[0]).any():
+        noise = ImageNoise.of_images(untouched_changes)
     if not np.isfinite(changes).all(axis=1).any():
         raise ValueError(f"frames: none of the {counted(len(frames), 'frame')} could be imaged.")
     all_contacts = [find_contacts(finder, change, noise) if np.isfinite(change).all() else [] for change in changes]
     contacts = []
     for candidates in all_contacts:
-        strongest = max((abs(contact.peak) for contact in candidates), default=0.0)
-        contacts.append([contact for contact in candidates if abs(contact.peak) >= weakest * strongest])
-    touches = without_side_lobes(track_contacts(seconds, contacts), weakest)
+        max_peak = max((abs(contact.peak) for contact in candidates), default=0.0)
+        contacts.append([contact for contact in candidates if abs(contact.peak) >= weakest * max_peak])
+    touches = remove_side_lobes(track_contacts(seconds, contacts), weakest)
     notes = []
     if noise is None:
         notes.append(
             f"noise is estimated from each image, because fewer than {_MIN_NOISE_FRAMES} different frames of the "
             "untouched skin are known: contacts may be missed"
         )
-    elif len(still) < 3 * _MIN_NOISE_FRAMES:
-        notes.append(f"noise is estimated from {len(still)} untouched frames; a hundred give fewer false contacts")
+    elif len(untouched_changes) < 3 * _MIN_NOISE_FRAMES:
+        notes.append(
+            f"noise is estimated from {len(untouched_changes)} untouched frames; a hundred give fewer false contacts"
+        )
     if num_refused := int((~np.isfinite(changes).all(axis=1)).sum()):
         notes.append(f"{counted(num_refused, 'frame')} could not be imaged")
-    if num_left_out := sum(map(len, all_contacts)) - sum(map(len, contacts)):
+    if num_excluded_contacts := sum(map(len, all_contacts)) - sum(map(len, contacts)):
         notes.append(
-            f"{counted(num_left_out, 'contact')} with less than {100 * weakest:.0f} % of the strongest change of the "
-            "frame may be side lobes of the image, and are left out"
+            f"{counted(num_excluded_contacts, 'contact')} with less than {100 * weakest:.0f} % of the strongest change "
+            "of the frame may be side lobes of the image, and are left out"
         )
-    if num_single := sum(map(len, contacts)) - sum(len(path.times) for path in touches):
-        notes.append(f"{counted(num_single, 'contact')} of brief or weak appearance belong to no touch")
+    if num_unassigned_contacts := sum(map(len, contacts)) - sum(len(path.times) for path in touches):
+        notes.append(f"{counted(num_unassigned_contacts, 'contact')} of brief or weak appearance belong to no touch")
     return RecordedContacts(seconds, changes, contacts, touches, tuple(notes))

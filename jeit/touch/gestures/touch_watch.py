@@ -190,18 +190,20 @@ class _WatchState:
             yield self._frame_result(image, self.sign * change)
         if self.touches.touches:
             self.arrival_time = time.perf_counter()
-            ended = tuple(self._ended_touch(touch) for touch in self.touches.touches)
+            ended_touches = tuple(self._ended_touch(touch) for touch in self.touches.touches)
             yield WatchedFrame(
-                self.frame_time, None, np.nan, False, None, ended, time.perf_counter() - self.arrival_time
+                self.frame_time, None, np.nan, False, None, ended_touches, time.perf_counter() - self.arrival_time
             )
 
     def _frames_without_drift(self, frames: Iterable) -> Iterator:
         """Yield frames with the drift of the untouched skin subtracted."""
-        for second, frame in frames:
+        for frame_time, frame in frames:
             self.arrival_time = time.perf_counter()
-            if not (is_number(second) and second >= self.frame_time):
-                raise ValueError(f"seconds must not fall: after {self.frame_time:g} s a frame has {describe(second)}.")
-            self.frame_time = float(second)
+            if not (is_number(frame_time) and frame_time >= self.frame_time):
+                raise ValueError(
+                    f"seconds must not fall: after {self.frame_time:g} s a frame has {describe(frame_time)}."
+                )
+            self.frame_time = float(frame_time)
             try:
                 values = np.asarray(frame)
             except ValueError:  # a ragged array, which the stream refuses
@@ -215,7 +217,7 @@ class _WatchState:
         touched."""
         second = self.frame_time
         self.touches = self.touches.follow(second, change)
-        ended = tuple(self._ended_touch(touch) for touch in self.touches.ended)
+        ended_touches = tuple(self._ended_touch(touch) for touch in self.touches.ended)
         self.touches = replace(self.touches, ended=())
         is_ongoing, newly_named = bool(self.touches.open), None
         is_touched = is_ongoing and self.touches.held == len(self.touches.open)
@@ -227,15 +229,15 @@ class _WatchState:
         note = ""
         if self._is_lifted(image, change):
             note = f"at {second:.2f} s the skin is more at rest than when its rest was read: was it touched? Read anew."
-            ended = (*ended, *self._reset_reference(image))
+            ended_touches = (*ended_touches, *self._reset_reference(image))
         elif is_ongoing and second - self.touches.open[0].seconds[0] >= self.watch.patience:
-            ended = (*ended, *(replace(touch, held=True) for touch in self._reset_reference(image)))
+            ended_touches = (*ended_touches, *(replace(touch, held=True) for touch in self._reset_reference(image)))
         elif second - self.last_touch_time >= _SETTLING_TIME and np.isfinite(self.last_result_time):
             self._follow_drift(image, 1 - np.exp(-(second - self.last_result_time) / _DRIFT_TIME_CONSTANT))
         self.last_result_time = second
         peak = float(change.max())
         return WatchedFrame(
-            second, image, peak, is_touched, newly_named, ended, time.perf_counter() - self.arrival_time, note
+            second, image, peak, is_touched, newly_named, ended_touches, time.perf_counter() - self.arrival_time, note
         )
 
     def _is_lifted(self, image: FrameImage, change: np.ndarray) -> bool:
@@ -248,17 +250,17 @@ class _WatchState:
 
     def _reset_reference(self, image: FrameImage) -> tuple[NamedTouch, ...]:
         """Make the last frame the reference of the untouched skin; return the current touch, which ends, if any."""
-        ended = tuple(self._ended_touch(touch) for touch in self.touches.touches)
+        ended_touches = tuple(self._ended_touch(touch) for touch in self.touches.touches)
         self.touches = replace(self.touches, open=(), held=0, lost=(0, 0))
         self.opposite_start = None
         self._follow_drift(image, 1.0)
-        return ended
+        return ended_touches
 
-    def _follow_drift(self, image: FrameImage, share: float) -> None:
-        """Add a fraction `share` of the last frame's deviation from the reference to the drift."""
+    def _follow_drift(self, image: FrameImage, update_fraction: float) -> None:
+        """Add a fraction `update_fraction` of the last frame's deviation from the reference to the drift."""
         if self.frame is not None and image.imaged:
             is_usable = image.usable & np.isfinite(self.frame)
-            self.drift = self.drift + np.where(is_usable, share * (self.frame - self.reference), 0.0)
+            self.drift = self.drift + np.where(is_usable, update_fraction * (self.frame - self.reference), 0.0)
 
     def _classify(self, touch: StreamTouch) -> NamedTouch:
         """Predict the gesture of a touch; record the computing time since the last frame arrived."""

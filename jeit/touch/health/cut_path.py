@@ -157,18 +157,18 @@ class LossFit:
                 for direction in directions
             ]
             starts_by_depth.append(sorted(candidate_starts, key=self._misfit)[:_NUM_OPTIMISED_STARTS])
-        complete_cuts = [self._minimise_misfit(start, fixed=True) for start in starts_by_depth[0]]
+        complete_cuts = [self._minimise_misfit(start, is_length_fixed=True) for start in starts_by_depth[0]]
         partial_cuts = [self._minimise_misfit(start) for start in starts_by_depth[1]]
         complete_cut = min(complete_cuts, key=lambda fit: fit.misfit)
         partial_cut = min(partial_cuts, key=lambda fit: fit.misfit)
-        complete_cut, partial_cut = self._fit_bend(complete_cut, fixed=True), self._fit_bend(partial_cut)
+        complete_cut, partial_cut = self._fit_bend(complete_cut, is_length_fixed=True), self._fit_bend(partial_cut)
         is_through = not partial_cut.misfit < _MAX_PARTIAL_RATIO * complete_cut.misfit
-        best_fit, other_fit = (complete_cut, partial_cut) if is_through else (partial_cut, complete_cut)
+        best_fit, rejected_fit = (complete_cut, partial_cut) if is_through else (partial_cut, complete_cut)
         path = best_fit.unknowns[:-2].reshape(-1, 2)
         # A long partial cut and a short cut through the whole depth may fit about equally well.
         is_certain = is_through and best_fit.misfit < _CERTAIN_MISFIT
-        are_similar = not is_certain and other_fit.misfit < _DISTINCT_RATIO * best_fit.misfit
-        length_difference = abs(_length(best_fit) - _length(other_fit)) if are_similar else 0.0
+        are_similar = not is_certain and rejected_fit.misfit < _DISTINCT_RATIO * best_fit.misfit
+        length_difference = abs(_length(best_fit) - _length(rejected_fit)) if are_similar else 0.0
         deviation = float(np.hypot(self._deviation(best_fit), length_difference))
         return FittedLoss(path, best_fit.misfit, self._conductivity_on_mesh(best_fit.unknowns), is_through, deviation)
 
@@ -178,26 +178,28 @@ class LossFit:
         best_fit = min((self._minimise_misfit(candidate) for candidate in candidate_starts), key=lambda fit: fit.misfit)
         return FittedLoss(best_fit.unknowns[None, :2], best_fit.misfit, self._conductivity_on_mesh(best_fit.unknowns))
 
-    def _fit_bend(self, straight_fit: _FittedUnknowns, *, fixed: bool = False) -> _FittedUnknowns:
-        ends = straight_fit.unknowns[:-2].reshape(-1, 2)
-        centre, (x, y) = ends.mean(axis=0), ends[-1] - ends[0]
+    def _fit_bend(self, straight_fit: _FittedUnknowns, *, is_length_fixed: bool = False) -> _FittedUnknowns:
+        cut_ends = straight_fit.unknowns[:-2].reshape(-1, 2)
+        centre, (x, y) = cut_ends.mean(axis=0), cut_ends[-1] - cut_ends[0]
         bend_offset = _BEND_OFFSET * np.array([-y, x])
         candidate_starts = [
-            np.array([*ends[0], *bend_place, *ends[-1], *straight_fit.unknowns[-2:]])
+            np.array([*cut_ends[0], *bend_place, *cut_ends[-1], *straight_fit.unknowns[-2:]])
             for bend_place in (centre + bend_offset, centre - bend_offset)
         ]
-        bent_fits = [self._minimise_misfit(candidate, fixed=fixed) for candidate in candidate_starts]
+        bent_fits = [
+            self._minimise_misfit(candidate, is_length_fixed=is_length_fixed) for candidate in candidate_starts
+        ]
         bent_fit = min(bent_fits, key=lambda fit: fit.misfit)
         return bent_fit if bent_fit.misfit < _MAX_BEND_RATIO * straight_fit.misfit else straight_fit
 
-    def _minimise_misfit(self, start: np.ndarray, *, fixed: bool = False) -> _FittedUnknowns:
-        """Minimise the misfit over the unknowns of a cut or a spot, from `start`; if `fixed`, the added length across
-        the cut is not fitted."""
+    def _minimise_misfit(self, start: np.ndarray, *, is_length_fixed: bool = False) -> _FittedUnknowns:
+        """Minimise the misfit over the unknowns of a cut or a spot, from `start`; if `is_length_fixed`, the added
+        length across the cut is not fitted."""
         from scipy.optimize import least_squares
 
         lower_bounds, upper_bounds, scales = self._bounds(len(start))
         is_free = np.ones(len(start), bool)
-        is_free[-2] = not fixed
+        is_free[-2] = not is_length_fixed
 
         def all_unknowns(free_unknowns: np.ndarray) -> np.ndarray:
             unknowns = start.copy()
@@ -303,11 +305,14 @@ class LossFit:
             return self.conductivity * np.expm1(self._log_spot(unknowns))
         fractions, normals = self._fraction_across_path(unknowns)
         change = np.zeros((len(fractions), self.dimension, self.dimension))
-        band = np.flatnonzero(fractions != 1)  # few of the region's cells
-        x, y = normals[band].T
-        lost = self.conductivity[band] * (fractions[band] - 1)
-        change[band, 0, 0], change[band, 1, 1] = lost * x * x, lost * y * y
-        change[band, 0, 1] = change[band, 1, 0] = lost * x * y
+        changed_cells = np.flatnonzero(fractions != 1)  # few of the region's cells
+        x, y = normals[changed_cells].T
+        conductivity_change = self.conductivity[changed_cells] * (fractions[changed_cells] - 1)
+        change[changed_cells, 0, 0], change[changed_cells, 1, 1] = (
+            conductivity_change * x * x,
+            conductivity_change * y * y,
+        )
+        change[changed_cells, 0, 1] = change[changed_cells, 1, 0] = conductivity_change * x * y
         return change
 
     def _log_spot(self, unknowns: np.ndarray) -> np.ndarray:
@@ -327,17 +332,17 @@ class LossFit:
         normals = np.column_stack([-directions[:, 1], directions[:, 0]])
         # Coordinates are multiplied one by one: sums over an axis of two elements take several times as long.
         x_offsets, y_offsets = (self.centres[:, i, None] - segment_starts[:, i] for i in (0, 1))  # (cells, segments)
-        positions_along = x_offsets * directions[:, 0] + y_offsets * directions[:, 1]
+        positions_on_path = x_offsets * directions[:, 0] + y_offsets * directions[:, 1]
         positions_across = x_offsets * normals[:, 0] + y_offsets * normals[:, 1]
         # The band reaches beyond the ends of its centre line, which is shortened so that the band ends with the path.
         shortening = np.minimum(self.band_half_width / _END_NARROWING, 0.45 * lengths)
         first_positions, last_positions = np.zeros(len(lengths)), lengths.copy()
         first_positions[0] += shortening[0]
         last_positions[-1] -= shortening[-1]
-        distances_beyond = _END_NARROWING * (
-            positions_along - np.clip(positions_along, first_positions, last_positions)
+        distances_beyond_ends = _END_NARROWING * (
+            positions_on_path - np.clip(positions_on_path, first_positions, last_positions)
         )
-        squared_distances = positions_across**2 + distances_beyond**2
+        squared_distances = positions_across**2 + distances_beyond_ends**2
         nearest_segments = squared_distances.argmin(axis=1)
         squared_distances = (
             squared_distances[np.arange(len(squared_distances)), nearest_segments] / self.band_half_width**2

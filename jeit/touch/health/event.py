@@ -130,19 +130,19 @@ class Step:
     """A step of the voltages between two consecutive windows of frames.
 
     **Fields**: `change`: change of each channel, volts; `size`: size of the change relative to changes between healthy
-    windows; `first`: index, among the frames of both windows, of the first frame after the step.
+    windows; `first_frame`: index, among the frames of both windows, of the first frame after the step.
     """
 
     change: Float[np.ndarray, " M"]
     size: float
-    first: int
+    first_frame: int
 
 
 def window_change(frames: Float[np.ndarray, "2w M"]) -> Float[np.ndarray, " M"]:
     """Compute the change of each channel from the median of the first half of frames to that of the second half; NaN if
     a half has no reading."""
-    half = len(frames) // 2
-    return channel_medians(frames[half:]) - channel_medians(frames[:half])
+    half_length = len(frames) // 2
+    return channel_medians(frames[half_length:]) - channel_medians(frames[:half_length])
 
 
 def channel_medians(frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, " M"]:
@@ -188,8 +188,8 @@ def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M
     sharpness = np.median(projections[first_frame : first_frame + quarter_length]) - np.median(
         projections[max(0, first_frame - quarter_length) : first_frame]
     )
-    medians_after = [np.median(third) for third in np.array_split(projections[first_frame:], 3)]
-    medians_before = [np.median(third) for third in np.array_split(projections[:first_frame], 3)]
+    medians_after = [np.median(part) for part in np.array_split(projections[first_frame:], 3)]
+    medians_before = [np.median(part) for part in np.array_split(projections[:first_frame], 3)]
     if (
         sharpness < _MIN_SHARPNESS
         or min(medians_after) < _MIN_FRACTION_AFTER
@@ -201,25 +201,25 @@ def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M
     return Step(channel_medians(frames[first_frame:]) - channel_medians(frames[:first_frame]), size, first_frame)
 
 
-def is_distinct(projections: Float[np.ndarray, " n"], first: int) -> bool:
-    """Return whether the levels of frames are 0 before index `first` and 1 from this index on, apart from noise and a
-    few exceptions.
+def is_distinct(projections: Float[np.ndarray, " n"], first_frame: int) -> bool:
+    """Return whether the levels of frames are 0 before index `first_frame` and 1 from this index on, apart from noise
+    and a few exceptions.
 
     A lasting step is distinct from two touches, between which the level returns to 0.
     """
     noise = 1.4826 * np.median(np.abs(np.diff(projections))) / np.sqrt(2)
     max_fraction = max(_MAX_OUTLIER_FRACTION, 1.5 * float(ndtr((_BEFORE_LEVEL - 1) / max(noise, 1e-12))))
-    early_fraction = np.mean(projections[:first] > 1 - _BEFORE_LEVEL) if first else 0.0
-    return bool(np.mean(projections[first:] < _BEFORE_LEVEL) <= max_fraction and early_fraction <= max_fraction)
+    early_fraction = np.mean(projections[:first_frame] > 1 - _BEFORE_LEVEL) if first_frame else 0.0
+    return bool(np.mean(projections[first_frame:] < _BEFORE_LEVEL) <= max_fraction and early_fraction <= max_fraction)
 
 
-def _best_split_index(projections: np.ndarray, half: int) -> int:
+def _best_split_index(projections: np.ndarray, half_length: int) -> int:
     """Find the index at which the levels of frames are best split into two constant parts by least squares."""
     num_frames = len(projections)
     total_sum, cumulative_sums = projections.sum(), np.cumsum(projections)[:-1]
-    num_before = np.arange(1, num_frames)
-    between_sum_of_squares = cumulative_sums**2 / num_before + (total_sum - cumulative_sums) ** 2 / (
-        num_frames - num_before
+    num_frames_before = np.arange(1, num_frames)
+    between_sum_of_squares = cumulative_sums**2 / num_frames_before + (total_sum - cumulative_sums) ** 2 / (
+        num_frames - num_frames_before
     )
-    allowed_indices = slice(max(3, half // 2) - 1, num_frames - 3)
+    allowed_indices = slice(max(3, half_length // 2) - 1, num_frames - 3)
     return int(np.argmax(between_sum_of_squares[allowed_indices])) + int(allowed_indices.start) + 1

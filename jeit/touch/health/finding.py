@@ -88,15 +88,15 @@ class ImagedSkin:
             )
         values = np.broadcast_to(values, model.mesh.num_cells).astype(float)
         predicted = np.asarray(model.voltages(values))
-        used = np.isfinite(noise)
-        ratio = reference[used] @ predicted[used] / (predicted[used] @ predicted[used])
+        is_used = np.isfinite(noise)
+        ratio = reference[is_used] @ predicted[is_used] / (predicted[is_used] @ predicted[is_used])
         if not 1 / _MAX_MODEL_FACTOR < ratio < _MAX_MODEL_FACTOR:
             raise ValueError(
                 f"healthy: it is {ratio:.2g} times what the model predicts; are both in SI units, and the signs right?"
             )
         channel_ratios = reference / np.where(predicted == 0, np.inf, predicted)
         gain = np.where(
-            used & (channel_ratios > ratio / _MAX_GAIN_FACTOR) & (channel_ratios < ratio * _MAX_GAIN_FACTOR),
+            is_used & (channel_ratios > ratio / _MAX_GAIN_FACTOR) & (channel_ratios < ratio * _MAX_GAIN_FACTOR),
             channel_ratios,
             ratio,
         )
@@ -246,14 +246,14 @@ class LastingChange:
     """A lasting change of a skin's voltages.
 
     **Fields**: `vector`: change of each channel, volts; `size`: size of the change relative to healthy changes; `time`,
-    `frame`: time and frame number at which the change began; `noticed`: time at which the change was detected.
+    `frame`: time and frame number at which the change began; `detection_time`: time at which the change was detected.
     """
 
     vector: Float[np.ndarray, " M"]
     size: float
     time: float
     frame: int
-    noticed: float
+    detection_time: float
 
 
 @dataclass(frozen=True)

@@ -98,22 +98,22 @@ def doubts_of(health: SkinHealth, healthy: FrameRecording, frames: Float[np.ndar
     has_reading = np.isfinite(frames)
     if not (has_reading[:, healthy_state.used].mean(axis=1) >= _MIN_READ_FRACTION).any():
         raise ValueError("frames: none of them has a reading in half of the healthy recording's channels.")
-    doubts = []
+    warnings = []
     window_length = healthy_state.window * healthy_state.stride
     if len(frames) < 2 * window_length:
-        doubts.append(
+        warnings.append(
             f"{len(frames)} frames are fewer than two windows of {window_length}: a change that lasts cannot be "
             "distinguished from a touch in them."
         )
     if healthy_state.is_brief or len(healthy.frames) < _MIN_NUM_FRAMES:
-        doubts.append(
+        warnings.append(
             f"the healthy recording has {len(healthy.frames)} frames, few beside the length of touches, or at all: "
             "findings may be false, and damage may be missed. Give forty of the longest touches, and a minute; or a "
             f"shorter patience than {health.patience:.3g}, if no touch lasts that long."
         )
     silent_channels = np.flatnonzero(healthy_state.used & ~has_reading.any(axis=0))
     if silent_channels.size:
-        doubts.append(f"without any reading: channels {', '.join(map(str, silent_channels[:12]))}, counted from 0.")
+        warnings.append(f"without any reading: channels {', '.join(map(str, silent_channels[:12]))}, counted from 0.")
     first_readings = np.where(
         has_reading.any(axis=0), np.take_along_axis(frames, has_reading.argmax(axis=0)[None], axis=0)[0], np.nan
     )
@@ -121,12 +121,12 @@ def doubts_of(health: SkinHealth, healthy: FrameRecording, frames: Float[np.ndar
         healthy_state.used & has_reading.any(axis=0) & (~has_reading | (frames == first_readings)).all(axis=0)
     )
     if constant_channels.size and len(frames) > 2:
-        doubts.append(f"constant throughout: channels {', '.join(map(str, constant_channels[:12]))}, counted from 0.")
+        warnings.append(f"constant throughout: channels {', '.join(map(str, constant_channels[:12]))}, counted from 0.")
     medians = np.nanmedian(
         np.where(has_reading, frames, np.nan)[:, healthy_state.used & has_reading.any(axis=0)], axis=0
     )
     healthy_medians = healthy_state.reference[healthy_state.used & has_reading.any(axis=0)]
     ratio = float(np.median(np.abs(medians)) / max(np.median(np.abs(healthy_medians)), 1e-300))
     if not 1 / _MAX_UNIT_RATIO < ratio < _MAX_UNIT_RATIO:
-        doubts.append(f"frames are {ratio:.3g} times the healthy ones: are both in the same unit?")
-    return doubts
+        warnings.append(f"frames are {ratio:.3g} times the healthy ones: are both in the same unit?")
+    return warnings

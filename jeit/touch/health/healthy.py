@@ -96,13 +96,13 @@ class HealthyState:
 
     @classmethod
     def learn(
-        cls, frames: Float[np.ndarray, "F M"], period: float = 1.0, longest: float | None = None
+        cls, frames: Float[np.ndarray, "F M"], period: float = 1.0, window_duration: float | None = None
     ) -> "HealthyState":
         """Learn the healthy state from frames (frames, channels), with or without touches, `period` seconds apart.
 
-        `longest`: length of a window, seconds, which must exceed the length of every touch; by default estimated from
-        the touches in the frames. Raises `ValueError` for fewer than 20 frames, and if every channel lacks readings or
-        is constant.
+        `window_duration`: length of a window, seconds, which must exceed the length of every touch; by default
+        estimated from the touches in the frames. Raises `ValueError` for fewer than 20 frames, and if every channel
+        lacks readings or is constant.
         """
         if len(frames) < _MIN_NUM_FRAMES:
             raise ValueError(
@@ -110,16 +110,16 @@ class HealthyState:
                 "minute of them with touches at best."
             )
         frames = np.where(np.isfinite(frames), frames, np.nan)
-        used = np.isfinite(frames).mean(axis=0) > 0.5
+        is_used = np.isfinite(frames).mean(axis=0) > 0.5
         medians = channel_medians(frames)
         noise = _estimate_noise(frames)
-        used &= noise > 1e-12 * np.nanmax(np.abs(medians), initial=0.0)
-        used &= noise > 0
-        if not used.any():
+        is_used &= noise > 1e-12 * np.nanmax(np.abs(medians), initial=0.0)
+        is_used &= noise > 0
+        if not is_used.any():
             raise ValueError("healthy: every channel lacks readings or is constant; is this a recording of the skin?")
-        noise = np.where(used, noise, np.inf)
-        frames = np.where(used, frames, np.nan)
-        window, wanted_length = _window_length(frames, noise, period, longest)
+        noise = np.where(is_used, noise, np.inf)
+        frames = np.where(is_used, frames, np.nan)
+        window, wanted_length = _window_length(frames, noise, period, window_duration)
         is_brief = wanted_length > _SHORT_WINDOW_FACTOR * window
         limit_factor = _BRIEF_LIMIT_FACTOR if is_brief else 1.0
         stride = max(1, -(-window // _MAX_WINDOW_STEPS))
@@ -132,11 +132,11 @@ class HealthyState:
         touch_directions, max_fraction_outside = _touch_directions(frames, noise, stride * window)
         deviations = frames - medians
         span = np.stack([np.nanmin(deviations, axis=0, initial=0.0), np.nanmax(deviations, axis=0, initial=0.0)])
-        reference = np.where(used, np.nan_to_num(medians), 0.0)
+        reference = np.where(is_used, np.nan_to_num(medians), 0.0)
         steadiness = Steadiness.learn(steps, window, noise)
         return cls(
             reference=reference,
-            used=used,
+            used=is_used,
             noise=noise,
             span=span,
             stride=stride,
@@ -195,12 +195,14 @@ def _estimate_noise(frames: np.ndarray) -> np.ndarray:
     return np.where(deviations > 0.05 * total_deviations, deviations, total_deviations)
 
 
-def _window_length(frames: np.ndarray, noise: np.ndarray, period: float, longest: float | None) -> tuple[int, float]:
+def _window_length(
+    frames: np.ndarray, noise: np.ndarray, period: float, window_duration: float | None
+) -> tuple[int, float]:
     """Return the length of a window, and the length that touches require, for which the recording may be too short;
     both in frames."""
     max_length = max(_MIN_WINDOW_STEPS, len(frames) // _MIN_NUM_WINDOWS)
-    if longest is not None:
-        return int(np.clip(np.ceil(longest / period), _MIN_WINDOW_STEPS, max_length)), longest / period
+    if window_duration is not None:
+        return int(np.clip(np.ceil(window_duration / period), _MIN_WINDOW_STEPS, max_length)), window_duration / period
     change_sizes = change_size((frames - channel_medians(frames)) / noise)
     quiet_size = np.quantile(change_sizes, _QUIET_QUANTILE)
     is_touched = change_sizes > _MIN_TOUCH_RATIO * quiet_size
@@ -242,9 +244,12 @@ def _step_limits(triples: np.ndarray, window: int, floor: np.ndarray) -> tuple[n
     """
     pairs = triples[:, : 2 * window]
     changes = np.nan_to_num(np.array([window_change(pair) for pair in pairs]))
-    half, lasting_sizes, sizes = len(changes) // 2, [0.0], [0.0]
+    half_index, lasting_sizes, sizes = len(changes) // 2, [0.0], [0.0]
     rest_medians = channel_medians(np.concatenate(list(triples[:: max(1, len(triples) // _MIN_NUM_WINDOWS)])))
-    for training, test in ((slice(None, half), slice(half, None)), (slice(half, None), slice(None, half))):
+    for training, test in (
+        (slice(None, half_index), slice(half_index, None)),
+        (slice(half_index, None), slice(None, half_index)),
+    ):
         scale = _deviation_of_changes(changes[training], floor)
         for triple, pair in zip(triples[test], pairs[test], strict=True):
             step = lasting_step(pair, scale, 0.0)
@@ -307,10 +312,10 @@ def _touch_directions(frames: np.ndarray, noise: np.ndarray, window: int) -> tup
     ]
     frames_of_touches = frames_of_touches if len(frames_of_touches) >= _MIN_WINDOW_STEPS else scaled_frames
     frames_of_touches = frames_of_touches[:: max(1, len(frames_of_touches) // 2000)]
-    half, fractions = len(frames_of_touches) // 2, []
+    half_index, fractions = len(frames_of_touches) // 2, []
     for training, test in (
-        (frames_of_touches[:half], frames_of_touches[half:]),
-        (frames_of_touches[half:], frames_of_touches[:half]),
+        (frames_of_touches[:half_index], frames_of_touches[half_index:]),
+        (frames_of_touches[half_index:], frames_of_touches[:half_index]),
     ):
         if len(training) and len(test):
             fractions.append(_fraction_outside(test, _principal_directions(training)))

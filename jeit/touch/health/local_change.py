@@ -49,11 +49,11 @@ def finer_model(
     if mesh.dimension == 2 and isinstance(model.electrodes, _MESH_INDEPENDENT):
         refined_mesh, parent = finer_mesh(mesh, centre, radius, 0.5 * edge**2)
         return ForwardModel(refined_mesh, model.electrodes, model.protocol), parent, edge
-    extent = np.ptp(np.asarray(mesh.points), axis=0)
+    bounding_box_sides = np.ptp(np.asarray(mesh.points), axis=0)
     if mesh.dimension == 2:
         edge = float(np.sqrt(2 * np.mean(np.asarray(measures(mesh)))))
     else:
-        edge = float(np.sqrt(6 * extent[0] * extent[1] / mesh.num_cells))
+        edge = float(np.sqrt(6 * bounding_box_sides[0] * bounding_box_sides[1] / mesh.num_cells))
     return model, np.arange(mesh.num_cells), edge
 
 
@@ -108,15 +108,15 @@ def _halve_cells(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, is_l
     new_nodes, parents_of_halved = midpoint_nodes[rotated_edges[~is_unchanged]], parent[~is_unchanged]
     new_cells, new_parents = [rotated_cells[is_unchanged]], [parent[is_unchanged]]
     half_triangles = ((second_node, third_node, new_nodes[:, 1]), (third_node, first_node, new_nodes[:, 2]))
-    for corner, opposite, edge_midpoint in half_triangles:
+    for corner, opposite_corner, edge_midpoint in half_triangles:
         # Half of a cell is the triangle (corner, opposite, midpoint of the longest edge); its edge from corner to
         # opposite may be halved too.
         is_halved = edge_midpoint >= 0
         longest_midpoint = new_nodes[:, 0]
         new_cells += [
-            np.column_stack([corner, opposite, longest_midpoint])[~is_halved],
+            np.column_stack([corner, opposite_corner, longest_midpoint])[~is_halved],
             np.column_stack([corner, edge_midpoint, longest_midpoint])[is_halved],
-            np.column_stack([edge_midpoint, opposite, longest_midpoint])[is_halved],
+            np.column_stack([edge_midpoint, opposite_corner, longest_midpoint])[is_halved],
         ]
         new_parents += [parents_of_halved[~is_halved], parents_of_halved[is_halved], parents_of_halved[is_halved]]
     return points, np.concatenate(new_cells), np.concatenate(new_parents)
@@ -230,12 +230,12 @@ class LocalChange:
 def _restricted_inverse(matrix, nodes: Int[np.ndarray, " t"]) -> Float[np.ndarray, "t t"]:
     """Compute the inverse of a sparse symmetric matrix, restricted to `nodes`: the inverse of the Schur complement
     after elimination of all other nodes."""
-    others = np.setdiff1d(np.arange(matrix.shape[0]), nodes)
+    other_nodes = np.setdiff1d(np.arange(matrix.shape[0]), nodes)
     schur_complement = matrix[nodes][:, nodes].toarray()
-    if len(others):
-        coupling = matrix[others][:, nodes]
+    if len(other_nodes):
+        coupling = matrix[other_nodes][:, nodes]
         coupled_nodes = np.flatnonzero(np.diff(coupling.tocsc().indptr))
         coupling = coupling[:, coupled_nodes].toarray()
-        factor = scipy.sparse.linalg.splu(matrix[others][:, others].tocsc(), permc_spec="MMD_AT_PLUS_A")
+        factor = scipy.sparse.linalg.splu(matrix[other_nodes][:, other_nodes].tocsc(), permc_spec="MMD_AT_PLUS_A")
         schur_complement[np.ix_(coupled_nodes, coupled_nodes)] -= coupling.T @ factor.solve(coupling)
     return scipy.linalg.inv(0.5 * (schur_complement + schur_complement.T))

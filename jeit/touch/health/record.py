@@ -52,7 +52,7 @@ class HealthRecord:
             kind=finding.kind,
             status=status,
             time=change.time,
-            noticed=change.noticed,
+            noticed=change.detection_time,
             frame=change.frame,
             channels=is_large & is_affected,
             change=np.where(is_affected, change.vector, 0.0),
@@ -64,7 +64,7 @@ class HealthRecord:
             reason=finding.reason,
         )
 
-    def with_changes(self, change: LastingChange, findings: list[Finding], status: EventStatus) -> HealthRecord:
+    def add_events(self, change: LastingChange, findings: list[Finding], status: EventStatus) -> HealthRecord:
         """Add an event for each finding, and their change to the reference voltages."""
         events = [
             self.create_event(change, finding, status, len(self.events) + index)
@@ -81,63 +81,67 @@ class HealthRecord:
         new_reference = np.where(
             is_affected & np.isfinite(change.vector), self.reference + change.vector, self.reference
         )
-        return replace(self, events=(*self.events, *events), reference=new_reference, skin=skin)._updated()
+        return replace(
+            self, events=(*self.events, *events), reference=new_reference, skin=skin
+        )._update_trusted_channels()
 
-    def with_faulty_channels(
-        self, kind: EventKind, channels: Bool[np.ndarray, " M"], at: LastingChange
+    def add_channel_faults(
+        self, kind: EventKind, channels: Bool[np.ndarray, " M"], event_time: LastingChange
     ) -> HealthRecord:
-        """Add an event for each of the noisy or stuck `channels` (M,). `at`: the time of the events; its change is not
-        used."""
+        """Add an event for each of the noisy or stuck `channels` (M,). `event_time`: the time of the events; its change
+        is not used."""
         fault = "is several times as noisy as it was, or jumps" if kind == EventKind.NOISY else "does not move"
         record = self
         for channel in np.flatnonzero(channels):
             is_channel = np.arange(self.reference.size) == channel
             finding = Finding(kind, f"Channel {channel} {fault}.", True, channels=is_channel)
-            event = record.create_event(at, finding, EventStatus.LASTING)
+            event = record.create_event(event_time, finding, EventStatus.LASTING)
             event = eqx.tree_at(lambda event: event.channels, event, is_channel)
             record = replace(record, events=(*record.events, event))
-        return record if record is self else record._updated()
+        return record if record is self else record._update_trusted_channels()
 
-    def with_status(self, event: HealthEvent, status: EventStatus) -> HealthRecord:
+    def set_event_status(self, event: HealthEvent, status: EventStatus) -> HealthRecord:
         """Set the status of an event. Raises `ValueError` for an event of a different skin."""
         check_kind("event", event, HealthEvent, "one of health.events, or health.held")
         if not event.number < len(self.events):
             raise ValueError(f"event {event.number} does not belong to this skin, which has {len(self.events)} events.")
         events = [
-            _with_new_status(known_event, status) if known_event.number == event.number else known_event
+            _set_status(known_event, status) if known_event.number == event.number else known_event
             for known_event in self.events
         ]
         return replace(self, events=tuple(events))
 
-    def denied(self, event: HealthEvent) -> HealthRecord:
+    def deny_event(self, event: HealthEvent) -> HealthRecord:
         """Deny an event, and reset the reference voltages to those before it. Raises `ValueError` for an event of a
         different skin."""
         reference = np.where(np.isfinite(event.change), self.reference - event.change, self.reference)
-        return replace(self.with_status(event, EventStatus.DENIED), reference=reference)._updated()
+        return replace(self.set_event_status(event, EventStatus.DENIED), reference=reference)._update_trusted_channels()
 
-    def reversed_by(self, change: LastingChange) -> HealthRecord | None:
+    def mend_reversed_event(self, change: LastingChange) -> HealthRecord | None:
         """Mend the event whose change is reversed by `change`; None if there is no such event."""
         for earlier_event in self.open_events:
             is_used = np.isfinite(earlier_event.change) & np.isfinite(change.vector) & self.trusted
             earlier_change = (earlier_event.change[is_used] / self.healthy.scale[is_used]).clip(-1e9, 1e9)
             new_change = (change.vector[is_used] / self.healthy.scale[is_used]).clip(-1e9, 1e9)
             fraction = -(new_change @ earlier_change) / max(earlier_change @ earlier_change, 1e-300)
-            left = np.linalg.norm(new_change + earlier_change)
-            if fraction > MIN_DISAPPEARED_FRACTION and left < _MAX_LEFT_FRACTION * np.linalg.norm(earlier_change):
-                record = self.with_status(earlier_event, EventStatus.MENDED)
+            remaining_norm = np.linalg.norm(new_change + earlier_change)
+            if fraction > MIN_DISAPPEARED_FRACTION and remaining_norm < _MAX_LEFT_FRACTION * np.linalg.norm(
+                earlier_change
+            ):
+                record = self.set_event_status(earlier_event, EventStatus.MENDED)
                 reason = f"Event {earlier_event.number} is gone: it was mended, or a press that has been lifted."
                 finding = Finding(EventKind.REPAIRED, reason, True)
                 event = record.create_event(change, finding, EventStatus.LASTING)
                 reference = np.where(np.isfinite(change.vector), self.reference + change.vector, self.reference)
-                return replace(record, events=(*record.events, event), reference=reference)._updated()
+                return replace(record, events=(*record.events, event), reference=reference)._update_trusted_channels()
         return None
 
-    def repaired(self, reference: Float[np.ndarray, " M"], time: float, frame: int) -> HealthRecord:
+    def mend_all_events(self, reference: Float[np.ndarray, " M"], time: float, frame: int) -> HealthRecord:
         """Mend all open events after the user has repaired the skin. `reference`: voltages of the repaired skin, volts,
         NaN in channels without a reading."""
         has_reading = np.isfinite(reference) & self.healthy.used
         change = np.where(has_reading, reference - self.reference, 0.0)
-        mended_events = [_with_new_status(event, EventStatus.MENDED) if event.open else event for event in self.events]
+        mended_events = [_set_status(event, EventStatus.MENDED) if event.open else event for event in self.events]
         event = HealthEvent(
             number=len(self.events),
             kind=EventKind.REPAIRED,
@@ -158,7 +162,7 @@ class HealthRecord:
             skin=None if self.skin is None else self.skin.without_cuts(),
         )
 
-    def _updated(self) -> HealthRecord:
+    def _update_trusted_channels(self) -> HealthRecord:
         """Update the trusted channels and the cuts of the model after a change of the events."""
         trusted = self.healthy.used.copy()
         for event in self.open_events:
@@ -171,5 +175,5 @@ class HealthRecord:
         return replace(self, trusted=trusted, skin=skin)
 
 
-def _with_new_status(event: HealthEvent, status: EventStatus) -> HealthEvent:
+def _set_status(event: HealthEvent, status: EventStatus) -> HealthEvent:
     return eqx.tree_at(lambda event_to_change: event_to_change.status, event, status)

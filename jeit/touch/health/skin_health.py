@@ -197,8 +197,8 @@ class SkinHealth:
             reason = f"Only {int(has_reading.sum())} of {int(self.healthy.used.sum())} channels have a reading."
         else:
             return self._process(float(time), values, has_reading)
-        no_channels = np.zeros_like(has_reading)
-        return replace(self, frames=self.frames + 1, status=WatchStatus.REFUSED, reason=reason, usable=no_channels)
+        is_usable = np.zeros_like(has_reading)
+        return replace(self, frames=self.frames + 1, status=WatchStatus.REFUSED, reason=reason, usable=is_usable)
 
     def confirm(self, event: HealthEvent) -> "SkinHealth":
         """Return the state after the user has confirmed an event; the event may be the pending event `held`.
@@ -206,9 +206,9 @@ class SkinHealth:
         Raises `ValueError` for an event of another skin.
         """
         if self._pending is not None and self.held is not None and event.number == self.held.number:
-            record = self.record.with_changes(self._pending.change, [self._pending.finding], EventStatus.CONFIRMED)
+            record = self.record.add_events(self._pending.change, [self._pending.finding], EventStatus.CONFIRMED)
             return replace(self, record=record, _pending=None)
-        return replace(self, record=self.record.with_status(event, EventStatus.CONFIRMED))
+        return replace(self, record=self.record.set_event_status(event, EventStatus.CONFIRMED))
 
     def deny(self, event: HealthEvent) -> "SkinHealth":
         """Return the state after the user has denied an event because it was a held press, not damage.
@@ -218,7 +218,7 @@ class SkinHealth:
         """
         if self._pending is not None and self.held is not None and event.number == self.held.number:
             return replace(self, _pending=None)
-        return replace(self, record=self.record.denied(event))
+        return replace(self, record=self.record.deny_event(event))
 
     def repaired(self, frames: ArrayLike) -> "SkinHealth":
         """Return the state after the user has repaired the skin; the status of all open events becomes "mended".
@@ -237,7 +237,7 @@ class SkinHealth:
             raise ValueError("frames: fewer than half of the channels have a reading; that is no reference.")
         return replace(
             self,
-            record=self.record.repaired(new_reference, self.time, self.frames),
+            record=self.record.mend_all_events(new_reference, self.time, self.frames),
             _window=(),
             _part=(),
             _settled=True,
@@ -353,7 +353,7 @@ class SkinHealth:
             else replace(finding, reason=f"{finding.reason} {_FIRST_WINDOW_NOTE}")
             for finding in findings
         ]
-        return state._with_reference(healthy.reference)._with_changes(change, findings)
+        return state._with_reference(healthy.reference)._add_events(change, findings)
 
     def _update_pending(self, medians: np.ndarray) -> "SkinHealth":
         """Return the state after checking whether the pending change has disappeared or outlasted a touch."""
@@ -361,34 +361,36 @@ class SkinHealth:
         if pending is None:
             return self
         change, scale = np.nan_to_num(pending.change.vector), np.where(self.trusted, self.healthy.scale, np.inf)
-        remainder = np.where(np.isfinite(medians), medians - self.reference, 0.0)
-        remaining_fraction = (remainder / scale**2) @ change / max((change / scale**2) @ change, 1e-300)
+        remaining_change = np.where(np.isfinite(medians), medians - self.reference, 0.0)
+        remaining_fraction = (remaining_change / scale**2) @ change / max((change / scale**2) @ change, 1e-300)
         if remaining_fraction < 1 - MIN_DISAPPEARED_FRACTION:
             return replace(self, _pending=None)
         if self.time - pending.change.time < self.patience:
             return self
-        lasting_change = replace(pending.change, vector=np.where(self.trusted, remainder, 0.0), noticed=self.time)
+        lasting_change = replace(
+            pending.change, vector=np.where(self.trusted, remaining_change, 0.0), detection_time=self.time
+        )
         reason = f"{pending.finding.reason} It has lasted for {self.time - pending.change.time:.3g} s or frames."
-        return replace(self, _pending=None)._with_changes(lasting_change, [replace(pending.finding, reason=reason)])
+        return replace(self, _pending=None)._add_events(lasting_change, [replace(pending.finding, reason=reason)])
 
     def _process_step(self, step: Step, frames: np.ndarray) -> "SkinHealth":
         """Return the state after a lasting step of the voltages was found."""
-        time, frame, _ = self._window[step.first]
+        time, frame, _ = self._window[step.first_frame]
         change = LastingChange(step.change, step.size, time, frame, self.time)
-        next_state = replace(self, _window=self._window[step.first :])
-        deviations = np.where(np.isfinite(step.change), channel_medians(frames[step.first :]) - self.reference, 0.0)
+        next_state = replace(self, _window=self._window[step.first_frame :])
+        frames_after = frames[step.first_frame :]
+        deviations = np.where(np.isfinite(step.change), channel_medians(frames_after) - self.reference, 0.0)
         scale = np.where(self.trusted, self.healthy.scale, np.inf)
         if change_size(deviations / scale) <= self.healthy.limit:  # the skin is as before a touch
             return next_state
-        reversed_record = self.record.reversed_by(change)
+        reversed_record = self.record.mend_reversed_event(change)
         if reversed_record is not None:
             return replace(next_state, record=reversed_record)
-        frames_after = frames[step.first :]
         findings = classify_change(
             step.change, frames_after, self.reference, self.healthy, self.record.touching, self.skin
         )
         if findings[0].electrode is not None or (findings[0].is_certain and change.size > self.healthy.sudden_limit):
-            return next_state._with_changes(change, findings)
+            return next_state._add_events(change, findings)
         if self._pending is not None:  # only one change is pending at a time: the first
             return next_state
         return replace(next_state, _pending=_PendingChange(change, findings[0]))
@@ -403,14 +405,14 @@ class SkinHealth:
         change = LastingChange(np.zeros(self.reference.size), self.healthy.limit, time, frame, self.time)
         noisy_channels = steadiness.noisy_channels(frames, checked_channels)
         stuck_channels = steadiness.stuck_channels(frames, checked_channels)
-        record = self.record.with_faulty_channels(EventKind.NOISY, noisy_channels, change)
-        return replace(self, record=record.with_faulty_channels(EventKind.STUCK, stuck_channels, change))
+        record = self.record.add_channel_faults(EventKind.NOISY, noisy_channels, change)
+        return replace(self, record=record.add_channel_faults(EventKind.STUCK, stuck_channels, change))
 
     def _with_reference(self, reference: Float[np.ndarray, " M"]) -> "SkinHealth":
         return replace(self, record=replace(self.record, reference=reference))
 
-    def _with_changes(self, change: LastingChange, findings: list[Finding]) -> "SkinHealth":
-        return replace(self, record=self.record.with_changes(change, findings, EventStatus.LASTING))
+    def _add_events(self, change: LastingChange, findings: list[Finding]) -> "SkinHealth":
+        return replace(self, record=self.record.add_events(change, findings, EventStatus.LASTING))
 
 
 def watch(health: SkinHealth, frames: ArrayLike, times: ArrayLike | None = None) -> SkinHealth:

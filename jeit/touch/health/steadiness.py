@@ -51,8 +51,11 @@ class Steadiness:
         """
         starts = range(0, max(1, len(steps) - window + 1), max(1, window // 2))
         measures = np.array([_variation_measures(steps[start : start + window]) for start in starts])  # (windows, 2, M)
-        half, ratios = len(measures) // 2, [np.zeros((1, *measures.shape[1:]))]
-        for training, test in ((measures[:half], measures[half:]), (measures[half:], measures[:half])):
+        half_index, ratios = len(measures) // 2, [np.zeros((1, *measures.shape[1:]))]
+        for training, test in (
+            (measures[:half_index], measures[half_index:]),
+            (measures[half_index:], measures[:half_index]),
+        ):
             if len(training) and len(test):
                 ratios.append(_relative_to_others(np.nan_to_num(test / _usual_variation(training, noise))))
         max_ratios = np.concatenate(ratios).max(axis=(0, 2))
@@ -74,8 +77,8 @@ class Steadiness:
 
         `steps` (steps, channels): averaged frames of both windows, volts; `trusted`: whether each channel may be used.
         """
-        half, exceeds_by_window = len(steps) // 2, []
-        for window_steps in (steps[:half], steps[half:]):
+        half_index, exceeds_by_window = len(steps) // 2, []
+        for window_steps in (steps[:half_index], steps[half_index:]):
             ratios = np.where(trusted, np.nan_to_num(_variation_measures(window_steps) / self.usual_values), 0.0)
             exceeds_by_window.append((_relative_to_others(ratios) > self.limits[:, None]).any(axis=0))
         return self._exclude_common_changes(exceeds_by_window, trusted)
@@ -85,11 +88,11 @@ class Steadiness:
     ) -> Bool[np.ndarray, " M"]:
         """Return whether each channel is constant in both of two windows while other channels change; arguments: see
         `noisy_channels`."""
-        half = len(steps) // 2
+        half_index = len(steps) // 2
         return self._exclude_common_changes(
             [
                 (_variation_measures(window_steps)[1] == 0) & self.can_be_stuck
-                for window_steps in (steps[:half], steps[half:])
+                for window_steps in (steps[:half_index], steps[half_index:])
             ],
             trusted,
         )
@@ -126,10 +129,15 @@ def _variation_measures(window_steps: Float[np.ndarray, "w M"]) -> Float[np.ndar
     """
     magnitudes = np.sort(np.abs(np.diff(window_steps, axis=0)), axis=0)  # NaN last
     num_readings = np.isfinite(magnitudes).sum(axis=0)
-    magnitudes, sums = np.nan_to_num(magnitudes), np.cumsum(np.nan_to_num(magnitudes), axis=0)
-    num_small = np.maximum((_SMALL_FRACTION * num_readings).astype(int), 1)
+    magnitudes, cumulative_sums = np.nan_to_num(magnitudes), np.cumsum(np.nan_to_num(magnitudes), axis=0)
+    num_small_changes = np.maximum((_SMALL_FRACTION * num_readings).astype(int), 1)
     channels = np.arange(magnitudes.shape[1])
-    measures = np.stack([sums[num_small - 1, channels] / num_small, sums[-1] / np.maximum(num_readings, 1)])
+    measures = np.stack(
+        [
+            cumulative_sums[num_small_changes - 1, channels] / num_small_changes,
+            cumulative_sums[-1] / np.maximum(num_readings, 1),
+        ]
+    )
     return np.where(num_readings >= max(2, _MIN_READ_FRACTION * len(magnitudes)), measures, np.nan)
 
 

@@ -85,18 +85,18 @@ class PlacedMap:
             )
         if len(frames) < _MIN_PRESSES or (positions == positions[0]).all():
             raise ValueError(f"positions: give those of {_MIN_PRESSES} presses or more, at different places.")
-        winners = learnt.nearest(frames, 1)[0][:, 0]
+        nearest_neurons = learnt.nearest(frames, 1)[0][:, 0]
         is_odd = np.arange(len(frames)) % 2 == 1
         candidates = []
         for is_fitted in (False, True):
             squared_error = squared_spread = squared_residual = 0.0
             for is_held_out in (is_odd, ~is_odd):
                 training_map = cls._from_presses(
-                    learnt, frames[~is_held_out], positions[~is_held_out], winners[~is_held_out], is_fitted
+                    learnt, frames[~is_held_out], positions[~is_held_out], nearest_neurons[~is_held_out], is_fitted
                 )
                 estimate = training_map._estimate_places(frames[is_held_out])
                 squared_error += float(np.sum((estimate.places - positions[is_held_out]) ** 2))
-                squared_spread += float(np.sum(estimate.spread**2))
+                squared_spread += float(np.sum(estimate.deviation**2))
                 squared_residual += float(np.sum(estimate.residuals**2))
             candidates.append(
                 (
@@ -106,36 +106,40 @@ class PlacedMap:
                     float(np.sqrt(squared_residual / frames.size)),
                 )
             )
-        _, is_fitted, widening, _ = min(candidates)
-        fitted_map = cls._from_presses(learnt, frames, positions, winners, is_fitted)
-        return replace(fitted_map, widening=widening, missed=candidates[0][3])
+        _, is_fitted, deviation_factor, _ = min(candidates)
+        fitted_map = cls._from_presses(learnt, frames, positions, nearest_neurons, is_fitted)
+        return replace(fitted_map, widening=deviation_factor, missed=candidates[0][3])
 
     @classmethod
-    def _from_presses(cls, learnt, frames, positions, winners, is_fitted: bool) -> "PlacedMap":
-        """Create a map with places from the frames, positions and nearest neurons (`winners`) of presses.
+    def _from_presses(cls, learnt, frames, positions, nearest_neurons, is_fitted: bool) -> "PlacedMap":
+        """Create a map with places from the frames, positions and nearest neurons (`nearest_neurons`) of presses.
 
         The standard deviations of the map's estimates are not yet calibrated.
         """
         num_neurons = learnt.shape[0] * learnt.shape[1]
-        win_counts = np.bincount(winners, minlength=num_neurons)[:, None]
-        sums = np.stack([np.bincount(winners, column, minlength=num_neurons) for column in positions.T], axis=1)
-        means = np.where(win_counts > 0, sums / np.maximum(win_counts, 1), np.nan).reshape(*learnt.shape, -1)
-        placed_map = cls(learnt, means, 1.0, 0.0, means if is_fitted else None)
+        win_counts = np.bincount(nearest_neurons, minlength=num_neurons)[:, None]
+        position_sums = np.stack(
+            [np.bincount(nearest_neurons, column, minlength=num_neurons) for column in positions.T], axis=1
+        )
+        mean_positions = np.where(win_counts > 0, position_sums / np.maximum(win_counts, 1), np.nan).reshape(
+            *learnt.shape, -1
+        )
+        placed_map = cls(learnt, mean_positions, 1.0, 0.0, mean_positions if is_fitted else None)
         if not is_fitted:
             return placed_map
-        neurons, shares, _ = placed_map._locating_neurons(frames)
+        neurons, neuron_weights, _ = placed_map._find_neurons_and_weights(frames)
         rows = np.repeat(np.arange(len(frames)), neurons.shape[1])
         combination_matrix = csr_array(
-            (shares.ravel(), (rows, neurons.ravel())), shape=(len(frames), np.count_nonzero(win_counts))
+            (neuron_weights.ravel(), (rows, neurons.ravel())), shape=(len(frames), np.count_nonzero(win_counts))
         )
-        place_errors = positions - combination_matrix @ means[placed_map.placed]
+        place_errors = positions - combination_matrix @ mean_positions[placed_map.placed]
         place_corrections = [
             lsqr(combination_matrix, column, damp=np.sqrt(_MEAN_WEIGHT), atol=1e-9, btol=1e-9)[0]
             for column in place_errors.T
         ]
-        fitted = means.copy()
-        fitted[placed_map.placed] += np.stack(place_corrections, axis=1)
-        return replace(placed_map, fitted=fitted)
+        fitted_positions = mean_positions.copy()
+        fitted_positions[placed_map.placed] += np.stack(place_corrections, axis=1)
+        return replace(placed_map, fitted=fitted_positions)
 
     @property
     def placed(self) -> Bool[np.ndarray, "R C"]:
@@ -153,20 +157,20 @@ class PlacedMap:
         `fitted` places: from the place of the nearest neuron) than the farthest neuron's place is. Raises `ValueError`
         for frames whose number of channels is not that of the map, and for NaN.
         """
-        placed = self._estimate_places(self.learnt.checked(frames))
-        return placed.places, self.widening * placed.spread
+        estimate = self._estimate_places(self.learnt.checked(frames))
+        return estimate.places, self.widening * estimate.deviation
 
     def _estimate_places(self, frames: Float[np.ndarray, "n M"]) -> "_Estimate":
-        neurons, shares, residuals = self._locating_neurons(frames)
+        neurons, neuron_weights, residuals = self._find_neurons_and_weights(frames)
         neuron_places = self._placed_neurons.places[neurons]
         initial_places = neuron_places.mean(axis=1) if self.fitted is None else neuron_places[:, 0]
-        offset = np.einsum("nq,nqd->nd", shares, neuron_places) - initial_places
+        offset = np.einsum("nq,nqd->nd", neuron_weights, neuron_places) - initial_places
         max_lengths = np.linalg.norm(neuron_places - initial_places[:, None], axis=2).max(axis=1)
         lengths = np.linalg.norm(offset, axis=1)
         places = initial_places + offset * np.minimum(1.0, max_lengths / np.maximum(lengths, 1e-300))[:, None]
         return _Estimate(places, np.sqrt(np.mean((neuron_places - places[:, None]) ** 2, axis=1)), residuals)
 
-    def _locating_neurons(self, frames: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _find_neurons_and_weights(self, frames: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Find the neurons from which the places of frames are estimated, and their shares in the frames.
 
         Returns the indices of these neurons among the neurons with places, and their shares, both (frames, neurons),
@@ -183,13 +187,13 @@ class PlacedMap:
                 placed_neurons.grid_neighbours[placed_neurons.neurons.winners(frames)[:, 1]],
                 _REGULARISATION_ON_GRID,
             )
-        shares, residuals = np.empty(neurons.shape), np.empty(frames.shape)
+        neuron_weights, residuals = np.empty(neurons.shape), np.empty(frames.shape)
         for start in range(0, len(frames), _CHUNK_SIZE):
             rows = slice(start, start + _CHUNK_SIZE)
-            shares[rows], residuals[rows] = _fit_combination_shares(
+            neuron_weights[rows], residuals[rows] = _fit_combination_weights(
                 placed_neurons.neurons.weights[0][neurons[rows]], frames[rows], regularisation
             )
-        return neurons, shares, residuals
+        return neurons, neuron_weights, residuals
 
     def predict(self, features: ArrayLike) -> Float[np.ndarray, "n d"]:
         """Estimate the places of touches as `locate` does, without standard deviations, in the interface of
@@ -220,16 +224,16 @@ class _PlacedNeurons(NamedTuple):
 class _Estimate(NamedTuple):
     """Estimated places of touches (frames, coordinates), metres.
 
-    `spread` (frames, coordinates): standard deviations of the neurons' places around an estimated place; `residuals`
+    `deviation` (frames, coordinates): standard deviations of the neurons' places around an estimated place; `residuals`
     (frames, channels): residuals of the frames.
     """
 
     places: Float[np.ndarray, "n d"]
-    spread: Float[np.ndarray, "n d"]
+    deviation: Float[np.ndarray, "n d"]
     residuals: Float[np.ndarray, "n M"]
 
 
-def _fit_combination_shares(
+def _fit_combination_weights(
     neuron_frames: Float[np.ndarray, "n q M"], frames: Float[np.ndarray, "n M"], regularisation: float
 ):
     """Compute shares (frames, neurons), of sum 1, with which the frames of neurons are combined to approximate
@@ -244,9 +248,9 @@ def _fit_combination_shares(
     diagonal = np.einsum("nqq->nq", gram)  # a view of the diagonal of `gram`
     diagonal += regularisation * diagonal.mean(axis=1, keepdims=True) + 1e-300
     change = frames - mean_frames[:, 0]
-    shares = np.linalg.solve(gram, deviations @ change[..., None])
-    residuals = change - (np.swapaxes(shares, 1, 2) @ deviations)[:, 0]
-    return shares[..., 0] + (1 - shares.sum(axis=1)) / num_neurons, residuals
+    weights = np.linalg.solve(gram, deviations @ change[..., None])
+    residuals = change - (np.swapaxes(weights, 1, 2) @ deviations)[:, 0]
+    return weights[..., 0] + (1 - weights.sum(axis=1)) / num_neurons, residuals
 
 
 # Number of iterations of the spring layout.

@@ -106,8 +106,8 @@ class SelfOrganisingMap:
 
         Raises `ValueError` as `distances` does.
         """
-        nearest = self._squared_distances(self.checked(frames)).argmin(axis=1)
-        return np.stack(np.unravel_index(nearest, self.shape), axis=1)
+        nearest_neurons = self._squared_distances(self.checked(frames)).argmin(axis=1)
+        return np.stack(np.unravel_index(nearest_neurons, self.shape), axis=1)
 
     def nearest(self, frames: Float[np.ndarray, "n M"], count: int) -> tuple[np.ndarray, np.ndarray]:
         """Find the `count` neurons nearest to each frame, the nearest first; `frames` must be an array from `checked`.

@@ -120,16 +120,16 @@ class _TouchSuperposition:
     variance: float
 
     @classmethod
-    def from_frame(cls, placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> "_TouchSuperposition":
-        check_kind("placed", placed, PlacedMap, "a map with places, as of PlacedMap.learn")
+    def from_frame(cls, placed_map: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> "_TouchSuperposition":
+        check_kind("placed", placed_map, PlacedMap, "a map with places, as of PlacedMap.learn")
         frame_values, reference_values = (
-            _check_frame(placed, name, array) for name, array in (("frame", frame), ("reference", reference))
+            _check_frame(placed_map, name, array) for name, array in (("frame", frame), ("reference", reference))
         )
-        changes = placed.learnt.weights[placed.placed] - reference_values
+        changes = placed_map.learnt.weights[placed_map.placed] - reference_values
         size = float(np.sqrt(np.mean(changes**2))) or 1.0
-        placed_positions = placed.places[placed.placed]
+        placed_positions = placed_map.places[placed_map.placed]
         return cls(
-            (frame_values - reference_values) / size, changes / size, placed_positions, (placed.missed / size) ** 2
+            (frame_values - reference_values) / size, changes / size, placed_positions, (placed_map.missed / size) ** 2
         )
 
     def fit_shares(self, neurons: Bool[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " k"], float]:
@@ -180,15 +180,15 @@ def _select_groups(
 def _create_touch(places: Float[np.ndarray, "k d"], shares: Float[np.ndarray, " k"]) -> MapTouch:
     """Create a touch from the places and shares of a group of neurons."""
     centroid = shares @ places / shares.sum()
-    spread = np.sqrt(shares @ np.sum((places - centroid) ** 2, axis=1) / shares.sum())
-    return MapTouch(centroid, float(spread), float(shares.sum()))
+    standard_distance = np.sqrt(shares @ np.sum((places - centroid) ** 2, axis=1) / shares.sum())
+    return MapTouch(centroid, float(standard_distance), float(shares.sum()))
 
 
-def _check_frame(placed: PlacedMap, name: str, value) -> Float[np.ndarray, " M"]:
+def _check_frame(placed_map: PlacedMap, name: str, value) -> Float[np.ndarray, " M"]:
     values = real_array(name, value, "one frame (M,)")
-    if values.shape != placed.learnt.weights.shape[2:] or not np.isfinite(values).all():
+    if values.shape != placed_map.learnt.weights.shape[2:] or not np.isfinite(values).all():
         raise ValueError(
-            f"{name} must be one finite frame of {placed.learnt.weights.shape[2]} channels; it has shape "
+            f"{name} must be one finite frame of {placed_map.learnt.weights.shape[2]} channels; it has shape "
             f"{values.shape}" + ("." if np.isfinite(values).all() else ", and NaN or infinite readings.")
         )
     return values

@@ -80,8 +80,8 @@ class MapSchedule(Module):
     def radii(self, shape: tuple[int, int]) -> Float[np.ndarray, " O"]:
         """Compute the neighbourhood radius for every frame of the ordering phase, in grid steps, for a map of this
         `shape`."""
-        first, last = (max(max(shape) / 2, 1.0), 1.0) if self.radius is None else self.radius
-        return np.geomspace(first, last, self.ordering)
+        first_radius, last_radius = (max(max(shape) / 2, 1.0), 1.0) if self.radius is None else self.radius
+        return np.geomspace(first_radius, last_radius, self.ordering)
 
 
 @jax.jit
@@ -139,21 +139,25 @@ def _ordering_phase(shape, weights, frames, rates, radii):
 
     def show_frame(state, step):
         distances, weight_means = state
-        index, rate, radius, to_other_frames, frame_mean = step
-        own_distances = distances[index]
+        frame_index, rate, radius, frame_distances, frame_mean = step
+        own_distances = distances[frame_index]
         best_row, best_column = _find_winner(own_distances, shape)
-        share = rate * jnp.exp(-((row - best_row) ** 2 + (column - best_column) ** 2) / (2 * radius**2)).reshape(-1)
-        distances = (1 - share) * distances + share * (to_other_frames[:, None] - (1 - share) * own_distances)
-        weight_means = weight_means + share * (frame_mean - weight_means)
-        return (distances, weight_means), (share, weight_means.mean())
+        move_fractions = rate * jnp.exp(
+            -((row - best_row) ** 2 + (column - best_column) ** 2) / (2 * radius**2)
+        ).reshape(-1)
+        distances = (1 - move_fractions) * distances + move_fractions * (
+            frame_distances[:, None] - (1 - move_fractions) * own_distances
+        )
+        weight_means = weight_means + move_fractions * (frame_mean - weight_means)
+        return (distances, weight_means), (move_fractions, weight_means.mean())
 
     initial_state, frame_distances = (
         (_squared_distances(frames, weights), weights.mean(axis=1)),
         _squared_distances(frames, frames),
     )
     steps = jnp.arange(len(frames)), rates, radii, frame_distances, frames.mean(axis=1)
-    _, (shares, curve) = jax.lax.scan(show_frame, initial_state, steps)
-    return _move_weights(weights, shares, frames), curve
+    _, (move_fractions, curve) = jax.lax.scan(show_frame, initial_state, steps)
+    return _move_weights(weights, move_fractions, frames), curve
 
 
 def _tuning_phase(shape, weights, frames, rates):
@@ -163,14 +167,16 @@ def _tuning_phase(shape, weights, frames, rates):
 
     def show_frame(state, step):
         distances, weight_means, (winner, winner_distances) = state
-        index, rate, to_other_frames, frame_mean = step
+        frame_index, rate, frame_distances, frame_mean = step
         # The distances of the previous frame's winner are written before any distances are read, which avoids a copy of
         # the array.
         distances = distances.at[:, winner].set(winner_distances, mode=_IN_BOUNDS)
-        row, column = _find_winner(distances[index], shape)
+        row, column = _find_winner(distances[frame_index], shape)
         winner = row * shape[1] + column
         old_distances = distances.at[:, winner].get(mode=_IN_BOUNDS)
-        winner_distances = (1 - rate) * old_distances + rate * (to_other_frames - (1 - rate) * old_distances[index])
+        winner_distances = (1 - rate) * old_distances + rate * (
+            frame_distances - (1 - rate) * old_distances[frame_index]
+        )
         weight_means = weight_means.at[winner].add(rate * (frame_mean - weight_means[winner]), mode=_IN_BOUNDS)
         return (distances, weight_means, (winner, winner_distances)), (winner, weight_means.mean())
 
@@ -178,8 +184,8 @@ def _tuning_phase(shape, weights, frames, rates):
     initial_state = distances, weights.mean(axis=1), (jnp.zeros((), int), distances[:, 0])
     steps = jnp.arange(len(frames)), rates, frame_distances, frames.mean(axis=1)
     _, (winners, curve) = jax.lax.scan(show_frame, initial_state, steps)
-    shares = jnp.where(winners[:, None] == winners, rates[:, None], 0.0)
-    return weights.at[winners].set(_move_weights(weights[winners], shares, frames)), curve
+    move_fractions = jnp.where(winners[:, None] == winners, rates[:, None], 0.0)
+    return weights.at[winners].set(_move_weights(weights[winners], move_fractions, frames)), curve
 
 
 def _squared_distances(frames, weights):
@@ -197,15 +203,17 @@ def _find_winner(distances, shape):
     return jnp.argmin(distance_grid[:, column]), column
 
 
-def _move_weights(weights, shares, frames):
-    """Move the weights of neurons towards frames, one frame after another, by `shares` (frames, neurons) of the
+def _move_weights(weights, move_fractions, frames):
+    """Move the weights of neurons towards frames, one frame after another, by `move_fractions` (frames, neurons) of the
     remaining way."""
 
-    def remaining_and_added(remaining, share):
+    def split_remaining_weight(remaining, share):
         return remaining * (1 - share), remaining * share
 
     # From the last frame to the first: later frames reduce the contribution of a frame by their own shares.
-    weight_shares, frame_shares = jax.lax.scan(remaining_and_added, jnp.ones(len(weights)), shares, reverse=True)
+    weight_shares, frame_shares = jax.lax.scan(
+        split_remaining_weight, jnp.ones(len(weights)), move_fractions, reverse=True
+    )
     return weight_shares[:, None] * weights + frame_shares.T @ frames
 
 

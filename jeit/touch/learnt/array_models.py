@@ -211,8 +211,8 @@ class NearestNeighbours:
         all_neighbours = cls(features, targets, count + 1, np.arange(targets.shape[1]))
         distances, indices = (array[:, 1:] for array in all_neighbours._nearest_presses(features))
         weights = 1 / np.maximum(distances, 1e-12)[..., None]
-        means = np.cumsum(weights * targets[indices], axis=1) / np.cumsum(weights, axis=1)
-        errors = np.linalg.norm(means - targets[:, None], axis=-1).mean(axis=0)
+        cumulative_means = np.cumsum(weights * targets[indices], axis=1) / np.cumsum(weights, axis=1)
+        errors = np.linalg.norm(cumulative_means - targets[:, None], axis=-1).mean(axis=0)
         best_count = min([k for k in _CANDIDATE_COUNTS if k <= count] or [count], key=lambda k: errors[k - 1])
         return cls(features, targets, best_count, all_neighbours.classes_)
 
@@ -330,16 +330,23 @@ class SupportVectorMachine:
         are not of the pair.
         """
         num_classes = len(self.classes_)
-        first, second = np.triu_indices(num_classes, 1)
+        first_classes, second_classes = np.triu_indices(num_classes, 1)
         if self.slopes is not None:
             distances = features @ self.slopes.T + self.intercepts
         else:
             kernel = (self.gain * features @ self.support.T + self.offset) ** self.degree
-            sums = np.empty((len(features), num_classes - 1, num_classes))
+            vote_sums = np.empty((len(features), num_classes - 1, num_classes))
             for class_index in range(num_classes):
                 class_vectors = slice(self.start[class_index], self.start[class_index + 1])
-                sums[:, :, class_index] = kernel[:, class_vectors] @ self.weights[:, class_vectors].T
-            distances = sums[:, second - 1, first] + sums[:, first, second] + self.intercepts
-        side_signs = np.zeros((len(first), num_classes))
-        side_signs[np.arange(len(first)), first], side_signs[np.arange(len(first)), second] = 1.0, -1.0
+                vote_sums[:, :, class_index] = kernel[:, class_vectors] @ self.weights[:, class_vectors].T
+            distances = (
+                vote_sums[:, second_classes - 1, first_classes]
+                + vote_sums[:, first_classes, second_classes]
+                + self.intercepts
+            )
+        side_signs = np.zeros((len(first_classes), num_classes))
+        (
+            side_signs[np.arange(len(first_classes)), first_classes],
+            side_signs[np.arange(len(first_classes)), second_classes],
+        ) = 1.0, -1.0
         return distances, side_signs

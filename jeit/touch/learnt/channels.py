@@ -127,22 +127,22 @@ class Channels:
         Raises `ValueError` if all channels have constant readings.
         """
         missing = np.isnan(changes)
-        used = missing.mean(axis=0) < 0.5
+        is_used = missing.mean(axis=0) < 0.5
         deviation = np.zeros(changes.shape[1])
-        deviation[used] = np.nanstd(changes[:, used], axis=0)
-        max_change = np.nanmax(np.abs(changes[:, used]), initial=0.0)
-        used &= deviation > max(1e-9 * deviation.max(initial=0.0), _ROUNDING_ERROR * max_change)
-        if not used.any():
+        deviation[is_used] = np.nanstd(changes[:, is_used], axis=0)
+        max_change = np.nanmax(np.abs(changes[:, is_used]), initial=0.0)
+        is_used &= deviation > max(1e-9 * deviation.max(initial=0.0), _ROUNDING_ERROR * max_change)
+        if not is_used.any():
             raise ValueError("frames: no channel changes; are these frames, and the skin connected?")
-        scale = deviation[used]
-        scaled = np.where(missing[:, used], 0.0, changes[:, used]) / scale
-        has_reading, half = ~missing[:, used], len(scaled) // 2
+        scale = deviation[is_used]
+        scaled = np.where(missing[:, is_used], 0.0, changes[:, is_used]) / scale
+        has_reading, half_index = ~missing[:, is_used], len(scaled) // 2
         # Residuals are larger for frames outside the training set than in it, so each half of the frames is evaluated
         # with the patterns that were fitted to the other half.
-        residuals, novelties, leave_one_out_errors = [], [], np.zeros((2, len(_DIAGONALS), int(used.sum())))
+        residuals, novelties, leave_one_out_errors = [], [], np.zeros((2, len(_DIAGONALS), int(is_used.sum())))
         for training_rows, test_rows in (
-            (slice(None, half), slice(half, None)),
-            (slice(half, None), slice(None, half)),
+            (slice(None, half_index), slice(half_index, None)),
+            (slice(half_index, None), slice(None, half_index)),
         ):
             variance, directions = _variances(scaled[training_rows])
             leave_one_out_errors += _leave_one_out_errors(scaled[test_rows], variance, directions)
@@ -151,34 +151,34 @@ class Channels:
             residuals.append(np.where(has_reading[test_rows], np.abs(residual), np.nan))
             novelties.append(_novelty(scores, residual, has_reading[test_rows], model[1]))
         residuals, novelties = np.concatenate(residuals), np.concatenate(novelties)
-        farthest = _RESIDUAL_FACTOR * np.nanquantile(residuals, _RESIDUAL_QUANTILE, axis=0)
-        farthest = np.maximum(farthest, max(6.0, float(np.nanquantile(residuals, 0.99))))
+        max_residuals = _RESIDUAL_FACTOR * np.nanquantile(residuals, _RESIDUAL_QUANTILE, axis=0)
+        max_residuals = np.maximum(max_residuals, max(6.0, float(np.nanquantile(residuals, 0.99))))
         variance, directions = _variances(scaled)
         best_diagonal = int(leave_one_out_errors[0].sum(axis=1).argmin())
-        weight, unpredicted = (
+        weight, leave_one_out_variance = (
             variance / (variance + _DIAGONALS[best_diagonal]),
             leave_one_out_errors[1, best_diagonal] / 2,
         )
-        patterns, spread, noise = _fit_patterns(scaled, variance, directions)
-        scores, _ = _most_likely_scores(scaled, has_reading, patterns, spread, noise)
-        usual = float(np.quantile(novelties, 0.99))
-        minima, maxima = np.nanmin(changes[:, used], axis=0) / scale, np.nanmax(changes[:, used], axis=0) / scale
+        patterns, score_deviation, noise = _fit_patterns(scaled, variance, directions)
+        scores, _ = _most_likely_scores(scaled, has_reading, patterns, score_deviation, noise)
+        usual_novelty = float(np.quantile(novelties, 0.99))
+        minima, maxima = np.nanmin(changes[:, is_used], axis=0) / scale, np.nanmax(changes[:, is_used], axis=0) / scale
         limits = np.stack(
             [minima - _MAX_RANGE_EXCESS * (maxima - minima), maxima + _MAX_RANGE_EXCESS * (maxima - minima)]
         )
         neighbourhood = Neighbourhood.learn(scores)
         return cls(
-            used,
+            is_used,
             scale,
             limits,
             patterns,
-            spread,
+            score_deviation,
             noise,
-            farthest,
+            max_residuals,
             directions,
             weight,
-            unpredicted,
-            usual,
+            leave_one_out_variance,
+            usual_novelty,
             neighbourhood,
         )
 
@@ -377,14 +377,14 @@ def _leave_one_out_errors(scaled, variance, directions) -> Float[np.ndarray, "2 
     return np.swapaxes(np.array(errors), 0, 1)
 
 
-def _most_likely_scores(changes, alive, patterns, spread, noise) -> tuple[np.ndarray, np.ndarray]:
+def _most_likely_scores(changes, alive, patterns, score_deviation, noise) -> tuple[np.ndarray, np.ndarray]:
     """Compute the most likely pattern scores of frames (frames, patterns), and the residuals of their readings divided
     by the noise.
 
     Residuals are 0 for readings that are not `alive` (frames, channels).
     """
     weighted_patterns = patterns / noise[:, None] ** 2
-    prior = np.diag(1 / spread**2)
+    prior = np.diag(1 / score_deviation**2)
     scores = np.linalg.solve(weighted_patterns.T @ patterns + prior, weighted_patterns.T @ changes.T).T
     for frame in np.flatnonzero(~alive.all(axis=1)):
         alive_patterns = weighted_patterns * alive[frame, :, None]
@@ -392,12 +392,12 @@ def _most_likely_scores(changes, alive, patterns, spread, noise) -> tuple[np.nda
     return scores, np.where(alive, (changes - scores @ patterns.T) / noise, 0.0)
 
 
-def _novelty(scores, residual, alive, spread) -> np.ndarray:
+def _novelty(scores, residual, alive, score_deviation) -> np.ndarray:
     """Compute the novelty of each frame: the larger of the root mean squares of its residuals, relative to the noise,
     and of its pattern scores, relative to their standard deviations.
     """
     residual_size = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(alive.sum(axis=1), 1))
-    return np.maximum(residual_size, np.sqrt(np.mean((scores / spread) ** 2, axis=1)))
+    return np.maximum(residual_size, np.sqrt(np.mean((scores / score_deviation) ** 2, axis=1)))
 
 
 def choose_channels(

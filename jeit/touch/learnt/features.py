@@ -45,22 +45,22 @@ class ImageReconstruction:
 
     @classmethod
     def create(
-        cls, model: ForwardModel, changes: Float[np.ndarray, "N m"], used: Bool[np.ndarray, " M"], reference
+        cls, model: ForwardModel, changes: Float[np.ndarray, "N m"], is_used: Bool[np.ndarray, " M"], reference
     ) -> tuple["ImageReconstruction", list[str]]:
-        """Create a one-step linear reconstruction from the channels that are `used`.
+        """Create a one-step linear reconstruction from the channels that are used (`is_used`).
 
         If a `reference` frame is given, the forward model is calibrated on this frame. The sign of the images is
         determined from the voltage `changes` of presses. Also returns notes on the calibration as text.
         """
-        notes, conductivity, mask = [], 1.0, as_array(used)
-        if reference is not None and np.abs(reference[used]).max() > 0:
+        notes, conductivity, mask = [], 1.0, as_array(is_used)
+        if reference is not None and np.abs(reference[is_used]).max() > 0:
             # -1 if the polarity of the channels is reversed.
-            polarity = np.sign(np.where(used, model.voltages(1.0), 0.0) @ reference)
+            polarity = np.sign(np.where(is_used, model.voltages(1.0), 0.0) @ reference)
             calibration = calibrate(model, as_array(polarity * reference), mask=mask, contact="fixed")
             if np.isfinite(calibration.misfit):
                 model, conductivity = calibration.model, calibration.conductivity
                 notes += [calibration.note] if calibration.note else []
-        matrix = np.asarray(one_step(model, conductivity, mask=mask).matrix).T[used]
+        matrix = np.asarray(one_step(model, conductivity, mask=mask).matrix).T[is_used]
         centres, sizes = np.asarray(centroids(model.mesh)), np.asarray(measures(model.mesh))
         around = KDTree(centres).query(centres, max(1, int(_NEIGHBOUR_FRACTION * len(centres))))[1]
         image = changes @ matrix
@@ -154,18 +154,18 @@ class WhitenedChanges:
     root: Float[np.ndarray, "m m"]
 
     @classmethod
-    def learn(cls, changes: Float[np.ndarray, "N m"], answers: Float[np.ndarray, "N d"]) -> "WhitenedChanges":
-        """Fit the whitening matrix to frames, of which some have the same `answers` (targets).
+    def learn(cls, changes: Float[np.ndarray, "N m"], targets: Float[np.ndarray, "N d"]) -> "WhitenedChanges":
+        """Fit the whitening matrix to frames, of which some have the same `targets`.
 
         The covariance between frames with the same targets is shrunk as in Ledoit and Wolf (2004).
         """
         from sklearn.covariance import ledoit_wolf
 
         scale = np.maximum(changes.std(axis=0), 1e-300)
-        group, count = _group_equal_rows(answers)
-        means = np.zeros((len(count), changes.shape[1]))
-        np.add.at(means, group, changes / count[group, None])
-        residuals = ((changes - means[group]) / scale)[count[group] > 1]
+        group, count = _group_equal_rows(targets)
+        mean_changes = np.zeros((len(count), changes.shape[1]))
+        np.add.at(mean_changes, group, changes / count[group, None])
+        residuals = ((changes - mean_changes[group]) / scale)[count[group] > 1]
         if not residuals.any():
             return cls(np.diag(1 / scale))
         degrees_of_freedom = len(residuals) - np.sum(count > 1)
@@ -185,9 +185,9 @@ class WhitenedChanges:
         return np.full(values.shape[1], np.sqrt(np.mean(values.var(axis=0))))
 
 
-def are_repeated(answers: Float[np.ndarray, "N d"]) -> bool:
-    """Whether enough frames have the same `answers` (targets) as another frame to estimate the noise of frames."""
-    return int(np.sum(_group_equal_rows(answers)[1] - 1)) >= _MIN_REPEATED_FRAMES
+def are_repeated(targets: Float[np.ndarray, "N d"]) -> bool:
+    """Whether enough frames have the same `targets` as another frame to estimate the noise of frames."""
+    return int(np.sum(_group_equal_rows(targets)[1] - 1)) >= _MIN_REPEATED_FRAMES
 
 
 def _group_equal_rows(targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -270,7 +270,7 @@ class Features:
         changes: Float[np.ndarray, "N m"],
         reference: Float[np.ndarray, "N m"],
         *,
-        made: WhitenedChanges | ContactFeatures | ImageFeatures | None = None,
+        learnt_function: WhitenedChanges | ContactFeatures | ImageFeatures | None = None,
         rotated: bool = True,
     ) -> "Features":
         """Fit the scaling and the principal components of features to voltage changes and reference voltages.
@@ -278,16 +278,16 @@ class Features:
         If `rotated`, features are reduced to principal components, except for the few features of a contact in an
         image.
         """
-        if made is None:
+        if learnt_function is None:
             unit, values, mean, deviation = standardisation(form, changes, reference)
         else:
-            unit, values = np.ones(changes.shape[1]), made(changes)
-            mean, deviation = values.mean(axis=0), _replace_zeros_by_infinity(made.deviation(values))
-        if not rotated or isinstance(made, ContactFeatures):
-            return cls(form, unit, mean, deviation, None, made)
+            unit, values = np.ones(changes.shape[1]), learnt_function(changes)
+            mean, deviation = values.mean(axis=0), _replace_zeros_by_infinity(learnt_function.deviation(values))
+        if not rotated or isinstance(learnt_function, ContactFeatures):
+            return cls(form, unit, mean, deviation, None, learnt_function)
         rows = np.linalg.svd((values - mean) / deviation, full_matrices=False)[2]
         components = rows[: max(2, min(_MAX_COMPONENTS, len(values) // _PRESSES_PER_COMPONENT))].T
-        return cls(form, unit, mean, deviation, components, made)
+        return cls(form, unit, mean, deviation, components, learnt_function)
 
     def __call__(self, changes: np.ndarray, reference: np.ndarray) -> Float[np.ndarray, "n k"]:
         """Compute the features (frames, features) of changes and reference voltages (frames, channels)."""
@@ -329,18 +329,18 @@ class Forms:
 
     @classmethod
     def available(
-        cls, answers: Float[np.ndarray, "N d"], imaged: ImageReconstruction | None, *, has_reference: bool
+        cls, targets: Float[np.ndarray, "N d"], imaged: ImageReconstruction | None, *, has_reference: bool
     ) -> "Forms":
         """Return the forms of features that the data allow: reference voltages, if `has_reference`, repeated targets in
-        `answers`, and images."""
-        makers: dict[str, Maker] = {"whitened": WhitenedChanges.learn} if are_repeated(answers) else {}
+        `targets`, and images."""
+        makers: dict[str, Maker] = {"whitened": WhitenedChanges.learn} if are_repeated(targets) else {}
         if imaged is not None:
-            makers |= {"contacts": lambda changes, answers: ContactFeatures(imaged)}
-            makers |= {"images": lambda changes, answers: ImageFeatures(imaged)}
+            makers |= {"contacts": lambda changes, targets: ContactFeatures(imaged)}
+            makers |= {"images": lambda changes, targets: ImageFeatures(imaged)}
         unlearnt_forms = [form for form in FORMS if has_reference or form != "ratios"]
         return cls((*unlearnt_forms, *makers), makers)
 
-    def learn(self, form: str, changes, reference, answers, *, rotated: bool = True) -> Features:
+    def learn(self, form: str, changes, reference, targets, *, rotated: bool = True) -> Features:
         """Fit features of one form to voltage changes, as `Features.learn` does."""
-        made = self.makers[form](changes, answers) if form in self.makers else None
-        return Features.learn(form, changes, reference, made=made, rotated=rotated)
+        learnt_function = self.makers[form](changes, targets) if form in self.makers else None
+        return Features.learn(form, changes, reference, learnt_function=learnt_function, rotated=rotated)

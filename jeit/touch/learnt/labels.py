@@ -77,11 +77,11 @@ def learn_labels(
     results = []
     for form in forms.names:
         progress(f"{_QUICK_METHOD} on {form}")
-        results.append(_hold_out(_QUICK_METHOD, form, forms, changes, reference, true_classes, folds))
+        results.append(_cross_validate(_QUICK_METHOD, form, forms, changes, reference, true_classes, folds))
     form = min(results, key=_error_rate).form
     for name in [name for name in CLASSIFIERS if name != _QUICK_METHOD and method in ("auto", name)]:
         progress(f"{name} on {form}")
-        results.append(_hold_out(name, form, forms, changes, reference, true_classes, folds))
+        results.append(_cross_validate(name, form, forms, changes, reference, true_classes, folds))
     results.sort(key=_error_rate)
     results = [result for result in results if method in ("auto", result.method)]
     best_result = results[0]
@@ -102,24 +102,20 @@ def _error_rate(result: LabelMethodResult) -> float:
     return result.error
 
 
-def _hold_out(method, form, forms: Forms, changes, reference, true_classes, folds) -> LabelMethodResult:
+def _cross_validate(method, form, forms: Forms, changes, reference, true_classes, folds) -> LabelMethodResult:
     """Predict the classes of all presses by cross-validation of one method with one form of features."""
     num_classes = true_classes.max() + 1
     odds = np.full((len(true_classes), num_classes), -1e3)
 
     def predict(fold: int) -> None:
-        is_held_out = folds == fold
-        features = forms.learn(form, changes[~is_held_out], reference[~is_held_out], true_classes[~is_held_out, None])
-        model = CLASSIFIERS[method](
-            features(changes[~is_held_out], reference[~is_held_out]), true_classes[~is_held_out]
-        )
-        odds[np.ix_(is_held_out, model.classes_)] = log_odds(
-            model, features(changes[is_held_out], reference[is_held_out])
-        )
+        is_test = folds == fold
+        features = forms.learn(form, changes[~is_test], reference[~is_test], true_classes[~is_test, None])
+        model = CLASSIFIERS[method](features(changes[~is_test], reference[~is_test]), true_classes[~is_test])
+        odds[np.ix_(is_test, model.classes_)] = log_odds(model, features(changes[is_test], reference[is_test]))
 
     apply_over_folds(predict, folds.max() + 1)
-    held_out = odds.argmax(axis=1)
-    return LabelMethodResult(method, form, held_out, odds, float(np.mean(held_out != true_classes)))
+    predicted_classes = odds.argmax(axis=1)
+    return LabelMethodResult(method, form, predicted_classes, odds, float(np.mean(predicted_classes != true_classes)))
 
 
 _INVERSE_PENALTIES = (1e-3, 1e-2, 1e-1, 1.0)
@@ -261,52 +257,52 @@ def _key_methods() -> dict[str, tuple[str, float]]:
     return candidates
 
 
-def _fit_key(name: str, changes, reference, answers, odds) -> tuple[StandardisedFeatures, Any, float]:
+def _fit_key(name: str, changes, reference, is_pressed, odds) -> tuple[StandardisedFeatures, Any, float]:
     """Fit the classification method `name` to one key; returns features, classifier, and sharpness (factor of
     log-odds).
 
-    `answers`: 1 for presses of the key, else 0; `odds`: log-odds of held-out presses, from which the sharpness is
+    `is_pressed`: 1 for presses of the key, else 0; `odds`: log-odds of held-out presses, from which the sharpness is
     fitted.
     """
     kind, strength = _key_methods()[name]
     features = StandardisedFeatures.learn(name.partition(" on ")[2], changes, reference)
     values = features(changes, reference)
-    sharpness = fit_sharpness(np.column_stack([np.zeros(len(odds)), odds]), answers)
+    sharpness = fit_sharpness(np.column_stack([np.zeros(len(odds)), odds]), is_pressed)
     if kind == "linear":
-        return features, _fit_rotated(values, answers, strength), sharpness
-    feature_indices = _select_features(values, answers)
+        return features, _fit_rotated(values, is_pressed, strength), sharpness
+    feature_indices = _select_features(values, is_pressed)
     key_features = StandardisedFeatures(
         features.form, features.unit, features.mean, features.deviation, feature_indices
     )
-    return key_features, _CHANNEL_METHODS[kind](values[:, feature_indices], answers), sharpness
+    return key_features, _CHANNEL_METHODS[kind](values[:, feature_indices], is_pressed), sharpness
 
 
-def _fit_rotated(values, answers, strength):
+def _fit_rotated(values, is_pressed, strength):
     """Fit logistic regression to principal components of the features, and convert its coefficients to the features."""
     rotation = np.linalg.svd(values, full_matrices=False)[2].T
-    model = _fit_logistic(values @ rotation, answers, strength)
+    model = _fit_logistic(values @ rotation, is_pressed, strength)
     model.coef_ = model.coef_ @ rotation.T
     model.n_features_in_ = values.shape[1]
     return model
 
 
-def _fit_logistic(values, answers, strength):
+def _fit_logistic(values, is_pressed, strength):
     from sklearn.linear_model import LogisticRegression
 
-    return LogisticRegression(C=strength, max_iter=500).fit(values, answers)
+    return LogisticRegression(C=strength, max_iter=500).fit(values, is_pressed)
 
 
-def _fit_discriminant(values, answers):
-    """Fit a linear discriminant to features (presses, features); `answers` are true for the presses of a key."""
+def _fit_discriminant(values, is_pressed):
+    """Fit a linear discriminant to features (presses, features); `is_pressed` are true for the presses of a key."""
     from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
-    return LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(values, answers)
+    return LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(values, is_pressed)
 
 
-def _fit_trees(values, answers):
+def _fit_trees(values, is_pressed):
     from sklearn.ensemble import ExtraTreesClassifier
 
-    ensemble = ExtraTreesClassifier(_NUM_TREES, **_TREE_OPTIONS).fit(values, answers)
+    ensemble = ExtraTreesClassifier(_NUM_TREES, **_TREE_OPTIONS).fit(values, is_pressed)
     return Forest.from_classification_trees(
         ensemble.estimators_, np.full(_NUM_TREES, 1 / _NUM_TREES), ensemble.classes_, votes=False
     )

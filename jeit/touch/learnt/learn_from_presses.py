@@ -61,14 +61,14 @@ def time_folds(
     num_copies = num_presses - frame_indices.max() - 1
     if num_copies:
         notes.append(f"{num_copies} frames are copies of others: kept in one fold with them.")
-        unit = _connected_sets(unit, frame_indices)
+        unit = _number_connected_sets(unit, frame_indices)
     has_repeated_places = False
     if positions is not None and positions.shape[1] > 1 and not is_grouped:
         place_indices = np.unique(positions, axis=0, return_inverse=True)[1].ravel()
         has_repeated_places = num_folds <= place_indices.max() + 1 < _MAX_UNIQUE_SHARE * num_presses
         if has_repeated_places:
             notes.append(f"{place_indices.max() + 1} places were repeated: held out with all of their presses.")
-            unit = _connected_sets(unit, place_indices)
+            unit = _number_connected_sets(unit, place_indices)
     num_intervals = num_folds
     fold = _assign_to_folds(unit, rank, num_folds, num_intervals)
     while not is_grouped and num_intervals < num_presses / 4 and not _training_sets_cover(fold, positions, kinds):
@@ -129,16 +129,16 @@ def _largest_distance(positions: np.ndarray, fold: np.ndarray) -> float:
     )
 
 
-def _connected_sets(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Number the connected sets of elements; two elements are connected if they have the same number in `first` or in
-    `second`."""
+def _number_connected_sets(first_labels: np.ndarray, second_labels: np.ndarray) -> np.ndarray:
+    """Number the connected sets of elements; two elements are connected if they have the same number in `first_labels`
+    or in `second_labels`."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    offset = first.max() + 1
-    size = offset + second.max() + 1
-    graph = coo_array((np.ones(len(first)), (first, offset + second)), shape=(size, size))
-    return np.unique(connected_components(graph, directed=False)[1][first], return_inverse=True)[1]
+    offset = first_labels.max() + 1
+    size = offset + second_labels.max() + 1
+    graph = coo_array((np.ones(len(first_labels)), (first_labels, offset + second_labels)), shape=(size, size))
+    return np.unique(connected_components(graph, directed=False)[1][first_labels], return_inverse=True)[1]
 
 
 METHODS = tuple(dict.fromkeys((*regression.METHODS, *label_methods.METHODS)))
@@ -189,8 +189,8 @@ def learn_quantities(
     models: dict[str, Any] = dict.fromkeys(("place", "force", "label", "keys"))
     all_rows = np.arange(len(changes))
     if presses.positions is not None:
-        rows, folds, remarks = places_and_folds(presses)
-        notes += remarks
+        rows, folds, fold_notes = places_and_folds(presses)
+        notes += fold_notes
         places = presses.positions[rows]
         models["place"], standing["place"] = _learn_targets(
             changes, reference, places, rows, folds, method, imaged, progress
@@ -204,7 +204,7 @@ def learn_quantities(
             changes, reference, force, all_rows, folds, method, imaged, progress
         )
     if presses.label is not None:
-        folds, remarks = time_folds(presses.frames, *_groups_and_times(presses, all_rows), kinds=presses.label)
+        folds, fold_notes = time_folds(presses.frames, *_groups_and_times(presses, all_rows), kinds=presses.label)
         learnt, results = learn_labels(
             changes,
             reference,
@@ -214,13 +214,13 @@ def learn_quantities(
             imaged=imaged,
             progress=progress,
         )
-        notes += [*remarks, *learnt.notes]
+        notes += [*fold_notes, *learnt.notes]
         models["label"] = learnt
         methods = [(f"{result.method} on {result.form}", result.error) for result in results]
         standing["label"] = Standing(methods[0][0], methods, learnt.classes[results[0].held_out], presses.label)
     if presses.touched is not None:
-        folds, remarks = time_folds(presses.frames, *_groups_and_times(presses, all_rows), kinds=presses.touched)
-        notes += remarks
+        folds, fold_notes = time_folds(presses.frames, *_groups_and_times(presses, all_rows), kinds=presses.touched)
+        notes += fold_notes
         if presses.touched.sum(axis=1).max() < 2:
             notes.append("no two keys were pressed together: predictions of keys pressed together are unreliable.")
         models["keys"], results = learn_keys(changes, reference, presses.touched, folds, progress=progress)
@@ -235,8 +235,8 @@ def places_and_folds(presses: Presses) -> tuple[np.ndarray, np.ndarray, tuple[st
     text."""
     positions = np.asarray(presses.positions)
     rows = np.flatnonzero(~np.isnan(positions).any(axis=1))
-    folds, remarks = time_folds(presses.frames[rows], *_groups_and_times(presses, rows), positions=positions[rows])
-    return rows, folds, remarks
+    folds, fold_notes = time_folds(presses.frames[rows], *_groups_and_times(presses, rows), positions=positions[rows])
+    return rows, folds, fold_notes
 
 
 def _learn_targets(

@@ -28,12 +28,12 @@ from jeit.touch.learnt.recorded_presses import (
     check_frames,
     check_reference,
     estimate_lag,
+    fill_reference,
     mean_reference,
-    reference_used,
     standardise_sessions,
 )
 from jeit.touch.learnt.regression import LearntNumbers
-from jeit.touch.learnt.resource_limits import apply_over_threads, one_thread
+from jeit.touch.learnt.resource_limits import apply_over_threads, limit_to_one_thread
 
 # A frame is unlike the training set above this novelty (about 1 for the farthest training frames), or below this
 # fraction of alive channels.
@@ -112,7 +112,7 @@ class LearntSkin:
         from that of the frames.
         """
         _check_fit(presses, method, model, num_channels, per_session)
-        with one_thread():
+        with limit_to_one_thread():
             report = progress or (lambda message: None)
             return cls._fit(presses, method, model, num_channels, per_session, report)
 
@@ -127,8 +127,8 @@ class LearntSkin:
         progress("channels")
         channels = Channels.learn(changes)
         if num_channels is not None:
-            channels, note = _reduce_channels(channels, changes, presses, num_channels)
-            notes.append(note)
+            channels, reduction_note = _reduce_channels(channels, changes, presses, num_channels)
+            notes.append(reduction_note)
         elif not channels.used.all():
             silent_channels = np.flatnonzero(~channels.used)
             notes.append(
@@ -149,7 +149,7 @@ class LearntSkin:
             progress("images")
             imaged, image_notes = ImageReconstruction.create(model, changes, channels.used, mean)
             model_notes += image_notes
-        references = None if mean is None else reference_used(presses.reference, mean, channels.used, len(changes))
+        references = None if mean is None else fill_reference(presses.reference, mean, channels.used, len(changes))
         models, standing, fit_notes = learn_quantities(changes, references, presses, method, imaged, progress)
         notes = list(dict.fromkeys([*notes, *model_notes, *fit_notes]))
         return cls(
@@ -181,8 +181,8 @@ class LearntSkin:
         predictions = apply_over_threads(
             self._predict,
             changes,
-            reference_used(reference, self.mean_reference, self.channels.used, len(changes)),
-            at_once=_CHUNK_SIZE,
+            fill_reference(reference, self.mean_reference, self.channels.used, len(changes)),
+            chunk_size=_CHUNK_SIZE,
         )
         names = [field.name for field in fields(Touches) if field.name != "notes"]
         touch_fields: dict[str, Any] = {name: predictions.get(name) for name in names}
@@ -201,7 +201,7 @@ class LearntSkin:
 
     def _predict(self, changes: Float[np.ndarray, "n M"], reference: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
         """Predict the learnt fields of `Touches`, by name, from the voltage changes of frames."""
-        completed_changes, alive, novelty, excess = self.channels.complete(changes)
+        completed_changes, alive, novelty, excess_mean_square = self.channels.complete(changes)
         is_touched = np.sqrt(np.mean((completed_changes / self.channels.scale) ** 2, axis=1)) > self.quiet
         # Frames with small changes count as untouched, not as unlike; frames with too many missing channels are always
         # unlike.
@@ -215,13 +215,13 @@ class LearntSkin:
             is_touched &= label != NO_TOUCH
         has_prediction = (is_touched & ~is_unlike)[:, None]
         if self.place is not None:
-            values, std = self._predict_targets(self.place, completed_changes, reference, alive, excess)
+            values, std = self._predict_targets(self.place, completed_changes, reference, alive, excess_mean_square)
             predictions |= {
                 "position": np.where(has_prediction, values, np.nan),
                 "position_std": np.where(has_prediction, std, np.nan),
             }
         if self.force is not None:
-            values, std = self._predict_targets(self.force, completed_changes, reference, alive, excess)
+            values, std = self._predict_targets(self.force, completed_changes, reference, alive, excess_mean_square)
             is_untouched = ~is_touched & ~is_unlike
             forces = np.where(has_prediction, np.maximum(values, 0.0), np.nan)[:, 0]
             predictions |= {
@@ -236,16 +236,16 @@ class LearntSkin:
         return predictions
 
     def _predict_targets(
-        self, model: LearntNumbers, changes, reference, alive, excess
+        self, model: LearntNumbers, changes, reference, alive, excess_mean_square
     ) -> tuple[np.ndarray, np.ndarray]:
         """Predict places or forces (frames, targets) and their standard deviations.
 
         The standard deviations include the errors of the readings that are predicted for dead channels. If a frame
         deviates more from the channel patterns than training presses do, they also include errors of all its readings.
         """
-        noisy_rows = np.flatnonzero(excess.any(axis=1))
+        noisy_rows = np.flatnonzero(excess_mean_square.any(axis=1))
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (_NUM_DRAWS, 1, changes.shape[1]))
-        perturbed_changes = (changes[noisy_rows] + signs * excess[noisy_rows]).reshape(-1, changes.shape[1])
+        perturbed_changes = (changes[noisy_rows] + signs * excess_mean_square[noisy_rows]).reshape(-1, changes.shape[1])
         # Predict for all inputs in one call, since for few frames the overhead of a call exceeds the computing time.
         repeated_references = np.tile(reference[noisy_rows], (_NUM_DRAWS, 1))
         inputs = np.concatenate([changes, perturbed_changes]), np.concatenate([reference, repeated_references])
@@ -442,12 +442,12 @@ def _align_frames(changes: np.ndarray, presses: Presses) -> tuple[np.ndarray, Pr
     frame_rows, press_rows = aligned_slices(len(changes), lag)
     reference = None if presses.reference is None else presses.reference[frame_rows]
     aligned_presses = replace(presses.rows(press_rows), frames=presses.frames[frame_rows], reference=reference)
-    note = (
+    alignment_note = (
         f"frames seem to be of the press {counted(abs(lag), 'row')} {'before' if lag > 0 else 'after'} (places "
         f"estimated {1e3 * error_with_lag:.3g} mm off, as recorded {1e3 * error_without_lag:.3g} mm): learnt so; "
         "check the recording."
     )
-    return changes[frame_rows], aligned_presses, lag, [note]
+    return changes[frame_rows], aligned_presses, lag, [alignment_note]
 
 
 def _list_briefly(numbers: np.ndarray, max_listed: int = 12) -> str:

@@ -224,7 +224,7 @@ class QuadraticDiscriminant:
         classes, class_indices = np.unique(label, return_inverse=True)
         shrinkage, num_features = covariance_shrinkage(features, label), features.shape[1]
         mean_variance = np.mean(np.var(features, axis=0))
-        means, whiten, offset = [], [], []
+        class_means, whiten, offset = [], [], []
         for class_index in range(len(classes)):
             class_features = features[class_indices == class_index]
             covariance = np.cov(class_features.T, bias=len(class_features) < 2).reshape(num_features, num_features)
@@ -233,10 +233,10 @@ class QuadraticDiscriminant:
             )
             values, axes = np.linalg.eigh(covariance)
             values = np.maximum(values, _MIN_VARIANCE_RATIO * max(values.max(), _MIN_VARIANCE_RATIO * mean_variance))
-            means.append(class_features.mean(axis=0))
+            class_means.append(class_features.mean(axis=0))
             whiten.append(axes / np.sqrt(values))
             offset.append(np.log(len(class_features) / len(features)) - 0.5 * np.sum(np.log(values)))
-        return cls(np.array(means), np.array(whiten), np.array(offset), classes)
+        return cls(np.array(class_means), np.array(whiten), np.array(offset), classes)
 
     def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
         """Compute the logarithm (frames, classes) of each class's density times its share of the presses, up to a

@@ -96,16 +96,16 @@ def _compiled_frame_training(num_steps: int) -> Callable[..., Any]:
         network = eqx.nn.MLP(*sizes, activation=jnp.tanh, dtype=jnp.float32, key=keys[0])
         parameters, static_part = eqx.partition(network, eqx.is_inexact_array)
 
-        def loss(parameters, index, key):
-            noisy_features = features[index] + _FRAME_FEATURE_NOISE * jax.random.normal(
+        def loss(parameters, batch_rows, key):
+            noisy_features = features[batch_rows] + _FRAME_FEATURE_NOISE * jax.random.normal(
                 key, (_BATCH_SIZE, features.shape[1]), features.dtype
             )
-            return jnp.mean((jax.vmap(eqx.combine(parameters, static_part))(noisy_features) - targets[index]) ** 2)
+            return jnp.mean((jax.vmap(eqx.combine(parameters, static_part))(noisy_features) - targets[batch_rows]) ** 2)
 
-        def update(carry, index):
+        def update(carry, batch_rows):
             parameters, state, key = carry
             key, step_key = jax.random.split(key)
-            updates, state = optimiser.update(jax.grad(loss)(parameters, index, step_key), state, parameters)
+            updates, state = optimiser.update(jax.grad(loss)(parameters, batch_rows, step_key), state, parameters)
             return (eqx.apply_updates(parameters, updates), state, key), None
 
         parameters = jax.lax.scan(update, (parameters, optimiser.init(parameters), keys[1]), batches)[0][0]
@@ -139,14 +139,16 @@ class TemporalNetwork:
 
     def predict_proba(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
         """Compute the probabilities of the classes (touches, classes), averaged over the networks."""
-        course = features[:, self.whole :].reshape(len(features), -1, self.first.shape[2] // _KERNEL_SIZE)
+        time_course = features[:, self.whole :].reshape(len(features), -1, self.first.shape[2] // _KERNEL_SIZE)
         summed_probabilities = np.zeros((len(features), len(self.classes_)))
         for network_index in range(len(self.first)):
             hidden = _relu(
-                _neighbouring_steps(course, np) @ self.first[network_index].T + self.first_bias[network_index]
+                _concatenate_neighbouring_steps(time_course, np) @ self.first[network_index].T
+                + self.first_bias[network_index]
             )
             hidden = _relu(
-                _neighbouring_steps(hidden, np) @ self.second[network_index].T + self.second_bias[network_index]
+                _concatenate_neighbouring_steps(hidden, np) @ self.second[network_index].T
+                + self.second_bias[network_index]
             )
             pooled_features = np.concatenate(
                 [features[:, : self.whole], hidden.mean(axis=1), hidden.max(axis=1)], axis=1
@@ -183,17 +185,19 @@ def _relu(values):
     return np.maximum(values, 0.0)
 
 
-def _neighbouring_steps(course, engine):
+def _concatenate_neighbouring_steps(time_course, engine):
     """Concatenate the values at each time step with those at the two steps before and after; zeros beyond the ends."""
-    half_width, num_steps = _KERNEL_SIZE // 2, course.shape[-2]
-    padded_course = engine.pad(course, ((0, 0), (half_width, half_width), (0, 0)))
+    half_width, num_steps = _KERNEL_SIZE // 2, time_course.shape[-2]
+    padded_course = engine.pad(time_course, ((0, 0), (half_width, half_width), (0, 0)))
     return engine.concatenate(
         [padded_course[:, first_step : first_step + num_steps] for first_step in range(_KERNEL_SIZE)], axis=-1
     )
 
 
 @functools.cache
-def _compiled_course_training(num_steps: int, whole: int, values: int, num_classes: int) -> Callable[..., Any]:
+def _compiled_course_training(
+    num_steps: int, num_whole_features: int, num_values: int, num_classes: int
+) -> Callable[..., Any]:
     """Return a function that trains networks in `num_steps` steps of AdamW, compiled once for each shape of its
     arguments.
 
@@ -208,22 +212,24 @@ def _compiled_course_training(num_steps: int, whole: int, values: int, num_class
         optax.cosine_decay_schedule(_COURSE_LEARNING_RATE, num_steps), weight_decay=_COURSE_WEIGHT_DECAY
     )
     sizes = [
-        (_COURSE_HIDDEN_SIZE, _KERNEL_SIZE * values),
+        (_COURSE_HIDDEN_SIZE, _KERNEL_SIZE * num_values),
         (_COURSE_HIDDEN_SIZE, _KERNEL_SIZE * _COURSE_HIDDEN_SIZE),
-        (_DENSE_SIZE, whole + 2 * _COURSE_HIDDEN_SIZE),
+        (_DENSE_SIZE, num_whole_features + 2 * _COURSE_HIDDEN_SIZE),
         (num_classes, _DENSE_SIZE),
     ]
 
     def log_odds(weights, features, key):
-        first, first_bias, second, second_bias, dense, dense_bias, last, last_bias = weights
-        course = features[:, whole:].reshape(len(features), -1, values)
-        hidden = jax.nn.relu(_neighbouring_steps(course, jnp) @ first.T + first_bias)
-        hidden = jax.nn.relu(_neighbouring_steps(hidden, jnp) @ second.T + second_bias)
-        pooled_features = jnp.concatenate([features[:, :whole], hidden.mean(axis=1), hidden.max(axis=1)], axis=1)
+        first_weights, first_bias, second_weights, second_bias, dense, dense_bias, last_weights, last_bias = weights
+        time_course = features[:, num_whole_features:].reshape(len(features), -1, num_values)
+        hidden = jax.nn.relu(_concatenate_neighbouring_steps(time_course, jnp) @ first_weights.T + first_bias)
+        hidden = jax.nn.relu(_concatenate_neighbouring_steps(hidden, jnp) @ second_weights.T + second_bias)
+        pooled_features = jnp.concatenate(
+            [features[:, :num_whole_features], hidden.mean(axis=1), hidden.max(axis=1)], axis=1
+        )
         pooled_features = (
             pooled_features * jax.random.bernoulli(key, 1 - _DROPOUT_RATE, pooled_features.shape) / (1 - _DROPOUT_RATE)
         )
-        return jax.nn.relu(pooled_features @ dense.T + dense_bias) @ last.T + last_bias
+        return jax.nn.relu(pooled_features @ dense.T + dense_bias) @ last_weights.T + last_bias
 
     def loss(weights, features, class_indices, key):
         noise_key, dropout_key = jax.random.split(key)
@@ -244,10 +250,10 @@ def _compiled_course_training(num_steps: int, whole: int, values: int, num_class
 
     @jax.jit
     def train(features, class_indices, batches, keys):
-        def update(carry, index):
+        def update(carry, batch_rows):
             weights, state, key = carry
             key, step_key = jax.random.split(key)
-            gradients = jax.grad(loss)(weights, features[index], class_indices[index], step_key)
+            gradients = jax.grad(loss)(weights, features[batch_rows], class_indices[batch_rows], step_key)
             updates, state = optimiser.update(gradients, state, weights)
             return (optax.apply_updates(weights, updates), state, key), None
 

@@ -56,16 +56,16 @@ def mean_reference(reference: np.ndarray) -> np.ndarray:
     return np.where(is_finite, reference, 0.0).sum(axis=0) / np.maximum(is_finite.sum(axis=0), 1)
 
 
-def reference_used(
-    reference: np.ndarray | None, mean: np.ndarray | None, used: Bool[np.ndarray, " M"], num_frames: int
+def fill_reference(
+    reference: np.ndarray | None, mean: np.ndarray | None, is_used: Bool[np.ndarray, " M"], num_frames: int
 ) -> Float[np.ndarray, "n m"]:
-    """Return reference frames (frames, channels) of the `used` channels; zeros if there is no reference.
+    """Return reference frames (frames, channels) of the used channels; zeros if there is no reference.
 
     Missing readings are replaced by the `mean` reference frame of the training set.
     """
     if reference is None or mean is None:
-        return np.zeros((num_frames, int(used.sum())))
-    return np.where(np.isnan(reference), mean, reference)[:, used]
+        return np.zeros((num_frames, int(is_used.sum())))
+    return np.where(np.isnan(reference), mean, reference)[:, is_used]
 
 
 # Maximum extent of the positions of presses. Positions with a larger extent are refused, as probably in millimetres.
@@ -273,13 +273,13 @@ def _check_positions(values) -> np.ndarray:
         raise ValueError(
             f"positions: {len(known_positions)} presses have one; give {_MIN_PRESSES} or more, or leave positions out."
         )
-    extent = np.ptp(known_positions, axis=0).max()
-    if extent > _MAX_EXTENT:
+    largest_range = np.ptp(known_positions, axis=0).max()
+    if largest_range > _MAX_EXTENT:
         raise ValueError(
-            f"positions spread over {extent:.4g}: are these metres? Divide millimetres by 1000; no side may be longer "
-            f"than {_MAX_EXTENT:g} m."
+            f"positions spread over {largest_range:.4g}: are these metres? Divide millimetres by 1000; no side may be "
+            f"longer than {_MAX_EXTENT:g} m."
         )
-    if extent == 0:
+    if largest_range == 0:
         raise ValueError("positions are all the same: there is nothing to learn.")
     return positions
 

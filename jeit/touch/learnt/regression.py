@@ -55,15 +55,15 @@ class DeviationModel:
         learnt. If there are enough such presses, standard deviations are calibrated on them alone, since future
         presses, too, are recorded after the training set.
         """
-        where = np.column_stack([predictions, _log_size(changes)])
-        low, unit = where.mean(axis=0), where.std(axis=0)
+        features = np.column_stack([predictions, _log_size(changes)])
+        low, unit = features.mean(axis=0), features.std(axis=0)
         unit = np.where(unit > 0, unit, 1.0)
         unit[-1] /= _SIZE_WEIGHT
         max_errors = np.quantile(
             np.abs(errors), 0.99, axis=0
         )  # a single large error is not representative of similar presses
         squares = np.minimum(np.abs(errors), max_errors) ** 2
-        uncalibrated_model = cls((where - low) / unit, squares, low, unit, np.ones(errors.shape[1]))
+        uncalibrated_model = cls((features - low) / unit, squares, low, unit, np.ones(errors.shape[1]))
         local_deviations = uncalibrated_model._local_deviations(uncalibrated_model.where, leave_one_out=True)
         last_presses = last_presses if last_presses.sum() >= _MIN_CALIBRATION_PRESSES else np.ones_like(last_presses)
         factors = [
@@ -76,19 +76,20 @@ class DeviationModel:
 
     def __call__(self, predictions: np.ndarray, changes: np.ndarray) -> Float[np.ndarray, "n d"]:
         """Compute the standard deviations of predictions (frames, targets) from the voltage changes of the frames."""
-        where = (np.column_stack([predictions, _log_size(changes)]) - self.low) / self.unit
-        return self.factor * self._local_deviations(where)
+        features = (np.column_stack([predictions, _log_size(changes)]) - self.low) / self.unit
+        return self.factor * self._local_deviations(features)
 
     def held_out(self, predictions: np.ndarray, changes: np.ndarray) -> Float[np.ndarray, "N d"]:
         """Compute the standard deviations of the predictions for held-out presses, each estimated without the press's
         own error."""
-        where = (np.column_stack([predictions, _log_size(changes)]) - self.low) / self.unit
-        return self.factor * self._local_deviations(where, leave_one_out=True)
+        features = (np.column_stack([predictions, _log_size(changes)]) - self.low) / self.unit
+        return self.factor * self._local_deviations(features, leave_one_out=True)
 
-    def _local_deviations(self, where: np.ndarray, *, leave_one_out: bool = False) -> np.ndarray:
-        """Estimate standard deviations (frames, targets) from the errors of the held-out presses nearest to `where`."""
+    def _local_deviations(self, features: np.ndarray, *, leave_one_out: bool = False) -> np.ndarray:
+        """Estimate standard deviations (frames, targets) from the errors of the held-out presses nearest to
+        `features`."""
         num_neighbours = min(_NUM_SIMILAR, len(self.where) - 1)
-        neighbours = np.asarray(self._search_tree.query(where, num_neighbours + leave_one_out)[1])[
+        neighbours = np.asarray(self._search_tree.query(features, num_neighbours + leave_one_out)[1])[
             :, int(leave_one_out) :
         ]
         similar_variance = self.squares[neighbours].mean(axis=1)
@@ -198,13 +199,13 @@ def learn_numbers(
     for form in forms.names:
         for quick_method in QUICK_METHODS:
             progress(f"{quick_method} on {form}")
-            results.append(cross_validation.hold_out(quick_method, form))
+            results.append(cross_validation.evaluate_method(quick_method, form))
     best_forms = list(dict.fromkeys(result.form for result in sorted(results, key=_mean_error)))[:2]
     slower_methods = [name for name in REGRESSORS if name not in QUICK_METHODS and method in ("auto", BLEND, name)]
     for slower_method in slower_methods:
         for form in best_forms if slower_method in ("gaussian-process", "forest") else best_forms[:1]:
             progress(f"{slower_method} on {form}")
-            results.append(cross_validation.hold_out(slower_method, form))
+            results.append(cross_validation.evaluate_method(slower_method, form))
     results.sort(key=_mean_error)
     if method not in ("auto", BLEND):
         results = [result for result in results if result.method == method]
@@ -231,8 +232,8 @@ def learn_numbers(
         )
         members.append((features, model))
     is_in_end_fold = (folds == 0) | (folds == folds.max())
-    spread = DeviationModel.learn(predictions, changes, predictions - targets, is_in_end_fold)
-    return LearntNumbers(members, cross_validation.mean, cross_validation.scale, spread), results
+    deviation_model = DeviationModel.learn(predictions, changes, predictions - targets, is_in_end_fold)
+    return LearntNumbers(members, cross_validation.mean, cross_validation.scale, deviation_model), results
 
 
 def _choose_methods(results: list[MethodResult], targets: np.ndarray, *, blend: bool) -> list[MethodResult]:
@@ -274,7 +275,7 @@ class _CrossValidation:
         self.scale = float(np.sqrt(np.mean((targets - self.mean) ** 2)))
         self.features = {}
 
-    def hold_out(self, method: str, form: str) -> MethodResult:
+    def evaluate_method(self, method: str, form: str) -> MethodResult:
         predictions = np.empty_like(self.targets)
 
         def predict(fold: int) -> None:

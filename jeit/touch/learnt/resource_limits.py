@@ -13,7 +13,7 @@ import numpy as np
 from jeit_solvers import number_of_cores
 
 
-def one_thread() -> AbstractContextManager:
+def limit_to_one_thread() -> AbstractContextManager:
     """Return a context manager within which numerical libraries use one thread.
 
     In learning from thousands of presses, several threads spend more time waiting for each other than computing.
@@ -25,23 +25,24 @@ def one_thread() -> AbstractContextManager:
     return threadpool_limits(1)
 
 
-def apply_in_parts(function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, at_once: int) -> np.ndarray:
-    """Apply `function` to `at_once` rows of an array at a time, which limits memory, and concatenate the results."""
-    return np.concatenate([function(rows[chunk]) for chunk in _slices(len(rows), at_once)])
+def apply_in_parts(function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, chunk_size: int) -> np.ndarray:
+    """Apply `function` to `chunk_size` rows of an array at a time, which limits memory, and concatenate the results."""
+    return np.concatenate([function(rows[chunk]) for chunk in _chunk_slices(len(rows), chunk_size)])
 
 
 def apply_over_threads(
-    function: Callable[..., dict[str, np.ndarray]], *arrays: np.ndarray, at_once: int
+    function: Callable[..., dict[str, np.ndarray]], *arrays: np.ndarray, chunk_size: int
 ) -> dict[str, np.ndarray]:
-    """Apply `function` to `at_once` rows of the `arrays` at a time, and concatenate the arrays that `function` returns.
+    """Apply `function` to `chunk_size` rows of the `arrays` at a time, and concatenate the arrays that `function`
+    returns.
 
-    If there are many parts of `at_once` rows, they are computed in parallel.
+    If there are many parts of `chunk_size` rows, they are computed in parallel.
     """
-    chunks = _slices(len(arrays[0]), at_once)
+    chunks = _chunk_slices(len(arrays[0]), chunk_size)
     if len(chunks) < 4:
         results = [function(*(array[chunk] for array in arrays)) for chunk in chunks]
     else:
-        with one_thread(), ThreadPoolExecutor(number_of_cores()) as pool:
+        with limit_to_one_thread(), ThreadPoolExecutor(number_of_cores()) as pool:
             results = list(pool.map(lambda chunk: function(*(array[chunk] for array in arrays)), chunks))
     return {key: np.concatenate([result[key] for result in results]) for key in results[0]}
 
@@ -55,12 +56,12 @@ def apply_over_folds(function: Callable[[int], Any], num_folds: int) -> list[Any
     """
 
     def apply_with_one_thread(fold: int) -> Any:
-        with one_thread():
+        with limit_to_one_thread():
             return function(fold)
 
     with ThreadPoolExecutor(number_of_cores()) as pool:
         return list(pool.map(apply_with_one_thread, range(num_folds)))
 
 
-def _slices(num_rows: int, at_once: int) -> list[slice]:
-    return [slice(first, first + at_once) for first in range(0, max(num_rows, 1), at_once)]
+def _chunk_slices(num_rows: int, chunk_size: int) -> list[slice]:
+    return [slice(start, start + chunk_size) for start in range(0, max(num_rows, 1), chunk_size)]

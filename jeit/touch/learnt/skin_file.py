@@ -161,7 +161,7 @@ def write_fields(path: str | Path, kind: str, version: int, fields_by_name: dict
     if Path(path).is_dir():
         raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / example}.")
     with written_whole(path) as file:
-        write_with_checksum({"kind": kind, "version": version, "skin": _to_plain(fields_by_name)}, file)
+        write_with_checksum({"kind": kind, "version": version, "skin": _to_dictionaries(fields_by_name)}, file)
 
 
 def read_fields(path: Path, kind: str, version: int, description: str, make: Callable[[dict[str, Any]], Any]) -> Any:
@@ -185,7 +185,7 @@ def read_fields(path: Path, kind: str, version: int, description: str, make: Cal
         if content["version"] != version:
             raise ValueError(f"it is of version {describe(content['version'])}, and this jeit reads {version}")
         verify_checksum(path)
-        fields_by_name: Any = _from_plain(content["skin"])
+        fields_by_name: Any = _from_dictionaries(content["skin"])
         return make(fields_by_name)
     except Exception as error:  # any exception: the file may create objects of many packages
         raise ValueError(
@@ -193,23 +193,26 @@ def read_fields(path: Path, kind: str, version: int, description: str, make: Cal
         ) from None
 
 
-def _to_plain(value):
+def _to_dictionaries(value):
     """Convert objects of jeit's classes (those in `_STORED_CLASSES`) to dictionaries of their fields, recursively."""
     if type(value) in _STORED_NAMES:
         return {
             "jeit": _STORED_NAMES[type(value)],
-            **{item.name: _to_plain(getattr(value, item.name)) for item in fields(value)},
+            **{item.name: _to_dictionaries(getattr(value, item.name)) for item in fields(value)},
         }
     if isinstance(value, dict):
-        return {key: _to_plain(item) for key, item in value.items()}
+        return {key: _to_dictionaries(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_to_plain(item) for item in value]
+        return [_to_dictionaries(item) for item in value]
     return value
 
 
-def _from_plain(value):
-    """Convert dictionaries of fields, which `_to_plain` returned, back to objects of jeit's classes, recursively."""
+def _from_dictionaries(value):
+    """Convert dictionaries of fields, which `_to_dictionaries` returned, back to objects of jeit's classes,
+    recursively."""
     if isinstance(value, dict):
-        restored_values = {_OLD_FIELDS.get(key, key): _from_plain(item) for key, item in value.items() if key != "jeit"}
+        restored_values = {
+            _OLD_FIELDS.get(key, key): _from_dictionaries(item) for key, item in value.items() if key != "jeit"
+        }
         return _STORED_CLASSES[value["jeit"]](**restored_values) if "jeit" in value else restored_values
-    return [_from_plain(item) for item in value] if isinstance(value, list) else value
+    return [_from_dictionaries(item) for item in value] if isinstance(value, list) else value

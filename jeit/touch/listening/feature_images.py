@@ -172,11 +172,13 @@ def _compute_image_blocks(recording: Recording, highest: float) -> Iterator[Soun
         )
         frame_indices = block_starts[:, None] - block_starts[0] + np.arange(NUM_FRAMES)
         intensity = power.sum(axis=-1)[:, frame_indices].transpose(1, 0, 2)
-        strongest = intensity.sum(axis=2).argmax(axis=1)
-        spectrum = (power / bins_per_band)[strongest[:, None], frame_indices].transpose(0, 2, 1)
+        strongest_microphones = intensity.sum(axis=2).argmax(axis=1)
+        spectrum = (power / bins_per_band)[strongest_microphones[:, None], frame_indices].transpose(0, 2, 1)
         is_known = np.broadcast_to(missing_share, power.shape[1])[frame_indices].mean(axis=1) < 0.5
         times = (block_starts * hop + window_length / 2 - padding_before) / rate
-        yield SoundImages(times, intensity.astype(np.float32), spectrum.astype(np.float32), strongest, is_known)
+        yield SoundImages(
+            times, intensity.astype(np.float32), spectrum.astype(np.float32), strongest_microphones, is_known
+        )
 
 
 def _band_powers(channel: np.ndarray, taper: np.ndarray, hop: int, weights: np.ndarray) -> Float[np.ndarray, "F 64"]:
@@ -201,6 +203,8 @@ def _band_weights(length: int, rate: float, highest: float) -> Float[np.ndarray,
     width = rate / length
     low = (np.arange(length // 2 + 1) - 0.5) * width
     high = np.minimum(low + width, highest + 0.5 / FRAME_DURATION)
-    shares = np.clip(np.minimum(high[:, None], edges[1:]) - np.maximum(low[:, None], edges[:-1]), 0, None) / width
-    shares[0] = 0.0
-    return shares
+    overlap_fractions = (
+        np.clip(np.minimum(high[:, None], edges[1:]) - np.maximum(low[:, None], edges[:-1]), 0, None) / width
+    )
+    overlap_fractions[0] = 0.0
+    return overlap_fractions

@@ -174,7 +174,7 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
         files = sorted(
             path for path in class_folder.rglob("*") if path.is_file() and not _is_hidden(path.relative_to(folder))
         )
-        num_before = len(paths)
+        num_files = len(paths)
         for path in files:
             try:
                 _check_clip(read_recording(path), path.name)
@@ -187,7 +187,7 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
             groups.append("/".join(group_parts) if group_parts else f"{class_folder.name}/{path.name}")
             if progress is not None:
                 progress(f"{counted(len(paths), 'clip')}")
-        if len(paths) == num_before:
+        if len(paths) == num_files:
             reason = failures[-1][1] if files else "it is empty"
             raise ValueError(f"'{class_folder}': there is no clip in it that can be read ({reason}).")
     notes = [_describe_unread(failures)] if failures else []
@@ -203,11 +203,11 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
 def _describe_unread(failures: list[tuple[str, str]]) -> str:
     """Describe how many files could not be read, and for which reasons. One file of each format is described first."""
     num_previous: dict[str, int] = {}
-    entries = []
+    sort_keys = []
     for index, (suffix, reason) in enumerate(failures):
         num_previous[suffix] = num_previous.get(suffix, -1) + 1
-        entries.append((num_previous[suffix], index, reason))
-    reasons = [reason for *_, reason in sorted(entries)]
+        sort_keys.append((num_previous[suffix], index, reason))
+    reasons = [reason for *_, reason in sorted(sort_keys)]
     omitted = f"; and {len(reasons) - _MAX_DESCRIBED} more" if len(reasons) > _MAX_DESCRIBED else ""
     return f"{counted(len(reasons), 'file')} not read: {'; '.join(reasons[:_MAX_DESCRIBED])}{omitted}"
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from jeit.touch.learnt.array_models import Forest
 from jeit.touch.learnt.methods import CLASSIFIERS
-from jeit.touch.learnt.resource_limits import one_thread
+from jeit.touch.learnt.resource_limits import limit_to_one_thread
 from jeit.touch.listening.feature_images import SoundImages
 from jeit.touch.listening.modality_network import (
     ModalityNetwork,
@@ -99,7 +99,7 @@ class NetworkLearner:
 
         Of the groups of clips of each class, one in six is held out; of three to five groups, one is held out.
         """
-        is_held_out = stopping_rows(training_set.labels, training_set.groups)
+        is_held_out = select_early_stopping_windows(training_set.labels, training_set.groups)
         levels = Levels.from_images(training_set.images[~is_held_out])
         level_images = levels(training_set.images)
         if training_set.checkpoint is not None:
@@ -155,7 +155,7 @@ class TreesListener:
             early_stopping=False,  # pyright: ignore[reportArgumentType]
             random_state=0,
         )
-        with one_thread():
+        with limit_to_one_thread():
             model.fit(sound_features(training_set.images), training_set.labels)
         return cls(Forest.from_boosted_classifier(model))
 
@@ -287,7 +287,7 @@ def num_features() -> int:
 _NO_WINDOWS = SoundImages(np.zeros(0), np.zeros((0, 1, 41)), np.zeros((0, 64, 41)), np.zeros(0, int), np.zeros(0, bool))
 
 
-def stopping_rows(window_classes: Int[np.ndarray, " W"], groups: Int[np.ndarray, " W"]) -> np.ndarray:
+def select_early_stopping_windows(window_classes: Int[np.ndarray, " W"], groups: Int[np.ndarray, " W"]) -> np.ndarray:
     """Return the mask (W,) of the windows that are held out for early stopping: whole groups of clips of each class.
 
     No group is held out of a class with fewer than three groups.

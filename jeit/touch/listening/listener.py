@@ -224,7 +224,7 @@ class Listener:
             )
             for block in image_blocks(recording, self.highest)
         ]
-        times, loudness, is_known, strongest, odds = (
+        times, loudness, is_known, strongest_microphones, odds = (
             np.concatenate(columns) for columns in zip(*block_results, strict=True)
         )
         is_quiet = loudness < self._quiet_threshold(float(loudness.max()))
@@ -240,7 +240,7 @@ class Listener:
             self.names,
             is_quiet,
             is_known,
-            strongest,
+            strongest_microphones,
             (loudness >= MIN_RELATIVE_LOUDNESS * loudness.max()) & (loudness > 0),
             recording.name,
             tuple(notes),
@@ -248,8 +248,8 @@ class Listener:
             deviations,
         )
 
-    def _quiet_threshold(self, loudest: float) -> float:
-        """Compute the loudness below which windows count as quiet; `loudest`: loudness of the recording's loudest
+    def _quiet_threshold(self, max_loudness: float) -> float:
+        """Compute the loudness below which windows count as quiet; `max_loudness`: loudness of the recording's loudest
         window.
 
         If loudness is not a feature, the recording's gain may differ from that of the training clips: up to 12 dB
@@ -259,7 +259,7 @@ class Listener:
         gain = (
             1.0
             if self.loudness
-            else float(np.clip(loudest / softest_clip, _MIN_GAIN, 1)) * max(1.0, loudest / loudest_clip)
+            else float(np.clip(max_loudness / softest_clip, _MIN_GAIN, 1)) * max(1.0, max_loudness / loudest_clip)
         )
         return _QUIET_RATIO * self.quietest * gain
 

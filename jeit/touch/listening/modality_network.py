@@ -62,8 +62,8 @@ class ModalityNetwork(Module):
 
         Kernels are drawn from normal distributions with the variance of He et al. (2015).
         """
-        for size, pool in zip(_KERNEL_SIZES, _POOL_SIZES, strict=True):
-            rows, columns = ((side - size + 1) // pool for side in (rows, columns))
+        for size, pool_size in zip(_KERNEL_SIZES, _POOL_SIZES, strict=True):
+            rows, columns = ((side - size + 1) // pool_size for side in (rows, columns))
         keys = jax.random.split(key, 3)
         size_1, size_2 = _KERNEL_SIZES
         shapes = (
@@ -71,16 +71,17 @@ class ModalityNetwork(Module):
             (size_2, size_2, *_NUM_CHANNELS),
             (rows * columns * _NUM_CHANNELS[1], classes),
         )
-        first, second, dense = (
+        first_kernels, second_kernels, dense = (
             jax.random.normal(layer_key, shape, jnp.float32) * jnp.float32(np.sqrt(2 / np.prod(shape[:-1])))
             for layer_key, shape in zip(keys, shapes, strict=True)
         )
-        num_first, num_second = _NUM_CHANNELS
+        num_first_channels, num_second_channels = _NUM_CHANNELS
         ones, zeros = (
-            (jnp.full(num_first, value, jnp.float32), jnp.full(num_second, value, jnp.float32)) for value in (1.0, 0.0)
+            (jnp.full(num_first_channels, value, jnp.float32), jnp.full(num_second_channels, value, jnp.float32))
+            for value in (1.0, 0.0)
         )
         dense, bias = 0.1 * dense, jnp.zeros(classes, jnp.float32)
-        return cls(first, second, ones, zeros, zeros, ones, dense, bias)
+        return cls(first_kernels, second_kernels, ones, zeros, zeros, ones, dense, bias)
 
     def log_odds(self, images: Float[Array, "b rows columns"]) -> Float[Array, "b C"]:
         """Compute the log-odds (b, C) of C classes for b images, with batch normalisation by running statistics."""
@@ -94,12 +95,12 @@ class ModalityNetwork(Module):
         Also returns the network with updated running means and variances.
         """
         log_odds, means, variances = self._forward(images, None, None)
-        running = jax.tree.map(
+        running_statistics = jax.tree.map(
             lambda old, new: (1 - _RUNNING_WEIGHT) * old + _RUNNING_WEIGHT * jax.lax.stop_gradient(new),
             (self.mean, self.variance),
             (means, variances),
         )
-        return log_odds, eqx.tree_at(lambda tree: (tree.mean, tree.variance), self, running)
+        return log_odds, eqx.tree_at(lambda tree: (tree.mean, tree.variance), self, running_statistics)
 
     def _forward(self, images, mean, variance):
         values, means, variances = images[..., None], [], []
@@ -160,11 +161,11 @@ class NetworkAnswers:
 
     def _evaluate_block(self, images: np.ndarray) -> np.ndarray:
         values = images[..., None]
-        for kernel, offset, size, pool in zip(self.kernels, self.offsets, _KERNEL_SIZES, _POOL_SIZES, strict=True):
+        for kernel, offset, size, pool_size in zip(self.kernels, self.offsets, _KERNEL_SIZES, _POOL_SIZES, strict=True):
             patches = sliding_window_view(values, (size, size), axis=(1, 2))
             values = patches.reshape(*patches.shape[:3], -1) @ kernel
             values += offset
-            values = _max_pool(np.maximum(values, 0, out=values), pool, np)
+            values = _max_pool(np.maximum(values, 0, out=values), pool_size, np)
         return values.reshape(len(images), -1) @ self.dense + self.bias
 
 
@@ -199,7 +200,7 @@ def library_plan(windows: int, *, batches: int, batch: int = 64) -> TrainingPlan
 def train_network(
     images: Float[np.ndarray, "N rows 41"],
     labels: Int[np.ndarray, " N"],
-    held_out: tuple[Float[np.ndarray, "n rows 41"], Int[np.ndarray, " n"]],
+    validation_set: tuple[Float[np.ndarray, "n rows 41"], Int[np.ndarray, " n"]],
     *,
     classes: int,
     key: Array,
@@ -210,7 +211,7 @@ def train_network(
 ) -> TrainingResult:
     """Train a network on images with the classes `labels`, until its loss on held-out images no longer decreases.
 
-    `held_out`: the held-out images and their classes; `plan`: training schedule, as returned by `library_plan`;
+    `validation_set`: the held-out images and their classes; `plan`: training schedule, as returned by `library_plan`;
     `noise`: standard deviation of the noise added to images; `checkpoint` and `progress`: as for
     `jeit.touch.fit_network`. Raises the errors of that function. The same `key` gives identical results.
     """
@@ -231,7 +232,7 @@ def train_network(
         return _cross_entropy(network.log_odds(batch[0]), batch[1])
 
     data = (np.asarray(images, np.float32), np.asarray(labels, np.int32))
-    validation = (np.asarray(held_out[0], np.float32), np.asarray(held_out[1], np.int32))
+    validation = (np.asarray(validation_set[0], np.float32), np.asarray(validation_set[1], np.int32))
     return fit_network(
         network,
         TrainingObjective(loss, validation_loss, is_running),

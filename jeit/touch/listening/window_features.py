@@ -32,14 +32,14 @@ class Levels:
     @classmethod
     def from_images(cls, images: SoundImages) -> "Levels":
         """Compute the conversion from feature images of the training set."""
-        loudest, mean, deviation = [], [], []
+        max_levels, mean_levels, level_deviations = [], [], []
         for power in (images.intensity, images.spectrum):
             max_level = _to_decibels(np.quantile(power, _LOUDEST_QUANTILE), -np.inf)
             levels = _to_decibels(power, float(max_level) - _LEVEL_RANGE)
-            loudest.append(float(max_level))
-            mean.append(float(levels.mean(dtype=float)))
-            deviation.append(float(levels.std(dtype=float)) or 1.0)
-        return cls(np.array(loudest), np.array(mean), np.array(deviation))
+            max_levels.append(float(max_level))
+            mean_levels.append(float(levels.mean(dtype=float)))
+            level_deviations.append(float(levels.std(dtype=float)) or 1.0)
+        return cls(np.array(max_levels), np.array(mean_levels), np.array(level_deviations))
 
     @classmethod
     def of(cls, images: SoundImages) -> "Levels":
@@ -215,7 +215,7 @@ def _spectral_features(spectrum: Float[np.ndarray, "W 64 41"], level: np.ndarray
     spectrum_levels = spectrum_levels - spectrum_levels.max(axis=1, keepdims=True)
     centroid = band_shares @ band_index
     width = np.sqrt(np.maximum(band_shares @ band_index**2 - centroid**2, 0))
-    flatness = np.exp(np.log(power).mean(axis=1)) / power.mean(axis=1)
+    spectral_flatness = np.exp(np.log(power).mean(axis=1)) / power.mean(axis=1)
     frame_power = spectrum.sum(axis=1) + 1e-30
     frame_centroid = np.einsum("wbt,b->wt", spectrum, band_index) / frame_power
     frame_weight = frame_power / frame_power.sum(axis=1, keepdims=True)
@@ -236,7 +236,7 @@ def _spectral_features(spectrum: Float[np.ndarray, "W 64 41"], level: np.ndarray
     scalar_features = [
         centroid,
         width,
-        flatness,
+        spectral_flatness,
         mean_centroid,
         centroid_deviation,
         flux.mean(axis=(1, 2)),
@@ -251,25 +251,28 @@ def _microphone_features(intensity: Float[np.ndarray, "W M 41"]) -> np.ndarray:
     mean_power = intensity.mean(axis=2) + 1e-30
     power_shares = mean_power / mean_power.sum(axis=1, keepdims=True)
     sorted_shares = np.sort(power_shares, axis=1)[:, ::-1]
-    evenness = -(power_shares * np.log(power_shares)).sum(axis=1) / np.log(max(power_shares.shape[1], 2))
+    normalised_entropy = -(power_shares * np.log(power_shares)).sum(axis=1) / np.log(max(power_shares.shape[1], 2))
     level = _relative_decibels(intensity)
     level_deviation = level - level.mean(axis=2, keepdims=True)
     # Correlation of each microphone's level over time with the level of the loudest microphone.
     loudest_deviation = level_deviation[np.arange(len(level_deviation)), power_shares.argmax(axis=1)]
     norms = np.sqrt((level_deviation**2).sum(axis=2) * (loudest_deviation**2).sum(axis=1)[:, None]) + 1e-9
     correlations = np.einsum("wmt,wt->wm", level_deviation, loudest_deviation) / norms
-    first, last = (
+    first_half_power, last_half_power = (
         intensity[..., half].mean(axis=2) + 1e-30 for half in (slice(NUM_FRAMES // 2), slice(NUM_FRAMES // 2, None))
     )
-    first, last = (np.sqrt(distribution / distribution.sum(axis=1, keepdims=True)) for distribution in (first, last))
-    distribution_change = 1 - (first * last).sum(axis=1)
+    first_half_power, last_half_power = (
+        np.sqrt(distribution / distribution.sum(axis=1, keepdims=True))
+        for distribution in (first_half_power, last_half_power)
+    )
+    distribution_change = 1 - (first_half_power * last_half_power).sum(axis=1)
     loudest_microphone = level.argmax(axis=1)
     change_rate = (np.diff(loudest_microphone, axis=1) != 0).mean(axis=1)
     return np.column_stack(
         [
             sorted_shares[:, 0],
             sorted_shares[:, : max(1, power_shares.shape[1] // 6)].sum(axis=1),
-            evenness,
+            normalised_entropy,
             correlations.mean(axis=1),
             np.sort(correlations, axis=1)[:, power_shares.shape[1] // 2],
             distribution_change,

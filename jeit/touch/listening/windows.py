@@ -49,9 +49,9 @@ def held_out_folds(
         fold[groups == group] = fold_index
     # If all groups of a class were in one fold, the class would be tested while it is absent from the training set.
     for label in np.unique(clip_classes):
-        in_class = clip_classes == label
-        if len(np.unique(fold[in_class])) < 2:
-            fold[in_class] = -1
+        is_in_class = clip_classes == label
+        if len(np.unique(fold[is_in_class])) < 2:
+            fold[is_in_class] = -1
     used_folds = np.unique(fold[fold >= 0])
     return np.where(fold >= 0, np.searchsorted(used_folds, fold), -1)
 
@@ -192,15 +192,15 @@ def _split_pieces(times: Float[np.ndarray, " n"]) -> list[np.ndarray]:
     `times`: middles of the windows, seconds. Consecutive windows belong to one sound if the time between them does not
     exceed the duration of a window. A long sound is cut every 2 s; windows that extend over a cut are left out.
     """
-    pieces, period = [], _PIECE_DURATION + WINDOW_DURATION
+    intervals, period = [], _PIECE_DURATION + WINDOW_DURATION
     for sound in np.split(np.arange(len(times)), np.flatnonzero(np.diff(times) > WINDOW_DURATION) + 1):
         elapsed = times[sound] - times[sound[0]]
         if elapsed[-1] <= period:
-            pieces.append(sound)
+            intervals.append(sound)
             continue
         piece_number, time_in_piece = np.divmod(elapsed, period)
         kept_windows = sound[time_in_piece <= _PIECE_DURATION]
-        pieces += np.split(kept_windows, np.flatnonzero(np.diff(piece_number[time_in_piece <= _PIECE_DURATION])) + 1)
-    if len(pieces) > _MAX_PIECES:
-        pieces = [pieces[index] for index in np.linspace(0, len(pieces) - 1, _MAX_PIECES).round().astype(int)]
-    return pieces
+        intervals += np.split(kept_windows, np.flatnonzero(np.diff(piece_number[time_in_piece <= _PIECE_DURATION])) + 1)
+    if len(intervals) > _MAX_PIECES:
+        intervals = [intervals[index] for index in np.linspace(0, len(intervals) - 1, _MAX_PIECES).round().astype(int)]
+    return intervals

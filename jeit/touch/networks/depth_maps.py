@@ -124,9 +124,9 @@ def stream_depths(network: ImageNetwork, frames: Iterable, rest: Float[np.ndarra
         start_time = time.perf_counter()
         try:
             change = network.changes(np.asarray(frame, float), rest)
-            share = network.share(change)
-            (reason,) = network.doubts(change, share)
-            depth = None if reason else network.thickness * share[0]
+            depth_fraction = network.share(change)
+            (reason,) = network.doubts(change, depth_fraction)
+            depth = None if reason else network.thickness * depth_fraction[0]
         except (ValueError, TypeError) as error:
             depth, reason = None, " ".join(str(error).split())
         yield FrameDepth(frame_index, depth, reason, time.perf_counter() - start_time)

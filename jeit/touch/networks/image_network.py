@@ -26,7 +26,7 @@ from jeit.protocol import Protocol
 from jeit.touch.networks.three_stage_network import ThreeStages
 from jeit.touch.networks.unrolled_network import Unrolled
 from jeit.touch.simulate.contact.indent_sets import pixel_places
-from jeit.touch.simulate.contact.indents import relative_to
+from jeit.touch.simulate.contact.indents import relative_voltage_changes
 from jeit.touch.training import check_same, read_model, write_model
 
 DESIGNS = ("unrolled", "three-stages")
@@ -127,7 +127,9 @@ class ImageNetwork:
                     else "a network of three stages needs all, another does not."
                 )
             )
-        change = np.where(is_missing, np.nan, relative_to(np.nan_to_num(reference_frame), np.nan_to_num(frames)))
+        change = np.where(
+            is_missing, np.nan, relative_voltage_changes(np.nan_to_num(reference_frame), np.nan_to_num(frames))
+        )
         if (max_change := np.nanmax(np.abs(change), initial=0)) > _MAX_RELATIVE_CHANGE:
             raise ValueError(f"voltages are {max_change:.3g} times those of the reference; are units the same?")
         return fill_missing(change, self._covariance, self.noise) if is_missing.any() else change

@@ -357,8 +357,8 @@ def learn_images(
             raise ValueError(f"touches must be a whole number, 1 or more; it is {describe(touches)}.")
         preset = dataclasses.replace(preset, number=touches)
     report = (lambda _: None) if progress is None else progress
-    work = Path(folder) / "work"
-    work.mkdir(parents=True, exist_ok=True)
+    working_folder = Path(folder) / "work"
+    working_folder.mkdir(parents=True, exist_ok=True)
     seconds, start = {}, time.monotonic()
     report("noise")
     noise = detection_noise(skin)
@@ -372,7 +372,7 @@ def learn_images(
         indents = IndentSet(
             skin, touch_draws(skin), num_touches, seed=3 * seed + seed_offset, shape=SHAPE, chunk=_CHUNK_SIZE
         )
-        path = work / f"{name}.zarr"
+        path = working_folder / f"{name}.zarr"
         try:
             simulate_presses(
                 indents,
@@ -383,13 +383,13 @@ def learn_images(
         except OtherContents:
             raise ValueError(
                 f"folder '{folder}' was begun for another skin, seed or number of touches; give another folder, or "
-                f"delete '{work}' to learn anew."
+                f"delete '{working_folder}' to learn anew."
             ) from None
         sets[name] = StoredTouches(indents, path)
     held_out_examples, test_examples = (sets[name].in_memory() for name in ("held-out", "standing"))
     seconds["touches"] = time.monotonic() - start
     key = jax.random.key(seed)
-    runs = TrainingRuns(preset.plan_of(design), key, work, progress)
+    runs = TrainingRuns(preset.plan_of(design), key, working_folder, progress)
     if design == "unrolled":
         channels = LinearChannels.from_skin(skin, SHAPE)
         initial_network = Unrolled(held_out_examples.change.shape[1], SHAPE, key=jax.random.fold_in(key, 3))
@@ -421,5 +421,5 @@ def evaluate_network(network: ImageNetwork, skin: Skin, examples: TouchExamples,
     ball_maps = estimate_maps(relative_changes(skin, [[Indent(tip, depth, place)] for place in grid.places]))
     rows, columns = network.shape
     place_errors = error_statistics(depth_centroids(ball_maps, image_places(skin, columns, rows)), grid.places)
-    deepest = float(np.median(ball_maps.max(axis=(1, 2)))) * float(skin.thickness) / depth
-    return ImageStanding(explained, place_errors, deepest, examples.depth[:6], maps[:6])
+    max_relative_depth = float(np.median(ball_maps.max(axis=(1, 2)))) * float(skin.thickness) / depth
+    return ImageStanding(explained, place_errors, max_relative_depth, examples.depth[:6], maps[:6])

@@ -26,7 +26,7 @@ from jeit.touch.simulate import (
 )
 from jeit.touch.simulate.contact.indent_sets import image_places
 from jeit.touch.simulate.contact.indenters import AbstractIndenter
-from jeit.touch.simulate.contact.indents import relative_changes, relative_to
+from jeit.touch.simulate.contact.indents import relative_changes, relative_voltage_changes
 from jeit.touch.simulate.contact.samples import lattice
 from jeit_solvers.engines import on_host
 
@@ -37,8 +37,8 @@ _TOUCH_FRACTION = 0.5
 def deepest_positions(maps: Float[np.ndarray, "n r c"], places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "n 2"]:
     """Return the positions (maps, 2) of the deepest pixels of depth maps, metres; `places` (rows, columns, 2):
     positions of the pixels, metres."""
-    deepest = maps.reshape(len(maps), -1).argmax(axis=1)
-    return places.reshape(-1, 2)[deepest]
+    deepest_indices = maps.reshape(len(maps), -1).argmax(axis=1)
+    return places.reshape(-1, 2)[deepest_indices]
 
 
 def depth_centroids(maps: Float[np.ndarray, "n r c"], places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "n 2"]:
@@ -99,8 +99,8 @@ def touch_draws(skin: Skin) -> IndentDraws:
     thickness = float(skin.thickness)
     low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
     depth = (DEPTHS[0] * thickness, DEPTHS[1] * thickness)
-    margin = _EDGE_MARGIN * min(high_x - low_x, high_y - low_y)
-    return IndentDraws(touching_bodies(), skin.flat_outline, depth, margin=margin, at_once=_MAX_BODIES)
+    edge_margin = _EDGE_MARGIN * min(high_x - low_x, high_y - low_y)
+    return IndentDraws(touching_bodies(), skin.flat_outline, depth, margin=edge_margin, at_once=_MAX_BODIES)
 
 
 def detection_noise(skin: Skin, limit: float = _DETECTION_LIMIT) -> float:
@@ -145,7 +145,7 @@ class LinearChannels(NamedTuple):
         model, conductivity = skin.model, np.asarray(skin.model_conductivity)
         rest_voltages, jacobian = (np.asarray(array) for array in model.voltages_and_jacobian(conductivity))
         points = lattice(np.asarray(model.mesh.points)[np.asarray(model.mesh.cells)], _POINTS_PER_SIDE)
-        cell_changes = relative_to(
+        cell_changes = relative_voltage_changes(
             rest_voltages, rest_voltages - jacobian.T * np.broadcast_to(conductivity, jacobian.shape[1])[:, None]
         )
         tree = KDTree(image_places(skin, columns, rows).reshape(-1, 2))
@@ -215,4 +215,4 @@ def _contact_changes(skin: Skin, rest_voltages, conductivity) -> Float[np.ndarra
         fields, impedance, model.electrodes.contact_impedance
     )
     changes = np.stack([select_channels(*on_host((model.protocol, derivative))) for derivative in derivatives])
-    return relative_to(np.asarray(rest_voltages), np.asarray(rest_voltages) + changes)
+    return relative_voltage_changes(np.asarray(rest_voltages), np.asarray(rest_voltages) + changes)

@@ -65,7 +65,9 @@ class StoredTouches:
         # The chunks are of similar size, so that no chunk is smaller than a batch.
         num_chunks = min(-(-indents.number // max_chunk_size), len(chunks))
         chunk_groups = np.array_split(np.arange(len(chunks)), num_chunks)
-        self.spans = [range(chunks[chunk_group[0]].start, chunks[chunk_group[-1]].stop) for chunk_group in chunk_groups]
+        self.row_ranges = [
+            range(chunks[chunk_group[0]].start, chunks[chunk_group[-1]].stop) for chunk_group in chunk_groups
+        ]
 
     def rows(self, *names: str) -> "StoredRows":
         """Return the arrays of these names, to be read chunk by chunk; see `SimulatedTouches`."""
@@ -77,8 +79,8 @@ class StoredTouches:
 
     def read(self, name: str, chunk: int) -> Float[np.ndarray, "n *shape"]:
         """Read the array `name` of one chunk of touches, float32."""
-        span = self.spans[chunk]
-        return self._arrays[name][span.start : span.stop].to_numpy().astype(np.float32, copy=False)
+        row_range = self.row_ranges[chunk]
+        return self._arrays[name][row_range.start : row_range.stop].to_numpy().astype(np.float32, copy=False)
 
 
 class StoredRows:
@@ -90,7 +92,7 @@ class StoredRows:
     @property
     def sizes(self) -> tuple[int, ...]:
         """Number of simulated touches of each chunk."""
-        return tuple(map(len, self._touches.spans))
+        return tuple(map(len, self._touches.row_ranges))
 
     @property
     def fingerprint(self) -> str:

@@ -180,9 +180,12 @@ def write_depths(
         drawn_indices = np.unique(np.linspace(0, len(row_indices) - 1, _MAX_DRAWN_MAPS).round().astype(int))
         with written_whole(result_folder / "depth.png") as file:
             _draw_depths(
-                rows.read(row_indices[drawn_indices]), frame_numbers[drawn_indices], statistics.deepest.depth, network
+                rows.read(row_indices[drawn_indices]),
+                frame_numbers[drawn_indices],
+                statistics.deepest_frame.depth,
+                network,
             ).savefig(file, dpi=130)
-        return WrittenDepths(rows.number, statistics.imaged, statistics.deepest, statistics.latency.values())
+        return WrittenDepths(rows.number, statistics.imaged, statistics.deepest_frame, statistics.latency.values())
 
 
 class _FrameStatistics:
@@ -192,16 +195,16 @@ class _FrameStatistics:
         self.network, self._places = network, pixel_places(network.extent, network.shape)
         self._empty_map = np.full(network.shape, np.nan)
         self.imaged, self.number_refused, self.first_reason = 0, 0, ""
-        self.refused: list[int] = []
+        self.refused_frames: list[int] = []
         self.row, self.number, self.latency = Sample(), Sample(), Sample()
-        self.deepest = DeepestFrame(-1, -np.inf, np.full(2, np.nan))
+        self.deepest_frame = DeepestFrame(-1, -np.inf, np.full(2, np.nan))
 
     def add_frame(self, frame: FrameDepth) -> tuple[list[object], Float[np.ndarray, "rows columns"]]:
         """Add a frame to the statistics; return its row of the table and its depth map."""
         if frame.depth is None:
             self.number_refused += 1
             self.first_reason = self.first_reason or frame.reason
-            self.refused += [frame.number] if len(self.refused) < _MAX_LISTED_FRAMES else []
+            self.refused_frames += [frame.number] if len(self.refused_frames) < _MAX_LISTED_FRAMES else []
             return [frame.number, "", "", ""], self._empty_map
         for sample, value in ((self.row, self.imaged + self.number_refused), (self.number, frame.number)):
             sample.append(value)
@@ -211,8 +214,8 @@ class _FrameStatistics:
         centroid = depth_centroids(frame.depth[None], self._places)[0]
         if not depth > self.network.floor:
             centroid = np.full(2, np.nan)
-        if depth > self.deepest.depth:
-            self.deepest = DeepestFrame(frame.number, depth, centroid)
+        if depth > self.deepest_frame.depth:
+            self.deepest_frame = DeepestFrame(frame.number, depth, centroid)
         texts = [f"{value:.6g}" if np.isfinite(value) else "" for value in (*centroid, depth)]
         return [frame.number, *texts], frame.depth
 
@@ -223,11 +226,11 @@ class _FrameStatistics:
             {
                 "frames": name,
                 "number": num_frames,
-                "refused": self.refused,
+                "refused": self.refused_frames,
                 "number_refused": self.number_refused,
                 "design": network.design,
                 "map": {"shape": network.shape, "extent_m": network.extent},
-                "deepest_m": self.deepest.depth,
+                "deepest_m": self.deepest_frame.depth,
                 "depth_by_noise_alone_m": network.floor,
                 "units": {"length": "m"},
                 "versions": {package: version_of(package) for package in _PACKAGES},
@@ -236,16 +239,16 @@ class _FrameStatistics:
 
 
 def _draw_depths(
-    maps: Float[np.ndarray, "k rows columns"], numbers: Int[np.ndarray, " k"], deepest: float, network: ImageNetwork
+    maps: Float[np.ndarray, "k rows columns"], numbers: Int[np.ndarray, " k"], depth_limit: float, network: ImageNetwork
 ):
-    """Draw the depth maps of k frames with the given `numbers`; `deepest`: maximum depth of all frames, metres."""
+    """Draw the depth maps of k frames with the given `numbers`; `depth_limit`: maximum depth of all frames, metres."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_depth_map
 
     figure = Figure(figsize=(4.2 * len(maps), 4.2), layout="constrained")
     # The colour scale reaches at least 4 times the noise floor, so that noise on an untouched skin does not fill it.
-    max_depth = max(deepest, 4 * network.floor)
+    max_depth = max(depth_limit, 4 * network.floor)
     for ax, depth_map, number in zip(figure.subplots(1, len(maps), squeeze=False)[0], maps, numbers, strict=True):
         is_last = number == numbers[-1]
         plot_depth_map(depth_map, network.extent, most=max_depth, colour_bar=is_last, title=f"frame {number}", ax=ax)

@@ -146,7 +146,7 @@ def write_watch(
                 progress(frame)
     if not seconds:
         raise ValueError(f"'{name}': there was no frame in it.")
-    written = WrittenWatch(
+    written_watch = WrittenWatch(
         touches=tuple(touches),
         seconds=np.array(seconds),
         peaks=np.array(peaks),
@@ -156,27 +156,29 @@ def write_watch(
         notes=tuple(notes),
     )
     with results(folder, WATCH_FILES[2:]) as result_folder:
-        write_json(report_watch(written, watch, name), result_folder / "report.json")
-        draw_watch(written, watch).savefig(result_folder / "timeline.png", dpi=130)
-    return written
+        write_json(report_watch(written_watch, watch, name), result_folder / "report.json")
+        draw_watch(written_watch, watch).savefig(result_folder / "timeline.png", dpi=130)
+    return written_watch
 
 
-def report_watch(written: WrittenWatch, watch: TouchWatch, name: str) -> dict[str, Any]:
+def report_watch(written_watch: WrittenWatch, watch: TouchWatch, name: str) -> dict[str, Any]:
     """Report classified touches as plain numbers, strings, lists and dictionaries; unknown values are None."""
-    names, counts = np.unique([touch.gesture for touch in written.touches if not touch.unlike], return_counts=True)
-    latencies = written.latency
+    names, counts = np.unique(
+        [touch.gesture for touch in written_watch.touches if not touch.unlike], return_counts=True
+    )
+    latencies = written_watch.latency
     return as_plain_values(
         {
             "stream": name,
-            "frames": len(written.seconds),
-            "duration_s": written.seconds[-1] - written.seconds[0],
-            "status": written.counts,
-            "first_refusal": written.first_reason or None,
-            "touches": len(written.touches),
+            "frames": len(written_watch.seconds),
+            "duration_s": written_watch.seconds[-1] - written_watch.seconds[0],
+            "status": written_watch.counts,
+            "first_refusal": written_watch.first_reason or None,
+            "touches": len(written_watch.touches),
             "gestures": dict(zip(names.tolist(), counts.tolist(), strict=True)),
-            "unlike_any_learnt": sum(touch.unlike for touch in written.touches),
-            "cut_off": sum(not touch.touch.whole for touch in written.touches),
-            "held": sum(touch.held for touch in written.touches),
+            "unlike_any_learnt": sum(touch.unlike for touch in written_watch.touches),
+            "cut_off": sum(not touch.touch.whole for touch in written_watch.touches),
+            "held": sum(touch.held for touch in written_watch.touches),
             "gestures_known": list(watch.model.names),
             "classifier": f"{watch.model.method} on {watch.model.form}",
             "level_S": watch.level.level,
@@ -186,14 +188,14 @@ def report_watch(written: WrittenWatch, watch: TouchWatch, name: str) -> dict[st
             if latencies.size
             else None,
             "background_S": watch.images.background,
-            "notes": [*watch.notes, *written.notes, *watch.model.notes, *watch.images.reference.notes],
+            "notes": [*watch.notes, *written_watch.notes, *watch.model.notes, *watch.images.reference.notes],
             "units": {"length": "m", "time": "s", "change": "S"},
             "versions": {package: version_of(package) for package in _WATCH_PACKAGES},
         }
     )
 
 
-def draw_watch(written: WrittenWatch, watch: TouchWatch):
+def draw_watch(written_watch: WrittenWatch, watch: TouchWatch):
     """Draw the classified touches of a stream over time, and their paths, as a `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
@@ -204,17 +206,18 @@ def draw_watch(written: WrittenWatch, watch: TouchWatch):
     grid = figure.add_gridspec(2, 2, width_ratios=(1.9, 1), height_ratios=(1, 1.25))
     upper_axes = figure.add_subplot(grid[0, 0])
     lower_axes = figure.add_subplot(grid[1, 0], sharex=upper_axes)
-    num_refused = int(np.isnan(written.peaks).sum())
-    title = f"{counted(len(written.touches), 'touch')} in {written.seconds[-1] - written.seconds[0]:.4g} s"
+    num_refused = int(np.isnan(written_watch.peaks).sum())
+    duration = written_watch.seconds[-1] - written_watch.seconds[0]
+    title = f"{counted(len(written_watch.touches), 'touch')} in {duration:.4g} s"
     title += f"; {counted(num_refused, 'frame')} refused" if num_refused else ""
-    plot_changes(written.seconds, written.peaks, watch.level.level, title=title, ax=upper_axes)
-    plot_timeline(list(written.touches), names, ax=lower_axes)
-    upper_axes.set_xlim(*_first_and_last(written.seconds))
+    plot_changes(written_watch.seconds, written_watch.peaks, watch.level.level, title=title, ax=upper_axes)
+    plot_timeline(list(written_watch.touches), names, ax=lower_axes)
+    upper_axes.set_xlim(*_time_range(written_watch.seconds))
     upper_axes.tick_params(labelbottom=False)
     model = watch.images.calibration.model
     plot_touch_paths(
         model.mesh,
-        list(written.touches),
+        list(written_watch.touches),
         names,
         model.electrodes,
         title="Where they went, from the dots on",
@@ -223,16 +226,16 @@ def draw_watch(written: WrittenWatch, watch: TouchWatch):
     return figure
 
 
-def _first_and_last(seconds: np.ndarray) -> tuple[float, float]:
+def _time_range(seconds: np.ndarray) -> tuple[float, float]:
     """Return the times of the first and the last frame, seconds, at least 1 ms apart."""
     return float(seconds[0]), max(float(seconds[-1]), float(seconds[0]) + 1e-3)
 
 
 def _event_row(touch: NamedTouch) -> list[object]:
     """Create the row of the table `events.csv` for a touch."""
-    course = touch.touch.course
-    peak_frame = int(course.peak.argmax())
-    centroids = course.centroid[np.isfinite(course.centroid).all(axis=1)]
+    time_course = touch.touch.course
+    peak_frame = int(time_course.peak.argmax())
+    centroids = time_course.centroid[np.isfinite(time_course.centroid).all(axis=1)]
     path_length = float(np.linalg.norm(np.diff(centroids, axis=0), axis=1).sum())
     return [
         touch.number,
@@ -241,11 +244,11 @@ def _event_row(touch: NamedTouch) -> list[object]:
         "" if touch.unlike else touch.gesture,
         f"{touch.probability:.4f}",
         int(touch.unlike),
-        *(f"{value:.5f}" for value in course.centroid[peak_frame]),
+        *(f"{value:.5f}" for value in time_course.centroid[peak_frame]),
         f"{path_length:.5f}",
         f"{np.linalg.norm(centroids[-1] - centroids[0]):.5f}",
-        f"{course.peak[peak_frame]:.6g}",
-        f"{course.area[peak_frame]:.6g}",
+        f"{time_course.peak[peak_frame]:.6g}",
+        f"{time_course.area[peak_frame]:.6g}",
         int(touch.touch.begun_before),
         int(touch.touch.cut_off),
         int(touch.held),
@@ -258,15 +261,15 @@ def _event_row(touch: NamedTouch) -> list[object]:
 
 def _path_rows(touch: NamedTouch) -> list[list[object]]:
     """Create the rows of the table `paths.csv` for a touch, one for each frame of the touch."""
-    course = touch.touch.course
+    time_course = touch.touch.course
     return [
         [
             touch.number,
-            f"{second:.4f}",
+            f"{time:.4f}",
             *(f"{value:.5f}" if np.isfinite(value) else "" for value in centroid),
             f"{peak:.6g}",
         ]
-        for second, centroid, peak in zip(course.seconds, course.centroid, course.peak, strict=True)
+        for time, centroid, peak in zip(time_course.seconds, time_course.centroid, time_course.peak, strict=True)
     ]
 
 
@@ -289,10 +292,10 @@ def write_contacts(found: RecordedContacts, images: TouchImages, folder: str | P
         for frame, contacts in enumerate(found.contacts)
         for contact in contacts
     )
-    with results(folder, CONTACT_FILES) as made:
-        write_rows(made / "contacts.csv", _CONTACT_COLUMNS, rows)
-        write_json(_report_contacts(found, images, name), made / "report.json")
-        _draw_contacts(found, images).savefig(made / "contacts.png", dpi=130)
+    with results(folder, CONTACT_FILES) as temporary_folder:
+        write_rows(temporary_folder / "contacts.csv", _CONTACT_COLUMNS, rows)
+        write_json(_report_contacts(found, images, name), temporary_folder / "report.json")
+        _draw_contacts(found, images).savefig(temporary_folder / "contacts.png", dpi=130)
 
 
 def _report_contacts(found: RecordedContacts, images: TouchImages, name: str) -> dict[str, Any]:

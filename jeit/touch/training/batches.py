@@ -126,24 +126,24 @@ class BatchOrder:
         """Number of full batches in an epoch of training."""
         return sum(self.num_batches)
 
-    def chunk_batches(self, first: int, last: int, max_batches: int) -> Iterator[ChunkBatches]:
-        """Yield the training batches with indices from `first` to `last`, exclusive, grouped by chunk.
+    def chunk_batches(self, first_batch: int, last_batch: int, max_batches: int) -> Iterator[ChunkBatches]:
+        """Yield the training batches with indices from `first_batch` to `last_batch`, exclusive, grouped by chunk.
 
         `max_batches`: maximum number of batches in a group of one chunk.
         """
-        while first < last:
-            epoch, batch_in_epoch = divmod(first, self.batches_per_epoch)
+        while first_batch < last_batch:
+            epoch, batch_in_epoch = divmod(first_batch, self.batches_per_epoch)
             chunks = self._permutation(len(self.sizes), epoch)
             last_batches = np.cumsum([self.num_batches[chunk_index] for chunk_index in chunks])
             position = int(np.searchsorted(last_batches, batch_in_epoch, side="right"))
             chunk = int(chunks[position])
             batch_in_chunk = batch_in_epoch - (int(last_batches[position]) - self.num_batches[chunk])
-            group_size = min(max_batches, last - first, int(last_batches[position]) - batch_in_epoch)
+            group_size = min(max_batches, last_batch - first_batch, int(last_batches[position]) - batch_in_epoch)
             rows = self._permutation(self.sizes[chunk], epoch, 1 + chunk)[batch_in_chunk * self.batch :][
                 : group_size * self.batch
             ]
-            yield ChunkBatches(chunk, rows.reshape(group_size, self.batch), first)
-            first += group_size
+            yield ChunkBatches(chunk, rows.reshape(group_size, self.batch), first_batch)
+            first_batch += group_size
 
     def _permutation(self, count: int, *location: int) -> np.ndarray:
         """Draw a random permutation of 0 … `count` - 1, determined by the seed and by `location`: the epoch, or the

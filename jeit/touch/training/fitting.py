@@ -152,7 +152,7 @@ def fit_network(
     rows = training if _is_row_source(training) else ArrayRows(training)
     validation_rows = ArrayRows(validation, "validation")
     held_out_arrays = jax.tree.map(jnp.asarray, validation_rows.arrays)
-    seed = [int(word) for word in np.asarray(jax.random.key_data(key) if _is_typed_key(key) else key).ravel()]
+    seed = [int(integer) for integer in np.asarray(jax.random.key_data(key) if _is_typed_key(key) else key).ravel()]
     order = BatchOrder(rows.sizes, plan.batch, seed)
     run = _CompiledTraining(network, objective, plan, order, jax.random.wrap_key_data(jnp.asarray(seed, jnp.uint32)))
     fingerprint = {
@@ -166,10 +166,10 @@ def fit_network(
     }
     checkpoint_file = None if checkpoint is None else Checkpoint(checkpoint, fingerprint)
     state = run.initial_state() if checkpoint_file is None else checkpoint_file.read(run.initial_state())
-    look_every = plan.look_every or order.batches_per_epoch
+    evaluation_interval = plan.look_every or order.batches_per_epoch
     last_batch, last_saved, loaded_chunk = plan.epochs * order.batches_per_epoch, time.monotonic(), (-1, None)
     while (reason := _end_reason(state, plan, last_batch)) is None:
-        next_evaluation = min(last_batch, (state.step // look_every + 1) * look_every)
+        next_evaluation = min(last_batch, (state.step // evaluation_interval + 1) * evaluation_interval)
         for batches in order.chunk_batches(state.step, next_evaluation, _CHECKPOINT_BATCHES):
             if loaded_chunk[0] != batches.chunk:
                 loaded_chunk = -1, None  # drops the chunk, so that two chunks are never in memory
@@ -182,7 +182,9 @@ def fit_network(
             ):
                 checkpoint_file.write(state)
                 last_saved = time.monotonic()
-        state = run.evaluate(state, held_out_arrays, next_evaluation - (next_evaluation - 1) // look_every * look_every)
+        state = run.evaluate(
+            state, held_out_arrays, next_evaluation - (next_evaluation - 1) // evaluation_interval * evaluation_interval
+        )
         if progress is not None:
             progress(_describe_progress(state, plan, order.batches_per_epoch))
         if checkpoint_file is not None and (

@@ -89,17 +89,19 @@ def read_model(
     return head, model
 
 
-def check_same(path: str | Path, made_for: dict[str, Any], expected: dict[str, Any]) -> None:
+def check_same(path: str | Path, actual_description: dict[str, Any], expected_description: dict[str, Any]) -> None:
     """Check that a model is used under the conditions of its training, such as for the same skin and protocol.
 
-    `made_for`, `expected`: descriptions of the skin and protocol in training and in use, as dictionaries of JSON
-    values, in which numbers may differ by a millionth. Raises `ValueError`, which states the first difference.
+    `actual_description`, `expected_description`: descriptions of the skin and protocol in training and in use, as
+    dictionaries of JSON values, in which numbers may differ by a millionth. Raises `ValueError`, which states the first
+    difference.
     """
-    for name in expected:
-        if not _are_equal(made_for.get(name), expected[name]):
+    for name in expected_description:
+        if not _are_equal(actual_description.get(name), expected_description[name]):
+            actual_text, expected_text = _shorten(actual_description.get(name)), _shorten(expected_description[name])
             raise ValueError(
-                f"'{path}' was trained for another skin or protocol: its {name} is {_shorten(made_for.get(name))}, and "
-                f"here it is {_shorten(expected[name])}; train one for this."
+                f"'{path}' was trained for another skin or protocol: its {name} is {actual_text}, and here it is "
+                f"{expected_text}; train one for this."
             )
 
 
@@ -147,26 +149,26 @@ def _read_array(file: BinaryIO, leaf: Any) -> Any:
     version = np.lib.format.read_magic(file)
     if version != (1, 0):
         raise ValueError(f"one of its arrays is in format {version}")
-    shape, columns_first, dtype = np.lib.format.read_array_header_1_0(file)
-    if (shape, dtype, columns_first) != (leaf.shape, leaf.dtype, columns_first and len(leaf.shape) > 1):
+    shape, is_fortran_order, dtype = np.lib.format.read_array_header_1_0(file)
+    if (shape, dtype, is_fortran_order) != (leaf.shape, leaf.dtype, is_fortran_order and len(leaf.shape) > 1):
         raise ValueError(
             f"one of its arrays is {dtype} of shape {shape}, and its header says {leaf.dtype} of {leaf.shape}"
         )
     data = file.read(_num_bytes([leaf]))
     if len(data) != _num_bytes([leaf]):
         raise ValueError("it is truncated")
-    values = np.frombuffer(data, dtype).reshape(shape, order="F" if columns_first else "C")
+    values = np.frombuffer(data, dtype).reshape(shape, order="F" if is_fortran_order else "C")
     if np.isnan(values).any():
         raise ValueError("some of its numbers are NaN")
     return as_array(values)
 
 
-def _are_equal(first: Any, second: Any) -> bool:
-    if isinstance(first, list | tuple) and isinstance(second, list | tuple):
-        return len(first) == len(second) and all(map(_are_equal, first, second))
-    if isinstance(first, int | float) and isinstance(second, int | float):
-        return math.isclose(first, second, rel_tol=1e-6, abs_tol=1e-12)
-    return first == second
+def _are_equal(first_value: Any, second_value: Any) -> bool:
+    if isinstance(first_value, list | tuple) and isinstance(second_value, list | tuple):
+        return len(first_value) == len(second_value) and all(map(_are_equal, first_value, second_value))
+    if isinstance(first_value, int | float) and isinstance(second_value, int | float):
+        return math.isclose(first_value, second_value, rel_tol=1e-6, abs_tol=1e-12)
+    return first_value == second_value
 
 
 def _shorten(value: Any) -> str:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jeit.touch.contacts import Contact, ContactTracker, track_contacts
-from jeit.touch.contacts.tracker import TouchPath, without_side_lobes
+from jeit.touch.contacts.tracker import TouchPath, remove_side_lobes
 
 TIMES = np.arange(60) / 60
 
@@ -136,6 +136,6 @@ def test_paths_beside_a_much_stronger_touch_are_side_lobes():
 
     strong, beside = path(0, 0.0, 1.0, 1.0), path(1, 0.5, 2.0, 0.3)
     alone, negative = path(2, 3.0, 4.0, 0.2), path(3, 0.0, 1.0, -0.9)
-    remaining = without_side_lobes([strong, beside, alone, negative], 0.4)
+    remaining = remove_side_lobes([strong, beside, alone, negative], 0.4)
     assert [touch.number for touch in remaining] == [0, 2, 3]
-    assert len(without_side_lobes([strong, beside], 0.3)) == 2
+    assert len(remove_side_lobes([strong, beside], 0.3)) == 2

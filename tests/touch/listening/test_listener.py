@@ -11,7 +11,7 @@ from jeit.acoustic import Recording
 from jeit.touch.learnt.methods import CLASSIFIERS
 from jeit.touch.listening import LabelledClips, Listener
 from jeit.touch.listening.feature_images import WINDOW_DURATION, SoundImages
-from jeit.touch.listening.learners import LEARNERS, LinearLearner, TrainingSet, stopping_rows
+from jeit.touch.listening.learners import LEARNERS, LinearLearner, TrainingSet, select_early_stopping_windows
 from jeit.touch.listening.windows import _split_pieces, held_out_folds
 
 KEY = jax.random.key(0)
@@ -204,7 +204,7 @@ def test_no_group_is_on_both_sides_and_every_class_is_in_training():
             out = fold == number
             assert not set(groups[out]) & set(groups[~out])
             assert set(right[out]) <= set(right[~out])
-        held = stopping_rows(right, groups)
+        held = select_early_stopping_windows(right, groups)
         assert not set(groups[held]) & set(groups[~held])
         assert set(right[~held]) == set(right)
 

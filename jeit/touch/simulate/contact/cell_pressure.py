@@ -97,7 +97,7 @@ def _pressed_cells(
         )
     rows_of_cells: list = [None] * len(presses)
     pressures: list = [None] * len(presses)
-    num_done = 0
+    num_finished = 0
     for indenter_number in np.unique(indenter_numbers):
         press_indices = np.flatnonzero(indenter_numbers == indenter_number)
         press_indices = press_indices[np.argsort(num_cells[press_indices], kind="stable")]
@@ -109,9 +109,9 @@ def _pressed_cells(
             for press_index, touch_cells, touch_pressure in zip(chunk, cells, pressure, strict=True):
                 is_pressed = touch_pressure.any(axis=-1)
                 rows_of_cells[press_index], pressures[press_index] = touch_cells[is_pressed], touch_pressure[is_pressed]
-            num_done += len(chunk)
+            num_finished += len(chunk)
             if progress is not None:
-                progress(f"pressure: {num_done} of {len(presses)}")
+                progress(f"pressure: {num_finished} of {len(presses)}")
     return _pad_and_stack(rows_of_cells, pressures)
 
 
@@ -138,10 +138,10 @@ def _reach_bounds(support: AbstractSupport, presses: Sequence[Press], indenter_n
     for press, *indenter_and_doublings in zip(presses, indenter_numbers, log2_loads, strict=True):
         if tuple(indenter_and_doublings) not in known_reaches:
             try:
-                extent = _REACH_MARGIN * support.pressure(press.indenter, 2.0 ** indenter_and_doublings[1]).reach
+                max_reach = _REACH_MARGIN * support.pressure(press.indenter, 2.0 ** indenter_and_doublings[1]).reach
             except ValueError:  # the rounded load exceeds the limit of the support; the load of the press may not
-                extent = press.indenter.reach
-            known_reaches[tuple(indenter_and_doublings)] = min(extent, press.indenter.reach)
+                max_reach = press.indenter.reach
+            known_reaches[tuple(indenter_and_doublings)] = min(max_reach, press.indenter.reach)
     return np.array(
         [
             known_reaches[indenter_and_doublings]
@@ -154,7 +154,7 @@ def _pressures_of_equal_indenters(samples: Samples, support: AbstractSupport, pr
     """Compute pressures (b, c, s) of b presses with the same indenter at the s samples of the `cells` (b, c)."""
     points = samples.points[cells]
     sample_shape = points.shape[:-1]
-    local_points, fall, area_ratios = samples.to_indenter_coordinates(
+    local_points, height_differences, area_ratios = samples.to_indenter_coordinates(
         presses, cells, points.reshape(len(cells), -1, points.shape[-1])
     )
     sample_areas = np.broadcast_to((area_ratios * samples.area[cells] * is_cell)[..., None], sample_shape).reshape(
@@ -162,7 +162,7 @@ def _pressures_of_equal_indenters(samples: Samples, support: AbstractSupport, pr
     )
     loads = np.array([press.load for press in presses])
     pressure = support.spread(
-        presses[0].indenter, loads, local_points, sample_areas, _depth_below_plane(samples, fall)
+        presses[0].indenter, loads, local_points, sample_areas, _depth_below_plane(samples, height_differences)
     ) * (sample_areas > 0)
     pressure = pressure.reshape(sample_shape)
     for press_index in np.flatnonzero(np.count_nonzero(pressure, axis=(1, 2)) < _MIN_NUM_SAMPLES).tolist():
@@ -180,16 +180,16 @@ def _pressures_on_finer_lattice(samples: Samples, support: AbstractSupport, pres
     """
     points = samples.lattice_points(cells, _FINE_LATTICE)
     num_fine_samples, num_samples = points.shape[1], samples.points.shape[1]
-    local_points, fall, area_ratios = samples.to_indenter_coordinates(
+    local_points, height_differences, area_ratios = samples.to_indenter_coordinates(
         [press], cells[None], points.reshape(1, -1, points.shape[-1])
     )
     sample_areas = np.repeat(
         area_ratios[0] * samples.area[cells] * is_cell * num_samples / num_fine_samples, num_fine_samples
     )[None]
     loads = np.array([press.load])
-    pressure = support.spread(press.indenter, loads, local_points, sample_areas, _depth_below_plane(samples, fall)) * (
-        sample_areas > 0
-    )
+    pressure = support.spread(
+        press.indenter, loads, local_points, sample_areas, _depth_below_plane(samples, height_differences)
+    ) * (sample_areas > 0)
     if pressure.any():
         return np.repeat(pressure.reshape(-1, num_fine_samples).mean(axis=1, keepdims=True), num_samples, axis=1)
     pressure = np.zeros((len(cells), num_samples))

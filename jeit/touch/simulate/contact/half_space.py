@@ -126,9 +126,9 @@ def _check_on_skin(pressure: PressureRaster, points, areas) -> None:
     represent."""
     is_on_skin = areas > 0
     pixel_centres, pixel = raster(pressure.pixel * len(pressure.values) / 2, len(pressure.values))
-    distances, nearest = KDTree(points[is_on_skin]).query(pixel_centres[pressure.values > 0])
+    distances, nearest_cells = KDTree(points[is_on_skin]).query(pixel_centres[pressure.values > 0])
     forces = pressure.values[pressure.values > 0] * pixel.prod()
-    load_fraction = forces[distances < np.sqrt(areas[is_on_skin][nearest])].sum() / pressure.load
+    load_fraction = forces[distances < np.sqrt(areas[is_on_skin][nearest_cells])].sum() / pressure.load
     if load_fraction < _MIN_LOAD_FRACTION:
         raise ValueError(
             f"position: of {pressure.load:g} N on a half-space, {100 * load_fraction:.0f} % of its pressure would lie "

@@ -269,9 +269,9 @@ def check_indenter(name: str, value) -> None:
     check_kind(name, value, AbstractIndenter, "an indenter, such as DiscIndenter(0.02) or ball_indenter(0.015)")
 
 
-def _check_size(name: str, value, maximum: float = np.inf, limit: str = "") -> None:
+def _check_size(name: str, value, maximum: float = np.inf, limit_text: str = "") -> None:
     """Check that a length is positive metres, not above `maximum`, and warn if it looks like millimetres."""
-    check_metres(name, value, maximum, limit)
+    check_metres(name, value, maximum, limit_text)
     check_length(name, value)
 
 

@@ -107,8 +107,8 @@ class PressDraws(Module):
                 indenter_indices, loads, places[:num_presses], angles, strict=True
             )
         ]
-        ends = np.cumsum(counts)
-        return [tuple(presses[end - count : end]) for end, count in zip(ends, counts, strict=True)]
+        end_indices = np.cumsum(counts)
+        return [tuple(presses[end - count : end]) for end, count in zip(end_indices, counts, strict=True)]
 
     def innermost(self) -> np.ndarray:
         """Return the place (x, y), metres, approximately farthest from the edge of the skin: the farthest of a thousand
@@ -290,7 +290,8 @@ def relative_changes(
     - `touches`: the touches, each a sequence of indents.
     - `resting`: data of the same skin at rest, from `resting_skin`, which several calls can share.
 
-    The changes are divided by the voltages at rest, as in `relative_to`. Raises `ValueError` as `indented_cells` does.
+    The changes are divided by the voltages at rest, as in `relative_voltage_changes`. Raises `ValueError` as
+    `indented_cells` does.
 
     **Example:**
 
@@ -302,11 +303,11 @@ def relative_changes(
     touched = indented_cells(skin, touches)
     if resting is not None:
         rest_voltages = np.asarray(resting.voltages)
-        return relative_to(rest_voltages, rest_voltages + resting.changes(touched))
+        return relative_voltage_changes(rest_voltages, rest_voltages + resting.changes(touched))
     # The choice of material does not matter: only exact voltages are used, without gains and noise.
     pressed = PressedSkin(jax.random.key(0), skin.model, material("hydrogel"), conductivity=skin.model_conductivity)
     rest_voltages = np.asarray(skin.model.voltages(skin.model_conductivity))
-    return relative_to(rest_voltages, pressed.voltages_under(touched))
+    return relative_voltage_changes(rest_voltages, pressed.voltages_under(touched))
 
 
 def resting_skin(skin: Skin, depth: float) -> RestingSkin | None:
@@ -320,7 +321,9 @@ def resting_skin(skin: Skin, depth: float) -> RestingSkin | None:
     return RestingSkin.create(skin.model, skin.model_conductivity, is_touchable)
 
 
-def relative_to(reference: Float[np.ndarray, " M"], voltages: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n M"]:
+def relative_voltage_changes(
+    reference: Float[np.ndarray, " M"], voltages: Float[np.ndarray, "n M"]
+) -> Float[np.ndarray, "n M"]:
     """Compute changes (n, M) of voltages relative to reference voltages (M,), channel by channel, without unit.
 
     The divisor is at least a thousandth of the maximum reference voltage.

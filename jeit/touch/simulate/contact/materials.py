@@ -93,7 +93,7 @@ class Foundation(AbstractSupport):
             points, pixel = raster(window, num_pixels)
             gap = indenter.gap(points)
             area = np.full(gap.size, pixel.prod())
-            return gap, float(water_level(gap.ravel(), area, load / self.stiffness))
+            return gap, float(solve_contact_displacement(gap.ravel(), area, load / self.stiffness))
 
         def is_pressed(window, num_pixels: int) -> np.ndarray:
             gap, approach = balance_load(window, num_pixels)
@@ -114,7 +114,7 @@ class Foundation(AbstractSupport):
         that presses through the layer.
         """
         gaps = indenter.gap(points) if fall is None else indenter.gap(points) + fall
-        approaches = water_level(gaps, areas, loads / self.stiffness)
+        approaches = solve_contact_displacement(gaps, areas, loads / self.stiffness)
         deepest_press = approaches.argmax()
         self._check_approach(approaches[deepest_press], loads[deepest_press])
         return self.stiffness * np.maximum(approaches[:, None] - gaps, 0.0)
@@ -127,7 +127,7 @@ class Foundation(AbstractSupport):
             )
 
 
-def water_level(
+def solve_contact_displacement(
     gap: Float[np.ndarray, "*n q"], area: Float[np.ndarray, "*n q"], volume: Float[np.ndarray, "*n"] | float
 ) -> Float[np.ndarray, "*n"]:
     """Compute the level δ at which Σ area · max(δ − gap, 0) equals `volume`, as that of water over ground of height
@@ -353,7 +353,7 @@ def advance_state(
     return MaterialState(output, branch_states), (1 - shares.sum()) * output + np.sum(shares * branch_states, axis=0)
 
 
-def held_pressure(material: Material, pressure: Float[np.ndarray, "..."], seconds: float) -> Float[np.ndarray, "..."]:
+def creep_pressure(material: Material, pressure: Float[np.ndarray, "..."], seconds: float) -> Float[np.ndarray, "..."]:
     """Compute the effective pressure (…), pascals, under the first `pressure` on a material, applied suddenly and
     constant for `seconds`."""
     shares, times = _creep_branches(material)

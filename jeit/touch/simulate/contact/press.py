@@ -218,7 +218,7 @@ class MovingPress(Module):
         return Press(self.indenter, self.load[frame], self.position[frame], self.angle[frame])
 
 
-def touches_of(presses) -> list[tuple[Press, ...]]:
+def convert_to_touches(presses) -> list[tuple[Press, ...]]:
     """Convert a list of presses, or of tuples of presses, to a list of tuples: the simultaneous presses of each touch.
     Raises `ValueError` for an empty list, and for elements that are not presses."""
     check_kind("presses", presses, (list, tuple), "a list of them, one for each frame, such as [press]")
@@ -234,7 +234,7 @@ def touches_of(presses) -> list[tuple[Press, ...]]:
     return touches
 
 
-def motions_of(motions, num_frames: int) -> list[MovingPress]:
+def convert_to_motions(motions, num_frames: int) -> list[MovingPress]:
     """Return the moving presses of a recording as a list; `motions`: a moving press or a list, empty for an untouched
     skin.
 

@@ -22,8 +22,8 @@ from jeit.forward.model import check_model, select_channels
 from jeit.forward.system import check_conductivity
 from jeit.mesh import Mesh, centroids, measures
 from jeit.touch.simulate.contact.cell_pressure import pressed_cells
-from jeit.touch.simulate.contact.materials import Material, advance_state, held_pressure, unloaded_state
-from jeit.touch.simulate.contact.press import MovingPress, Press, motions_of, touches_of
+from jeit.touch.simulate.contact.materials import Material, advance_state, creep_pressure, unloaded_state
+from jeit.touch.simulate.contact.press import MovingPress, Press, convert_to_motions, convert_to_touches
 from jeit.touch.simulate.contact.samples import Samples
 from jeit_solvers.engines import as_array, on_host
 from jeit_solvers.module import Module
@@ -37,8 +37,8 @@ def standard_normal(key: Array, shape: tuple[int, ...]) -> Float[np.ndarray, "..
     and to one number for gains, drift and short recordings, so that JAX compiles fewer programs. The first draws are
     the same for any number."""
     num_draws = math.prod(shape)
-    num_drawn = max(1 << max(num_draws - 1, 0).bit_length(), _MIN_DRAWS)
-    return np.asarray(jax.random.normal(key, (num_drawn,)))[:num_draws].reshape(shape)
+    padded_num_draws = max(1 << max(num_draws - 1, 0).bit_length(), _MIN_DRAWS)
+    return np.asarray(jax.random.normal(key, (padded_num_draws,)))[:num_draws].reshape(shape)
 
 
 def split_keys(key: Array, number: int) -> list[Array]:
@@ -60,9 +60,9 @@ def random_walk(
     )
 
 
-def draw_gains(key: Array, spread: float, num_channels: int) -> Float[np.ndarray, " M"]:
-    """Draw log-normal gains of channels (M,), with median 1; `spread`: standard deviation of the logarithm."""
-    return np.exp(spread * standard_normal(key, (num_channels,)))
+def draw_gains(key: Array, gain_deviation: float, num_channels: int) -> Float[np.ndarray, " M"]:
+    """Draw log-normal gains of channels (M,), with median 1; `gain_deviation`: standard deviation of the logarithm."""
+    return np.exp(gain_deviation * standard_normal(key, (num_channels,)))
 
 
 def white_noise(key: Array, deviation: float, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
@@ -178,9 +178,9 @@ class PressedSkin(Module):
     ) -> TouchedCells:
         """Compute which cells change their conductivity under n touches, and their relative changes. Arguments and
         errors: see `frames`."""
-        touches = touches_of(presses)
+        touches = convert_to_touches(presses)
         pressed = pressed_cells(Samples.from_mesh(self.model.mesh, self.face), self.material.support, touches, progress)
-        changes = self.material.change(held_pressure(self.material, pressed.pressure, held)).mean(axis=-1)
+        changes = self.material.change(creep_pressure(self.material, pressed.pressure, held)).mean(axis=-1)
         places = np.array([touch[0].position if touch else np.zeros(self._dimension) for touch in touches])
         return _collect_changes(places, pressed.cells, changes, self.model.mesh.num_cells)
 
@@ -253,7 +253,7 @@ class PressedSkin(Module):
         """Compute which cells change their conductivity in each of T frames, also due to earlier loads, and their
         relative changes. The arguments are those of `record`, which raises the same errors."""
         seconds = _check_times(seconds)
-        motions = motions_of(motions, len(seconds))
+        motions = convert_to_motions(motions, len(seconds))
         presses_of_frames = [[motion.at(frame) for motion in motions] for frame in range(len(seconds))]
         touches = [tuple(press for press in frame_presses if press is not None) for frame_presses in presses_of_frames]
         pressed = pressed_cells(Samples.from_mesh(self.model.mesh, self.face), self.material.support, touches, progress)
@@ -279,7 +279,7 @@ class PressedSkin(Module):
         `progress` is called with a message on the number of touches computed so far. Raises the errors of
         `touch_changes`.
         """
-        num_done = 0
+        num_finished = 0
         voltages = np.tile(self._rest_voltages, (len(touched.places), 1))
         places, cells, changes = (np.asarray(array) for array in (touched.places, touched.cells, touched.change))
         for group in _groups_of_similar_cost(self.model.mesh, cells, changes):
@@ -293,9 +293,9 @@ class PressedSkin(Module):
                 )
                 rows = TouchedCells(*arrays, num_cells=touched.num_cells)
                 voltages[chunk] += self._changes(rows)[: len(chunk)]
-                num_done += len(chunk)
+                num_finished += len(chunk)
                 if progress is not None:
-                    progress(f"voltages: {num_done} of {len(voltages)}")
+                    progress(f"voltages: {num_finished} of {len(voltages)}")
         return voltages
 
     def read(
@@ -396,8 +396,8 @@ def _groups_of_similar_cost(
     num_changed = is_changed.sum(axis=1)
     cell_centres = np.asarray(centroids(mesh))[:, : 3 if is_curved(mesh) else 2][cells]
     lower_corners, upper_corners = (
-        extreme(np.where(is_changed[..., None], cell_centres, padding), axis=1)
-        for extreme, padding in ((np.min, 1), (np.max, -1))
+        reduce_times(np.where(is_changed[..., None], cell_centres, padding), axis=1)
+        for reduce_times, padding in ((np.min, 1), (np.max, -1))
     )
     areas = np.sum(np.where(is_changed, np.asarray(measures(mesh))[cells], 0.0), axis=1)
     is_separate = np.linalg.norm(upper_corners - lower_corners, axis=1) > _MIN_SEPARATION * np.sqrt(areas)

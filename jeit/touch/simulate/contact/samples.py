@@ -197,12 +197,12 @@ def _indenter_axes(surface: Triangles, presses: Sequence[Press]):
         nearest_points.points, nearest_points.weights, surface.points[corners], surface.node_normals[corners]
     )
     outward_axes = surface.normals_at(nearest_points)
-    up_axes = np.where(
+    upward_directions = np.where(
         np.abs(outward_axes[:, 2:]) > _MIN_VERTICAL_COMPONENT, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
     )
-    up_axes -= np.sum(up_axes * outward_axes, axis=1, keepdims=True) * outward_axes
-    up_axes /= np.linalg.norm(up_axes, axis=1, keepdims=True)
-    return origins, np.stack([np.cross(up_axes, outward_axes), up_axes, outward_axes], axis=1)
+    upward_directions -= np.sum(upward_directions * outward_axes, axis=1, keepdims=True) * outward_axes
+    upward_directions /= np.linalg.norm(upward_directions, axis=1, keepdims=True)
+    return origins, np.stack([np.cross(upward_directions, outward_axes), upward_directions, outward_axes], axis=1)
 
 
 def _largest_cell_radius(corners) -> float:

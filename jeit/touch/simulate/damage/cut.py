@@ -187,20 +187,21 @@ def draw_cut(
     )
 
 
-def _segments_cross(start, end, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return whether the segments from `first` to `second` (m, 2) cross the segment from `start` to `end`."""
-    direction, second_direction = end - start, second - first
+def _segments_cross(start, end, other_starts: np.ndarray, other_ends: np.ndarray) -> np.ndarray:
+    """Return whether the segments from `other_starts` to `other_ends` (m, 2) cross the segment from `start` to
+    `end`."""
+    direction, second_direction = end - start, other_ends - other_starts
     first_orientation, second_orientation = (
-        _orientation(direction, first - start),
-        _orientation(direction, second - start),
+        _orientation(direction, other_starts - start),
+        _orientation(direction, other_ends - start),
     )
     return (first_orientation * second_orientation <= 0) & (
-        _orientation(second_direction, start - first) * _orientation(second_direction, end - first) <= 0
+        _orientation(second_direction, start - other_starts) * _orientation(second_direction, end - other_starts) <= 0
     )
 
 
-def _orientation(first, second) -> np.ndarray:
-    return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+def _orientation(first_vectors, second_vectors) -> np.ndarray:
+    return first_vectors[..., 0] * second_vectors[..., 1] - first_vectors[..., 1] * second_vectors[..., 0]
 
 
 # Factor by which a repair multiplies the hysteresis of a material. Park et al. (2022), figure S13, show an increase

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jeit.touch.simulate.contact import Foundation, Material, material
-from jeit.touch.simulate.contact.materials import MATERIALS, advance_state, held_pressure, unloaded_state
+from jeit.touch.simulate.contact.materials import MATERIALS, advance_state, creep_pressure, unloaded_state
 from jeit.touch.simulate.contact.pressed_skin import draw_gains, random_walk, split_keys, standard_normal, white_noise
 
 PLAIN = Material(0.2, 1e-4, Foundation(1e6, 2e-3), saturation=1.5, half_pressure=20e3)
@@ -58,7 +58,7 @@ def test_creep_of_a_step_is_exponential():
     late = 0.2 * np.exp(-seconds / 0.5) + 0.1 * np.exp(-seconds / 30.0)
     np.testing.assert_allclose(found, 1e4 * (1 - late), rtol=1e-12)
     for now, effective in zip(seconds, found, strict=True):
-        assert held_pressure(CREEPING, 1e4, now) == pytest.approx(effective, rel=1e-12)
+        assert creep_pressure(CREEPING, 1e4, now) == pytest.approx(effective, rel=1e-12)
 
 
 @pytest.mark.parametrize("made", [CREEPING, BOTH])
