@@ -170,19 +170,19 @@ def compare_layouts(
     return LayoutComparison((first, second), (responses[0], responses[1]), margin, places, contrast, seed)
 
 
-def check_same_outline(first: Layout | SurfaceLayout, second: Layout | SurfaceLayout) -> None:
+def check_same_outline(first_layout: Layout | SurfaceLayout, second_layout: Layout | SurfaceLayout) -> None:
     """Raise `ValueError` unless both layouts are on skins of the same size. For flat skins, the areas of the outlines
     and the sides of their bounding boxes must agree; for curved skins, the areas of the surfaces."""
-    if isinstance(first, SurfaceLayout) or isinstance(second, SurfaceLayout):
-        areas = [_layout_area(layout) for layout in (first, second)]
-        if type(first) is not type(second) or abs(areas[0] - areas[1]) > 1e-2 * areas[0]:
+    if isinstance(first_layout, SurfaceLayout) or isinstance(second_layout, SurfaceLayout):
+        areas = [_layout_area(layout) for layout in (first_layout, second_layout)]
+        if type(first_layout) is not type(second_layout) or abs(areas[0] - areas[1]) > 1e-2 * areas[0]:
             raise ValueError(
-                f"the layouts are on different skins, '{first.name}' of {1e4 * areas[0]:.4g} and '{second.name}' of "
-                f"{1e4 * areas[1]:.4g} cm²; compare layouts on the same surface."
+                f"the layouts are on different skins, '{first_layout.name}' of {1e4 * areas[0]:.4g} and "
+                f"'{second_layout.name}' of {1e4 * areas[1]:.4g} cm²; compare layouts on the same surface."
             )
         return
     sizes = []
-    for layout in (first, second):
+    for layout in (first_layout, second_layout):
         low_x, high_x, low_y, high_y = layout.known_outline.extent
         sizes.append((high_x - low_x, high_y - low_y, float(layout.known_outline.area)))
     if any(
@@ -191,7 +191,7 @@ def check_same_outline(first: Layout | SurfaceLayout, second: Layout | SurfaceLa
     ):
         size_text = " and ".join(
             f"'{layout.name}' {1e3 * width:.4g} × {1e3 * height:.4g} mm"
-            for layout, (width, height, _) in zip((first, second), sizes, strict=True)
+            for layout, (width, height, _) in zip((first_layout, second_layout), sizes, strict=True)
         )
         raise ValueError(
             f"the layouts are on different skins, {size_text}; a file that does not say its skin is read with outline=."
@@ -204,7 +204,7 @@ def _layout_area(layout: Layout | SurfaceLayout) -> float:
     return float(layout.known_outline.area)
 
 
-def comparison_figures(first: SkinResponse, second: SkinResponse) -> list[dict]:
+def comparison_figures(first_response: SkinResponse, second_response: SkinResponse) -> list[dict]:
     """Scores of each of two layouts, as dictionaries of plain numbers.
 
     - `sensitivity_…_V`: minimum and mean sensitivity, volts; `sensitivity_uniformity`: mean sensitivity divided by its
@@ -215,7 +215,7 @@ def comparison_figures(first: SkinResponse, second: SkinResponse) -> list[dict]:
       the taxels' areas, cm².
     - `taxel_overlap`: mean number of taxels that cover a position; `two_point_mm`: mean diameter of the taxels.
     """
-    return [_score_figures(*pair) for pair in ((first, second), (second, first))]
+    return [_score_figures(*pair) for pair in ((first_response, second_response), (second_response, first_response))]
 
 
 def _score_figures(response: SkinResponse, other_response: SkinResponse) -> dict:

@@ -192,10 +192,10 @@ def select_measurements(
     ```
     """
     _check_number(candidates, number, criterion)
-    limit = 0 if not exchange else number if max_swaps is None else max_swaps
-    if not isinstance(limit, int) or limit < 0:
+    swap_limit = 0 if not exchange else number if max_swaps is None else max_swaps
+    if not isinstance(swap_limit, int) or swap_limit < 0:
         raise ValueError(f"max_swaps must be a whole number from 0; it is {max_swaps!r}.")
-    return _select_with_swaps(candidates, number, criterion, limit)
+    return _select_with_swaps(candidates, number, criterion, swap_limit)
 
 
 def information(candidates: Candidates, chosen, *, criterion: Criterion = "D") -> Float[Array, "..."]:
@@ -281,10 +281,10 @@ def farthest_pairs(centres, number: int, *, lengths=None) -> Int[np.ndarray, " N
 
 def _pairs_by_length(centres, number: int, length_sign: int, lengths) -> np.ndarray:
     centres = np.asarray(centres, float)
-    first, second = np.triu_indices(len(centres), 1)
-    if not 1 <= number <= len(first):
+    first_electrodes, second_electrodes = np.triu_indices(len(centres), 1)
+    if not 1 <= number <= len(first_electrodes):
         raise ValueError(
-            f"number must be from 1 to the {len(first)} pairs of {len(centres)} electrodes; it is {number}."
+            f"number must be from 1 to the {len(first_electrodes)} pairs of {len(centres)} electrodes; it is {number}."
         )
     # Distances are rounded to a nanometre, so that pairs of equal distance are taken in the order of the channels.
     if lengths is None:
@@ -293,7 +293,7 @@ def _pairs_by_length(centres, number: int, length_sign: int, lengths) -> np.ndar
         raise ValueError(
             f"lengths has shape {np.shape(lengths)}; give one between any two of {len(centres)} electrodes."
         )
-    pair_lengths = np.asarray(lengths, float)[first, second].round(9)
+    pair_lengths = np.asarray(lengths, float)[first_electrodes, second_electrodes].round(9)
     return np.argsort(length_sign * pair_lengths, kind="stable")[:number]
 
 
@@ -305,28 +305,28 @@ def _check_number(candidates: Candidates, number: int, criterion: Criterion) -> 
 
 
 @partial(jax.jit, static_argnames=("number", "criterion"))
-def _select_with_swaps(candidates: Candidates, number: int, criterion: Criterion, limit) -> Selection:
+def _select_with_swaps(candidates: Candidates, number: int, criterion: Criterion, swap_limit) -> Selection:
     selected, gains = _greedy_selection(candidates, number, criterion)
     total, _ = _information_and_slope(candidates, jnp.ones(candidates.num_candidates), criterion)
 
     def can_improve(state):
-        _, swaps, settled = state
-        return (swaps < limit) & ~settled
+        _, num_swaps, is_settled = state
+        return (num_swaps < swap_limit) & ~is_settled
 
     def swap(state):
-        selected, swaps, _ = state
+        selected, num_swaps, _ = state
         swap_gains = _swap_gains(candidates, selected, criterion)
         removed_position, added_candidate = jnp.unravel_index(jnp.argmax(swap_gains), swap_gains.shape)
         is_gain = swap_gains[removed_position, added_candidate] > _MIN_GAIN * total
         return (
             jnp.where(is_gain, selected.at[removed_position].set(added_candidate), selected),
-            swaps + is_gain,
+            num_swaps + is_gain,
             ~is_gain,
         )
 
-    selected, swaps, settled = jax.lax.while_loop(can_improve, swap, (selected, jnp.array(0), jnp.array(False)))
+    selected, num_swaps, is_settled = jax.lax.while_loop(can_improve, swap, (selected, jnp.array(0), jnp.array(False)))
     final_information = _information_of_sets(candidates, selected[None], criterion)[0]
-    return Selection(selected, gains, final_information, total, swaps, settled)
+    return Selection(selected, gains, final_information, total, num_swaps, is_settled)
 
 
 def _greedy_selection(candidates: Candidates, number: int, criterion: Criterion):

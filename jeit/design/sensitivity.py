@@ -24,7 +24,7 @@ def uniformity(sensitivities: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
 
 
 @either_engine
-def _fraction_below(level, sensitivities: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
+def _fraction_below_level(level, sensitivities: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
     return (sensitivities < level).astype(sensitivities.dtype).mean(axis=-1)
 
 
@@ -71,7 +71,7 @@ class SensitivityMap(Module):
         """
         if has_values(level) and not np.all(np.asarray(level) >= 0):
             raise ValueError(f"level must be a sensitivity in volts, not negative; it is {level!r}.")
-        return _fraction_below(level, self.values)
+        return _fraction_below_level(level, self.values)
 
     def histogram(self, bins: int | np.ndarray = 40) -> tuple[np.ndarray, np.ndarray]:
         """Fraction of the skin's area in each bin of the sensitivity Θ, and the edges of the bins in volts; `bins` as

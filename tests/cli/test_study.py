@@ -11,7 +11,7 @@ from studies import SMALL
 
 from jeit.design.study import read_study
 from jeit.design.study import run as study_run
-from jeit.design.study.lock import locked
+from jeit.design.study.lock import lock_store
 from jeit.design.study.store import Store
 
 pytest.importorskip("xarray")
@@ -97,7 +97,7 @@ def test_a_stopped_study_is_resumed(file, run, monkeypatch):
 @pytest.mark.parametrize("command", ["run", "resume"])
 def test_a_study_that_another_process_writes_is_refused(file, run, command):
     store = Store(read_study(file), file.with_suffix(".zarr"))
-    with locked(store.path, "study"):
+    with lock_store(store.path, "study"):
         assert f"{store.path} is being written by this process since " in failed(run("study", command, file, "-q"))
         assert "0 of 2 points finished" in run("study", "status", file)[1]
         assert "no chunk of the study is finished" in failed(run("study", "report", file))

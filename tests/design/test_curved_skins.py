@@ -175,7 +175,7 @@ def test_touches_of_a_bent_sheet_and_their_derivatives_are_those_of_the_flat_she
     np.testing.assert_allclose(np.linalg.norm(slope, axis=1), np.linalg.norm(expected_slope, axis=1), rtol=1e-9)
     products, expected_products = slope @ slope.T, expected_slope @ expected_slope.T
     np.testing.assert_allclose(products, expected_products, rtol=0, atol=0.05 * expected_products.max())
-    thicker = touches.at_thickness(2 * thickness)
+    thicker = touches.with_thickness(2 * thickness)
     np.testing.assert_allclose(thicker.touched.change, np.asarray(touches.touched.change) / 2, rtol=1e-12)
     np.testing.assert_allclose(thicker.slope, np.asarray(touches.slope) / 2, rtol=1e-12)
 

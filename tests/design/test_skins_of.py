@@ -7,7 +7,7 @@ import pytest
 
 from jeit.design import Skin
 from jeit.design.skin.names import skin_protocol
-from jeit.design.skin.skin import skins_of
+from jeit.design.skin.skin import create_skins
 from jeit.layout import SurfaceLayout, named_layout
 from jeit.mesh import Rectangle, tube
 
@@ -16,7 +16,7 @@ OPTIONS = {"num_layers": 0, "cell_size": 8e-3}
 
 
 def skins(*layouts):
-    return skins_of(layouts, [skin_protocol(one) for one in layouts], **OPTIONS)
+    return create_skins(layouts, [skin_protocol(one) for one in layouts], **OPTIONS)
 
 
 def test_layouts_of_equal_size_on_one_outline_share_a_mesh():
@@ -62,7 +62,7 @@ def test_curved_layouts_share_a_mesh_on_the_same_side_of_the_same_surface():
         inward,
         SurfaceLayout(first.centres[:5], 9e-3, longer, outward=False),
     ]
-    made = skins_of(layouts, [skin_protocol(one) for one in layouts], thickness=4e-3, num_layers=1)
+    made = create_skins(layouts, [skin_protocol(one) for one in layouts], thickness=4e-3, num_layers=1)
     shared = [one.model.mesh.points is other.model.mesh.points for one, other in pairwise(made)]
     assert shared == [True, False, False, False, False, False]
     for skin, layout in zip(made, layouts, strict=True):

@@ -13,7 +13,7 @@ from studies import contents
 
 from jeit.design.study import lock as lock_module
 from jeit.design.study import open_results, run_study, study_progress
-from jeit.design.study.lock import locked
+from jeit.design.study.lock import lock_store
 
 pytest.importorskip("xarray")
 pytest.importorskip("zarr")
@@ -21,8 +21,8 @@ pytest.importorskip("zarr")
 HOLDS = """
 import sys, time
 from pathlib import Path
-from jeit.design.study.lock import locked
-with locked(Path(sys.argv[1]), "study"):
+from jeit.design.study.lock import lock_store
+with lock_store(Path(sys.argv[1]), "study"):
     print("held", flush=True)
     time.sleep(60)
 """
@@ -60,13 +60,13 @@ def test_a_running_owner_is_named_and_a_dead_one_detected(study, store_path, loc
     other_process.send_signal(signal.SIGKILL)
     other_process.wait()
     assert lock_file.exists()
-    with locked(store_path, "study"):
+    with lock_store(store_path, "study"):
         assert json.loads(lock_file.read_text())["pid"] == os.getpid()
     assert not lock_file.exists()
 
 
 def test_reading_needs_no_lock_and_a_second_writer_is_refused(study, whole_store, lock_file):
-    with locked(whole_store, "study"):
+    with lock_store(whole_store, "study"):
         assert study_progress(study, whole_store).chunks == 3
         assert open_results(study, whole_store).finished.all()
         with pytest.raises(ValueError, match=r"being written by this process since .* then resume the study"):
@@ -77,9 +77,9 @@ def test_reading_needs_no_lock_and_a_second_writer_is_refused(study, whole_store
 def test_a_link_to_a_store_has_its_lock(store_path, whole_store):
     store_path.symlink_to(whole_store)
     with (
-        locked(whole_store, "study"),
+        lock_store(whole_store, "study"),
         pytest.raises(ValueError, match="being written by this process"),
-        locked(store_path, "study"),
+        lock_store(store_path, "study"),
     ):
         pass
 
@@ -108,7 +108,7 @@ def test_abandoned_locks_are_taken_over(store_path, lock_file, left):
         signed(lock_file, boot=lock_module.boot_identifier())
     else:
         lock_file.write_text({"nothing": "", "no JSON": "{" * 5000, "a list": "[1]"}[left])
-    with locked(store_path, "study"):
+    with lock_store(store_path, "study"):
         assert json.loads(lock_file.read_text())["pid"] == os.getpid()
 
 
@@ -117,20 +117,20 @@ def test_on_file_systems_without_locks(store_path, lock_file, monkeypatch):
     signed(lock_file, host=lock_module.platform.node(), pid=os.getpid())
     with (
         pytest.raises(ValueError, match=f"process {os.getpid()} on this machine since .* delete "),
-        locked(store_path, "study"),
+        lock_store(store_path, "study"),
     ):
         pass
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
     signed(lock_file, host=lock_module.platform.node(), pid=ended.pid)
-    with locked(store_path, "study"):
+    with lock_store(store_path, "study"):
         assert json.loads(lock_file.read_text())["pid"] == os.getpid()
 
 
 def test_a_link_is_not_followed_for_writing(store_path, lock_file, tmp_path):
     (tmp_path / "letter.txt").write_text("dear")
     lock_file.symlink_to(tmp_path / "letter.txt")
-    with pytest.raises(OSError, match="the study's store cannot be made"), locked(store_path, "study"):
+    with pytest.raises(OSError, match="the study's store cannot be made"), lock_store(store_path, "study"):
         pass
     assert (tmp_path / "letter.txt").read_text() == "dear"
 

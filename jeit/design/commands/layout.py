@@ -202,9 +202,9 @@ def _print_improvement(console, result: "ImprovedLayout") -> None:
         (name, factor, report["start"][key], report["optimised"][key]) for key, name, factor in _OPTIMISED_QUANTITIES
     ]
     rows = [
-        (name, f"{factor * before:.3g} → {factor * after:.3g}")
-        for name, factor, before, after in quantities
-        if before is not None and after is not None
+        (name, f"{factor * score_before:.3g} → {factor * score_after:.3g}")
+        for name, factor, score_before, score_after in quantities
+        if score_before is not None and score_after is not None
     ]
     console.print(name_value_table(result.start.name, rows))
     console.print(f"  {report['status']}: {report['reason']}", soft_wrap=True)
@@ -287,7 +287,7 @@ def compare(
     from jeit.design.comparison import check_same_outline
     from jeit.design.reports import write_layout_comparison
     from jeit.design.skin.names import skin_protocol
-    from jeit.design.skin.skin import skins_of
+    from jeit.design.skin.skin import create_skins
 
     _check_layer(thickness, conductivity)
     check_positive({"--cell-mm": cell})
@@ -303,7 +303,7 @@ def compare(
         step("mesh")
         protocols = [skin_protocol(compared_layout, num_pairs=pairs) for compared_layout in layouts]
         material = {"thickness": 1e-3 * thickness, "conductivity": conductivity}
-        skins_to_compare = skins_of(layouts, protocols, **material, cell_size=1e-3 * cell)
+        skins_to_compare = create_skins(layouts, protocols, **material, cell_size=1e-3 * cell)
         result = compare_layouts(
             skins_to_compare[0],
             skins_to_compare[1],

@@ -37,13 +37,13 @@ def run(
     file: File, output: Output = None, page: Page = None, scheduler: Scheduler = None, quiet: Quiet = False
 ) -> None:
     """Run a study from its beginning, and write its report."""
-    from jeit.design.study.lock import locked
+    from jeit.design.study.lock import lock_store
 
     sweep, store = _read_study_and_path(file, output)
     if store.exists() and not (store / "zarr.json").is_file():
         raise ValueError(f"--output {store}: there is something else already; choose another name.")
     if store.exists():
-        with locked(store, "study"):  # refuses while another process is writing, before the store is deleted
+        with lock_store(store, "study"):  # refuses while another process is writing, before the store is deleted
             pass
         raise ValueError(f"{store} is there already: 'jeit study resume {file}' goes on with it; or delete it.")
     _run_with_progress(sweep, file, store, page, scheduler, quiet)
@@ -136,11 +136,11 @@ def _run_with_progress(
             bar = stack.enter_context(Bar(*columns, console=console, disable=quiet))
             task = bar.add_task("points", total=len(sweep.points), left="")
 
-            def show(now: "Progress") -> None:
-                left = "" if now.seconds_left is None else f"{_format_duration(now.seconds_left)} left"
-                bar.update(task, completed=now.points, left=left)
+            def show_progress(now: "Progress") -> None:
+                time_text = "" if now.seconds_left is None else f"{_format_duration(now.seconds_left)} left"
+                bar.update(task, completed=now.points, left=time_text)
 
-            run_study(sweep, store, client=client, progress=show)
+            run_study(sweep, store, client=client, progress=show_progress)
         write_study_report(sweep, store, report_path)
     except KeyboardInterrupt:
         if not store.exists():
@@ -164,6 +164,6 @@ def connect_to_scheduler(scheduler: str):
 
 def _format_duration(seconds: float) -> str:
     """Format a duration as hours, minutes and seconds, such as "1:02:03"."""
-    minutes, second = divmod(round(seconds), 60)
+    minutes, remaining_seconds = divmod(round(seconds), 60)
     hours, minute = divmod(minutes, 60)
-    return f"{hours}:{minute:02}:{second:02}" if hours else f"{minute}:{second:02}"
+    return f"{hours}:{minute:02}:{remaining_seconds:02}" if hours else f"{minute}:{remaining_seconds:02}"

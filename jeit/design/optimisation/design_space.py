@@ -60,11 +60,12 @@ class Constraints(Module):
     ) -> dict[str, Float[Array, " q"]]:
         """Violations of the constraints on L discs, metres, by the name of the constraint: "minimum_spacing", "outline"
         and "keep_out"."""
-        first, second = np.triu_indices(len(radii), 1)
-        distances = jnp.sqrt(jnp.sum((centres[first] - centres[second]) ** 2, axis=1) + 1e-24)
+        first_electrodes, second_electrodes = np.triu_indices(len(radii), 1)
+        distances = jnp.sqrt(jnp.sum((centres[first_electrodes] - centres[second_electrodes]) ** 2, axis=1) + 1e-24)
         keep_out_violations = [radii + domain.signed_distance(centres) for domain in self.keep_out]
         return {
-            "minimum_spacing": jnp.maximum(self.minimum_spacing, radii[first] + radii[second]) - distances,
+            "minimum_spacing": jnp.maximum(self.minimum_spacing, radii[first_electrodes] + radii[second_electrodes])
+            - distances,
             "outline": radii - self.outline.signed_distance(centres),
             "keep_out": jnp.concatenate(keep_out_violations) if keep_out_violations else jnp.zeros(0),
         }
@@ -148,14 +149,14 @@ class DesignSpace(Module):
         Raises `ValueError` for settings of the design space that no layout can satisfy."""
         options = {"sizes": self.sizes, "contacts": self.contact_impedance, "thickness": self.thickness}
         outline = constraints.outline
-        variables = Variables.create(outline, parameters_of(skin), symmetry=self.symmetry, **options)
+        variables = Variables.create(outline, layout_parameters(skin), symmetry=self.symmetry, **options)
         if self.thickness is not None:
             _check_thickness(self.thickness, depth, outline)
         constraints.check_room(variables.min_radii)
         return variables
 
 
-def parameters_of(skin: Skin) -> LayoutParameters:
+def layout_parameters(skin: Skin) -> LayoutParameters:
     """Current positions, radii and contact impedances of a skin's electrodes and its thickness: the quantities that a
     layout optimisation may vary."""
     discs = skin.model.electrodes

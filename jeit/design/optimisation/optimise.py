@@ -19,7 +19,13 @@ from jaxtyping import Array, Float
 
 from jeit.arguments import check_key, check_kind
 from jeit.design.defaults import STEPS
-from jeit.design.optimisation.design_space import Constraints, DesignSpace, Record, minimise_from_starts, parameters_of
+from jeit.design.optimisation.design_space import (
+    Constraints,
+    DesignSpace,
+    Record,
+    layout_parameters,
+    minimise_from_starts,
+)
 from jeit.design.optimisation.variables import LayoutParameters, Objective, Variables
 from jeit.design.scores import Scores
 from jeit.design.skin.skin import Skin, check_skin
@@ -122,7 +128,7 @@ def optimise_layout(
     initial_variables = np.stack([variables.start, *_random_starts(variables, constraints, starts - 1, key)])
     # The given layout is used unchanged, unless it violates the symmetry or the constraints.
     initial_variables = _make_feasible(variables, constraints, jnp.asarray(np.array(initial_variables)))
-    initial_scores = objective.scores_of_varied(skin, parameters_of(skin))
+    initial_scores = objective.scores_of_varied(skin, layout_parameters(skin))
     start_value = float(objective.score(initial_scores))
     if not np.isfinite(start_value):
         raise ValueError("score is not finite for the layout given; does some touch change no voltage?")
@@ -199,7 +205,7 @@ class _LayoutSearch(Module):
         index is None if no start satisfies the constraints or improves on the given layout."""
         layout = self.skin.layout
         is_valid = (violations <= 0) & np.isfinite(values)
-        is_initial_valid = self.variables.represents(parameters_of(self.skin))
+        is_initial_valid = self.variables.represents(layout_parameters(self.skin))
         is_initial_valid = (
             is_initial_valid and _largest_violation(self.constraints, layout.centres, layout.diameters / 2) <= 1e-9
         )
@@ -255,8 +261,10 @@ def _random_starts(variables: Variables, constraints: Constraints, num_layouts: 
         allowed_positions = unit_positions[is_allowed]
         if len(allowed_positions) < num_generators:
             raise ValueError("keep_out: it leaves no room for the electrodes inside the outline; give less.")
-        other_variables = variables.start[2 * num_generators :]
-        layouts_variables.append(np.concatenate([allowed_positions[:num_generators].ravel(), other_variables]))
+        size_and_contact_variables = variables.start[2 * num_generators :]
+        layouts_variables.append(
+            np.concatenate([allowed_positions[:num_generators].ravel(), size_and_contact_variables])
+        )
     return layouts_variables
 
 
@@ -282,16 +290,18 @@ def _make_feasible(variables: Variables, constraints: Constraints, start_variabl
     return minimise_from_starts(cost, start_variables, 500, Record(), tolerance=0.0)[0]
 
 
-def _penalties(all_variables, variables: Variables, constraints: Constraints, weight: float, margin: float):
+def _penalties(all_variables, variables: Variables, constraints: Constraints, weight: float, safety_margin: float):
     """Penalty (S,) for violated constraints of the layouts of S starts, times `weight`, and its gradient (S, v) with
-    respect to the v variables. `margin`: safety margin of the constraints, metres."""
-    return on_host(_penalty_and_gradient(all_variables, variables, constraints, as_array(weight), as_array(margin)))
+    respect to the v variables. `safety_margin`: safety margin of the constraints, metres."""
+    return on_host(
+        _penalty_and_gradient(all_variables, variables, constraints, as_array(weight), as_array(safety_margin))
+    )
 
 
 @eqx.filter_jit
-def _penalty_and_gradient(all_variables, variables: Variables, constraints: Constraints, weight, margin):
+def _penalty_and_gradient(all_variables, variables: Variables, constraints: Constraints, weight, safety_margin):
     def penalty(start_variables):
-        violations = constraints.violations(*variables.parameters(start_variables)[:2]) + margin
+        violations = constraints.violations(*variables.parameters(start_variables)[:2]) + safety_margin
         return weight * jnp.sum((jnp.maximum(violations, 0) / variables.pitch) ** 2)
 
     return jax.vmap(jax.value_and_grad(penalty))(all_variables)
@@ -301,7 +311,7 @@ def _penalty_and_gradient(all_variables, variables: Variables, constraints: Cons
 def _scores_and_gradients(all_variables, search: _LayoutSearch):
     """Score (S,) of the layouts of S starts, and its gradient (S, v) with respect to the v variables."""
 
-    def score(start_variables):
+    def compute_score(start_variables):
         parameters = search.variables.parameters(start_variables)
         # The score is undefined for an electrode outside the skin, so the electrode is moved to the nearest point of
         # the skin.
@@ -309,7 +319,7 @@ def _scores_and_gradients(all_variables, search: _LayoutSearch):
         return search.objective.score(search.objective.scores_of_varied(search.skin, clipped_parameters))
 
     # Starts are evaluated one after the other, since the Jacobian of a single layout fills the processor's cache.
-    return jax.lax.map(jax.value_and_grad(score), all_variables)
+    return jax.lax.map(jax.value_and_grad(compute_score), all_variables)
 
 
 @eqx.filter_jit

@@ -43,29 +43,32 @@ class LayoutParameters(NamedTuple):
 
 
 class Range(Module):
-    """Logarithmic mapping from k variables between 0 and 1 to positive values between `lower` (k,) and `lower` ·
-    exp(`span`)."""
+    """Logarithmic mapping from k variables between 0 and 1 to positive values between `lower_limits` (k,) and
+    `lower_limits` · exp(`log_ratios`)."""
 
-    lower: Float[np.ndarray, " k"]
-    span: Float[np.ndarray, " k"]
+    lower_limits: Float[np.ndarray, " k"]
+    log_ratios: Float[np.ndarray, " k"]
 
     @classmethod
     def create(cls, name: str, limits, initial_values, unit: str) -> "Range":
         """Create the range of k values between two `limits`, which are the same for all values. `initial_values` (k,)
         only determines the number k. Raises `ValueError` for invalid limits."""
-        lower, upper = limits if np.shape(limits) == (2,) else (0.0, 0.0)
-        if not 0 < lower < upper < np.inf:
+        lower_limit, upper_limit = limits if np.shape(limits) == (2,) else (0.0, 0.0)
+        if not 0 < lower_limit < upper_limit < np.inf:
             raise ValueError(f"{name} must be two values in {unit}, the smaller one first; it is {limits!r}.")
-        return cls(np.full(np.shape(initial_values), lower), np.full(np.shape(initial_values), np.log(upper / lower)))
+        return cls(
+            np.full(np.shape(initial_values), lower_limit),
+            np.full(np.shape(initial_values), np.log(upper_limit / lower_limit)),
+        )
 
     def variables(self, values) -> Float[np.ndarray, " k"]:
         """Variables (k,) between 0 and 1 that correspond to `values` (k,); values outside the range are clipped to the
         range."""
-        return np.minimum(np.maximum(np.log(np.asarray(values) / self.lower) / self.span, 0), 1)
+        return np.minimum(np.maximum(np.log(np.asarray(values) / self.lower_limits) / self.log_ratios, 0), 1)
 
     def values(self, variables) -> Float[Array, " k"]:
         """Values (k,) that correspond to `variables` (k,) between 0 and 1."""
-        return jnp.asarray(self.lower) * jnp.exp(self.span * variables)
+        return jnp.asarray(self.lower_limits) * jnp.exp(self.log_ratios * variables)
 
 
 class Variables(Module):
@@ -76,8 +79,8 @@ class Variables(Module):
 
     - `low`, `size` (2,): lower left corner and side lengths of the box in which the electrodes' centres may lie,
       metres.
-    - `images` (k, 2, 2): matrices of the k operations of the symmetry; `order` (L,): index of each electrode among the
-      images of the generators.
+    - `images` (k, 2, 2): matrices of the k operations of the symmetry; `electrode_order` (L,): index of each electrode
+      among the images of the generators.
     - `initial`: the initial parameters of the layout; `start`: the design variables that correspond to `initial`.
     - `sizes` (G), `contacts` (G), `thickness` (1): ranges of the radii, contact impedances and thickness; None for
       parameters that are not varied.
@@ -87,7 +90,7 @@ class Variables(Module):
     low: np.ndarray
     size: np.ndarray
     images: np.ndarray
-    order: np.ndarray
+    electrode_order: np.ndarray
     initial: LayoutParameters
     sizes: Range | None
     contacts: Range | None
@@ -116,11 +119,11 @@ class Variables(Module):
             size_range = Range(radii[is_generator] / 2, np.full(is_generator.sum(), np.log(4.0)))
         elif sizes is not False:
             diameters = Range.create("sizes", sizes, radii[is_generator], "metres")
-            size_range = Range(diameters.lower / 2, diameters.span)
+            size_range = Range(diameters.lower_limits / 2, diameters.log_ratios)
         if contacts is not None:
             contact_range = Range.create("contact_impedance", contacts, radii[is_generator], "ohm·m²")
         thickness_range = None if thickness is None else Range.create("thickness", thickness, np.ones(1), "metres")
-        min_radius = radii.min() if size_range is None else size_range.lower.min()
+        min_radius = radii.min() if size_range is None else size_range.lower_limits.min()
         low, size = np.array([x_min, y_min]) + min_radius, np.array([x_max - x_min, y_max - y_min]) - 2 * min_radius
         if (size <= 0).any():
             name = "outline: it" if size_range is None else "sizes: the outline"
@@ -130,7 +133,9 @@ class Variables(Module):
         )
         # Images of generators are assigned to electrodes such that the sum of the distances between image and electrode
         # is minimal.
-        order = scipy.optimize.linear_sum_assignment(np.linalg.norm(centres[:, None] - image_positions, axis=-1))[1]
+        electrode_order = scipy.optimize.linear_sum_assignment(
+            np.linalg.norm(centres[:, None] - image_positions, axis=-1)
+        )[1]
         start = [np.clip((centres[is_generator] - low) / size, 0, 1).ravel()]
         if size_range is not None:
             start.append(size_range.variables(radii[is_generator]))
@@ -139,35 +144,35 @@ class Variables(Module):
         if thickness_range is not None:
             start.append(thickness_range.variables(np.asarray(initial.thickness)[None]))
         radii, impedance = (
-            as_array(np.tile(np.asarray(values)[is_generator], len(images))[order])
+            as_array(np.tile(np.asarray(values)[is_generator], len(images))[electrode_order])
             for values in (radii, initial.contact_impedance)
         )
         symmetric_parameters = LayoutParameters(initial.centres, radii, impedance, initial.thickness)
-        pitch = float(np.sqrt(np.prod(size) / len(order)))
+        pitch = float(np.sqrt(np.prod(size) / len(electrode_order)))
         ranges = size_range, contact_range, thickness_range
-        return cls(low, size, images, order, symmetric_parameters, *ranges, np.concatenate(start), pitch)
+        return cls(low, size, images, electrode_order, symmetric_parameters, *ranges, np.concatenate(start), pitch)
 
     def represents(self, parameters: LayoutParameters) -> bool:
         """Whether the variables `start` reproduce the given `parameters`: True if the parameters have the symmetry and
         lie in the ranges."""
         represented = _compiled_parameters(self, jnp.asarray(self.start))
         are_equal = (
-            np.allclose(represented_values, given_values, rtol=1e-6, atol=0)
-            for represented_values, given_values in zip(represented[1:], parameters[1:], strict=True)
+            np.allclose(represented_values, parameter_values, rtol=1e-6, atol=0)
+            for represented_values, parameter_values in zip(represented[1:], parameters[1:], strict=True)
         )
         return bool(np.allclose(represented.centres, parameters.centres, atol=1e-6)) and all(are_equal)
 
     @property
     def num_generators(self) -> int:
         """Number of generators, G: electrodes that the variables describe directly."""
-        return len(self.order) // len(self.images)
+        return len(self.electrode_order) // len(self.images)
 
     @property
     def min_radii(self) -> Float[np.ndarray, " L"]:
         """Minimum radii (L,) of the electrodes, metres."""
         if self.sizes is None:
             return np.asarray(self.initial.radii)
-        return np.tile(self.sizes.lower, len(self.images))[self.order]
+        return np.tile(self.sizes.lower_limits, len(self.images))[self.electrode_order]
 
     def parameters(self, variables: Float[Array, " v"]) -> LayoutParameters:
         """Parameters of the layout that correspond to the design variables (v,) between 0 and 1."""
@@ -190,11 +195,11 @@ class Variables(Module):
             )
         if self.thickness is not None:
             thickness = self.thickness.values(remaining_variables)[0]
-        return LayoutParameters(centres[self.order], radii, contact_impedance, thickness)
+        return LayoutParameters(centres[self.electrode_order], radii, contact_impedance, thickness)
 
     def _values_of_mirror_images(self, values: Float[Array, " G"]) -> Float[Array, " L"]:
         """Repeat the values (G,) of the generators for their images: values (L,) of all electrodes."""
-        return jnp.tile(values, len(self.images))[self.order]
+        return jnp.tile(values, len(self.images))[self.electrode_order]
 
 
 _compiled_parameters = eqx.filter_jit(Variables.parameters)
@@ -214,19 +219,21 @@ def _is_in_first_sector(offsets: np.ndarray, symmetry: str | None) -> np.ndarray
     return (x > 0) & (y >= 0) if symmetry == "rotate-4" else np.ones(len(offsets), bool)
 
 
-def _check_symmetric_counts(num_first: int, num_sectors: int, num_electrodes: int, symmetry: str | None) -> None:
-    if num_first * num_sectors == num_electrodes:
+def _check_symmetric_counts(
+    num_in_first_sector: int, num_sectors: int, num_electrodes: int, symmetry: str | None
+) -> None:
+    if num_in_first_sector * num_sectors == num_electrodes:
         return
     if num_electrodes % num_sectors:
-        advice = (
+        remedy = (
             f"{num_electrodes} electrodes cannot be shared equally among {num_sectors} parts; add or remove "
             f"{num_electrodes % num_sectors}, or choose another symmetry."
         )
     else:
-        advice = "give a layout with the same number in each."
+        remedy = "give a layout with the same number in each."
     raise ValueError(
-        f"symmetry: {num_first} of {num_electrodes} electrodes are in the first of {num_sectors} parts of the skin "
-        f"for '{symmetry}'; {advice}"
+        f"symmetry: {num_in_first_sector} of {num_electrodes} electrodes are in the first of {num_sectors} parts of "
+        f"the skin for '{symmetry}'; {remedy}"
     )
 
 
@@ -295,6 +302,6 @@ class Objective(Module):
         differentiable with respect to `varied`."""
         model = skin.model.with_electrodes(SheetDiscs(varied.centres, varied.radii, varied.contact_impedance))
         conductance = _scaled(skin.model_conductivity, varied.thickness, skin.thickness)
-        touches = self.touches.at_thickness(varied.thickness)
+        touches = self.touches.with_thickness(varied.thickness)
         options = {"prior": self.prior, "noise": self.noise, "temperature": self.temperature}
         return layout_scores(model, conductance, touches, **options)

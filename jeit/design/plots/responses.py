@@ -229,11 +229,11 @@ def plot_similarity(
     colour_bar: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot the cosine similarity of each position's voltage change to the mean voltage change of taxel `index`, and the
-    taxel's outline.
+    """Plot the cosine similarity of each position's voltage change to the mean voltage change of taxel `index`,
+    and the taxel's outline.
 
-    `electrodes`: positions (L, 2) or (L, 3) of the electrodes to be marked, metres. Raises `ValueError` for an `index`
-    that no taxel has, and for taxels of a batch of layouts.
+    `electrodes`: positions (L, 2) or (L, 3) of the electrodes to be marked, metres. Raises `ValueError` for an
+    `index` that no taxel has, and for taxels of a batch of layouts.
     """
     _check_single(taxels)
     num_taxels = len(taxels.similarity)
@@ -289,9 +289,9 @@ def _map_colours(taxels: Taxels) -> np.ndarray:
     are_neighbours[first_labels, second_labels] = are_neighbours[second_labels, first_labels] = True
     np.fill_diagonal(are_neighbours, False)
     colours = np.full(num_taxels, -1)
-    for index in range(num_taxels):
-        free_colours = np.setdiff1d(np.arange(num_taxels), colours[are_neighbours[index]])
-        colours[index] = free_colours[0] % colormaps[_PALETTE].N
+    for taxel_index in range(num_taxels):
+        free_colours = np.setdiff1d(np.arange(num_taxels), colours[are_neighbours[taxel_index]])
+        colours[taxel_index] = free_colours[0] % colormaps[_PALETTE].N
     return colours
 
 

@@ -72,13 +72,13 @@ def plot_travel(
     ax.add_collection(PatchCollection(initial_discs, facecolor="none", edgecolor=LIGHT_GREY, linewidth=1.0, zorder=3))
     ax.add_collection(LineCollection(list(paths.swapaxes(0, 1)), colors=LIGHT_GREY, linewidths=1.2, zorder=3))
     ax.add_collection(PatchCollection(final_discs, facecolor=METAL, edgecolor=DARK_GREY, linewidth=0.6, zorder=4))
-    _draw_legend(ax, has_keep_out=bool(keep_out))
+    _draw_legend(ax, has_excluded_areas=bool(keep_out))
     distances = np.linalg.norm(final_centres - paths[0], axis=1)
     ax.set_title(f"Moved {1e3 * distances.mean():.0f} mm on average" if title is None else title, color=DARK_GREY)
     return ax
 
 
-def _draw_legend(ax: Axes, *, has_keep_out: bool) -> None:
+def _draw_legend(ax: Axes, *, has_excluded_areas: bool) -> None:
     """Draw the legend of the positions below the plot, beside the scale bar."""
     disc = {"marker": "o", "markersize": 8, "linestyle": "none"}
     handles: list[Artist] = [
@@ -94,7 +94,7 @@ def _draw_legend(ax: Axes, *, has_keep_out: bool) -> None:
             **disc,
         ),
     ]
-    if has_keep_out:
+    if has_excluded_areas:
         handles.append(Patch(facecolor="none", edgecolor=LIGHT_GREY, hatch="////", label="kept free"))
     style = {"frameon": False, "fontsize": 9, "labelcolor": DARK_GREY, "borderaxespad": 0.2, "columnspacing": 1.2}
     ax.legend(handles=handles, loc="lower right", ncols=2, **style)

@@ -106,10 +106,10 @@ def draw_scores(data):
                 color=f"C{layout_index}",
                 label=_escape_for_matplotlib(layout),
             )
-            ones = np.ones(is_infinite.sum())
+            ones_array = np.ones(is_infinite.sum())
             axes.plot(
                 point_numbers[is_infinite],
-                ones,
+                ones_array,
                 "^",
                 ms=5,
                 color=f"C{layout_index}",
@@ -130,9 +130,11 @@ def draw_scores(data):
 def map_points(data) -> np.ndarray:
     """Indices of the finished points whose sensitivity maps are drawn in the report: all finished points, or 24 evenly
     spaced points if there are more."""
-    finished = np.flatnonzero(data.finished.values)
-    selected_positions = np.linspace(0, len(finished) - 1, min(len(finished), _MAX_MAPS)).round().astype(int)
-    return finished[selected_positions]
+    finished_points = np.flatnonzero(data.finished.values)
+    selected_positions = (
+        np.linspace(0, len(finished_points) - 1, min(len(finished_points), _MAX_MAPS)).round().astype(int)
+    )
+    return finished_points[selected_positions]
 
 
 def draw_maps(study: Study, data):
@@ -160,14 +162,14 @@ def draw_maps(study: Study, data):
     image = None
     for axes, point_index, map_values in zip(panels, point_indices, values, strict=False):
         layout = study.points[point_index].layout
-        image = map_drawing.draw(axes, map_values, norm=scale, cmap="magma")
+        image = map_drawing.draw_values(axes, map_values, norm=scale, cmap="magma")
         diameter = 1e3 * np.asarray(layout.diameters)
         circles = EllipseCollection(
             diameter,
             diameter,
             np.zeros_like(diameter),
             units="xy",
-            offsets=1e3 * map_drawing.places(layout.centres),
+            offsets=1e3 * map_drawing.to_plane(layout.centres),
             offset_transform=axes.transData,
             facecolors="none",
             edgecolors="c",
@@ -195,10 +197,10 @@ class _FlatMaps:
     def __init__(self, outline: Rectangle, grid: TouchGrid):
         self.extent, self.grid = tuple(1e3 * length for length in outline.extent), grid
 
-    def draw(self, axes, values, **style):
+    def draw_values(self, axes, values, **style):
         return axes.imshow(self.grid.raster(values), origin="lower", extent=self.extent, **style)
 
-    def places(self, centres) -> np.ndarray:
+    def to_plane(self, centres) -> np.ndarray:
         return np.asarray(centres)
 
 
@@ -210,18 +212,18 @@ class _UnrolledMaps:
         fine_surface = outline
         while len(fine_surface.points) < _MIN_MAP_NODES:
             fine_surface = fine_surface.finer()
-        self.flat = unroll(fine_surface)
-        self.nearest_places = Geodesics.create(fine_surface).owners(grid.places)[0][self.flat.nodes]
+        self.unrolled_surface = unroll(fine_surface)
+        self.nearest_places = Geodesics.create(fine_surface).owners(grid.places)[0][self.unrolled_surface.nodes]
 
-    def draw(self, axes, values, **style):
+    def draw_values(self, axes, values, **style):
         axes.set_aspect("equal")
-        x, y = 1e3 * self.flat.points.T
+        x, y = 1e3 * self.unrolled_surface.points.T
         return axes.tripcolor(
-            x, y, self.flat.cells, np.asarray(values)[self.nearest_places], shading="gouraud", **style
+            x, y, self.unrolled_surface.cells, np.asarray(values)[self.nearest_places], shading="gouraud", **style
         )
 
-    def places(self, centres) -> np.ndarray:
-        return self.flat.flat(np.asarray(centres))
+    def to_plane(self, centres) -> np.ndarray:
+        return self.unrolled_surface.flat(np.asarray(centres))
 
 
 def point_titles(study: Study) -> list[str]:

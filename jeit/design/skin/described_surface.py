@@ -45,17 +45,19 @@ def _check_unit(table: SurfaceTable, surface: Mesh) -> None:
     likely unit of length."""
     from jeit.design.skin.surface_tables import ScanTable
 
-    extent = float(np.ptp(np.asarray(surface.points), axis=0).max())
-    if not isinstance(table, ScanTable) or MIN_SKIN_SIZE <= extent <= MAX_SKIN_SIZE:
+    largest_side = float(np.ptp(np.asarray(surface.points), axis=0).max())
+    if not isinstance(table, ScanTable) or MIN_SKIN_SIZE <= largest_side <= MAX_SKIN_SIZE:
         return
-    extents_by_unit = {unit: extent * scale / _UNITS[table.unit] for unit, scale in _UNITS.items()}
+    extents_by_unit = {unit: largest_side * scale / _UNITS[table.unit] for unit, scale in _UNITS.items()}
     likely_unit = min(extents_by_unit, key=lambda unit: abs(np.log(extents_by_unit[unit] / _TYPICAL_EXTENT)))
-    hint = (
+    unit_hint = (
         f'give "{likely_unit}", in which it is {_length_text(extents_by_unit[likely_unit])}'
         if likely_unit != table.unit
         else "is it the right file?"
     )
-    raise ValueError(f'surface.unit: in "{table.unit}" the skin would be {_length_text(extent)} across; {hint}.')
+    raise ValueError(
+        f'surface.unit: in "{table.unit}" the skin would be {_length_text(largest_side)} across; {unit_hint}.'
+    )
 
 
 def _length_text(metres: float) -> str:
@@ -90,8 +92,8 @@ def _create_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Mesh
         case tables.CapTable():
             return cap(1e-3 * table.radius_mm, float(np.deg2rad(table.angle_degrees)), cell_size=cell_size)
         case tables.BentSheetTable():
-            flat = rectangle(1e-3 * table.width_mm, 1e-3 * table.height_mm, cell_size=cell_size)
-            return bend(flat, 1e-3 * table.radius_mm, axis=table.axis)
+            flat_mesh = rectangle(1e-3 * table.width_mm, 1e-3 * table.height_mm, cell_size=cell_size)
+            return bend(flat_mesh, 1e-3 * table.radius_mm, axis=table.axis)
     file, scale = folder / table.file, _UNITS[table.unit]
     if table.has_cells:
         surface = read(file, scale=scale)

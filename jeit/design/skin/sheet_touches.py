@@ -36,7 +36,7 @@ class SheetTouches(Module):
     depth: float
 
     @values_at_once
-    def at_thickness(self, thickness) -> "SheetTouches":
+    def with_thickness(self, thickness) -> "SheetTouches":
         """Return the same touches for a sheet that represents a layer of a different `thickness`, metres. Conductivity
         changes are proportional to depth / thickness."""
         depth_ratio = self.thickness / thickness
@@ -76,17 +76,17 @@ def sheet_touches(
         return (contrast - 1) * indentation.depth_at(distance) / thickness
 
     # In NumPy where values are known, so that only the derivative is compiled.
-    all_centroids, known = on_host((centroids(mesh), touched))
-    cell_centroids, origins = gather(all_centroids, known.cells), known.places
+    all_centroids, touched_values = on_host((centroids(mesh), touched))
+    cell_centroids, origins = gather(all_centroids, touched_values.cells), touched_values.places
     if mesh.is_surface:
         cell_centroids = _flatten_centroids(mesh, touched, indentation.reach)
         origins = np.zeros((len(touched.places), 2))
     slopes = on_host(jax.jit(jax.vmap(jax.vmap(jax.grad(relative_change), (None, 0))))(origins, cell_centroids))
-    slopes = jnp.asarray(namespace(known, slopes).where(known.change[..., None] != 0, slopes, 0.0))
+    slopes = jnp.asarray(namespace(touched_values, slopes).where(touched_values.change[..., None] != 0, slopes, 0.0))
     return SheetTouches(touched, slopes, jnp.asarray(thickness, float), float(indentation.depth_at(host.zeros(()))))
 
 
-def _flatten_centroids(mesh: Mesh, touched: TouchedCells, reach: float) -> Float[np.ndarray, "n c 2"]:
+def _flatten_centroids(mesh: Mesh, touched: TouchedCells, max_distance: float) -> Float[np.ndarray, "n c 2"]:
     """Map the centroids of touched cells to the tangent plane at the position of their touch. The distance from the
     position in the plane equals the distance along the surface. Returns coordinates (n, c, 2) relative to the position,
     metres."""
@@ -100,7 +100,7 @@ def _flatten_centroids(mesh: Mesh, touched: TouchedCells, reach: float) -> Float
     flat_centroids = np.einsum("nid,ncd->nci", tangent_frames, cell_centroids[cells] - places[:, None])
     lengths, cell_lengths = np.zeros(cells.shape), np.zeros(mesh.num_cells)
     for row, (cell_indices, touch_lengths) in enumerate(
-        Geodesics.create(surface).near(places, surface.nearest(cell_centroids), reach)
+        Geodesics.create(surface).near(places, surface.nearest(cell_centroids), max_distance)
     ):
         cell_lengths[cell_indices] = touch_lengths
         lengths[row] = cell_lengths[cells[row]]

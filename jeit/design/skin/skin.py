@@ -253,7 +253,7 @@ class Skin(Module):
         return touch_changes(self.model, self.model_conductivity, touched, linear=linear)
 
 
-def skins_of(layouts: Sequence[Layout | SurfaceLayout], protocols: Sequence[Protocol], **options) -> list[Skin]:
+def create_skins(layouts: Sequence[Layout | SurfaceLayout], protocols: Sequence[Protocol], **options) -> list[Skin]:
     """Create one skin for each layout and its protocol, with `options` of `Skin.create`. Consecutive layouts with the
     same outline and number of electrodes share one mesh and the symbolic factorisation of its system matrix. Raises the
     errors of `Skin.create`."""

@@ -178,18 +178,18 @@ def touched_cells(
         raise ValueError("thickness is for sheets; that of a layer is in its mesh.")
     if not is_layer and (thickness is None or not 0 < thickness < np.inf):
         raise ValueError(f"thickness must be given for a sheet, in metres, positive; it is {thickness!r}.")
-    reached = reached_cells(mesh, places, indentation.reach, max_depth + edge if is_layer else np.inf, face)
-    thickness = reached.thickness if is_layer else thickness
+    cells_in_reach = reached_cells(mesh, places, indentation.reach, max_depth + edge if is_layer else np.inf, face)
+    thickness = cells_in_reach.thickness if is_layer else thickness
     assert thickness is not None
     if max_depth >= thickness:
         raise ValueError(
             f"the indentation is {1e3 * max_depth:.3g} mm deep, and the skin {1e3 * thickness:.3g} mm thick; press "
             "less."
         )
-    cells, is_entry = pad_rows(reached.cells)
+    cells, is_entry = pad_rows(cells_in_reach.cells)
     distances = np.full(cells.shape, np.inf)
-    distances[is_entry] = np.concatenate(reached.distances)
-    depths, centroid_depths = np.asarray(indentation.depth_at(as_array(distances))), reached.centroid_depths
+    distances[is_entry] = np.concatenate(cells_in_reach.distances)
+    depths, centroid_depths = np.asarray(indentation.depth_at(as_array(distances))), cells_in_reach.centroid_depths
     if not is_layer:
         fractions = depths / thickness
     elif edge:
@@ -278,16 +278,17 @@ def touched_nodes(model: ForwardModel, touches: TouchedCells, strips: Strips | N
     return TouchedNodes(strips, np.take_along_axis(nodes, entry_indices, axis=1), corners)
 
 
-def _number_nodes(nodes: Int[np.ndarray, "b c q"], no_node: int):
-    """Number the distinct mesh nodes of each of b touches from 0, except for the index `no_node`, which marks padding.
-    Returns the number of every entry of `nodes` (b, c, q), and for every distinct node its touch, number and index."""
-    first_keys = (no_node + 1) * np.arange(len(nodes), dtype=np.int32)
+def _number_nodes(nodes: Int[np.ndarray, "b c q"], padding_index: int):
+    """Number the distinct mesh nodes of each of b touches from 0, except for the index `padding_index`, which marks
+    padding. Returns the number of every entry of `nodes` (b, c, q), and for every distinct node its touch, number and
+    index."""
+    first_keys = (padding_index + 1) * np.arange(len(nodes), dtype=np.int32)
     keys = nodes + first_keys[:, None, None]
-    is_used = np.zeros(len(nodes) * (no_node + 1), bool)
+    is_used = np.zeros(len(nodes) * (padding_index + 1), bool)
     is_used[keys] = True
-    is_used[first_keys + no_node] = False
+    is_used[first_keys + padding_index] = False
     distinct_keys = np.flatnonzero(is_used)
-    touch, node = np.divmod(distinct_keys, no_node + 1)
+    touch, node = np.divmod(distinct_keys, padding_index + 1)
     local_number = np.arange(len(distinct_keys)) - np.searchsorted(distinct_keys, first_keys)[touch]
     numbers_of_keys = np.zeros(len(is_used), np.int32)
     numbers_of_keys[distinct_keys] = local_number

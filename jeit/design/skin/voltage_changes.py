@@ -101,13 +101,15 @@ def _linear_changes(model: ForwardModel, conductivity, touched: TouchedCells):
 
 
 def _exact_changes(model: ForwardModel, conductivity, touched: TouchedCells):
-    touched_at = touched_nodes(model, touched)
-    max_distance = -(-touched_at.strips.max_strip_distance(touched_at.nodes) // _STRIP_MULTIPLE) * _STRIP_MULTIPLE
+    touch_geometry = touched_nodes(model, touched)
+    max_distance = (
+        -(-touch_geometry.strips.max_strip_distance(touch_geometry.nodes) // _STRIP_MULTIPLE) * _STRIP_MULTIPLE
+    )
     solved_system = evaluate(model, solved_system_of, conductivity)
-    fields_and_inverse_of_skin = fields_and_inverse(solved_system, touched_at.strips, max_distance)
-    touches = on_device((touched.cells, touched.change, touched_at.nodes, touched_at.corners))
+    fields_and_inverse_of_skin = fields_and_inverse(solved_system, touch_geometry.strips, max_distance)
+    touches = on_device((touched.cells, touched.change, touch_geometry.nodes, touch_geometry.corners))
     compute_changes = partial(
-        changes_between, model.protocol, cell_stiffness(model, conductivity), fields_and_inverse_of_skin, touches
+        exact_voltage_changes, model.protocol, cell_stiffness(model, conductivity), fields_and_inverse_of_skin, touches
     )
     return _changes_over_cores(compute_changes, touched)
 
@@ -139,25 +141,25 @@ def cell_stiffness(model: ForwardModel, conductivity) -> Float[Array, "m q q"]:
 
 
 @jax.jit
-def changes_between(protocol: Protocol, element_matrices, fields_and_inverse, touches, index):
-    """Compute the exact voltage changes due to the touches with indices `index` (c, s), s touches at a time.
+def exact_voltage_changes(protocol: Protocol, element_matrices, fields_and_inverse, touches, touch_indices):
+    """Compute the exact voltage changes due to the touches with indices `touch_indices` (c, s), s touches at a time.
 
     `element_matrices`: result of `cell_stiffness`; `fields_and_inverse`: result of the function with this name;
     `touches`: cells and changes of all touches as in `TouchedCells`, and their nodes and corners as in
     `TouchedNodes`."""
     fields, inverse = fields_and_inverse
-    voltages_of = jax.vmap(lambda relative_change: select_channels(protocol, relative_change))
+    select_voltages = jax.vmap(lambda relative_change: select_channels(protocol, relative_change))
 
-    def chunk_changes(index):
-        cells, relative_change, nodes, corners = (array[index] for array in touches)
+    def chunk_changes(chunk_indices):
+        cells, relative_change, nodes, corners = (array[chunk_indices] for array in touches)
         blocks = element_matrices[cells] * relative_change[..., None, None]
-        return voltages_of(
+        return select_voltages(
             _impedance_changes(
                 blocks, corners, inverse.blocks(nodes), fields[nodes], _weakening_factor(relative_change)
             )
         )
 
-    return _join_chunks(jax.lax.map(chunk_changes, index))
+    return _join_chunks(jax.lax.map(chunk_changes, touch_indices))
 
 
 def _join_chunks(chunks: Float[Array, "c s *m"]) -> Float[Array, "cs *m"]:
@@ -220,8 +222,8 @@ def _impedance_changes(blocks, corners, inverse, fields, weakening_factor):
     initial_energy = jnp.sum(right_hand_side * scaled_load, axis=1, keepdims=True)
     # The remaining error is at most the energy Rᵀ G R times `weakening_factor`. The voltages change by at least Fᵀ D F
     # due to insulators, and by at least (Fᵀ D F)² divided by the energy of the load due to conductors.
-    linear = jnp.abs(jnp.sum(fields * right_hand_side, axis=1, keepdims=True))
-    voltages = jnp.minimum(linear, linear**2 / jnp.where(initial_energy > 0, initial_energy, 1.0))
+    linear_change = jnp.abs(jnp.sum(fields * right_hand_side, axis=1, keepdims=True))
+    voltages = jnp.minimum(linear_change, linear_change**2 / jnp.where(initial_energy > 0, initial_energy, 1.0))
     max_energy = (
         _TOLERANCE * jnp.maximum(voltages, _MIN_RELATIVE_VOLTAGE * initial_energy) / weakening_factor[:, None, None]
     )
@@ -302,12 +304,12 @@ class RestingSkin(Module):
     def changes(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
         """Compute the exact voltage changes (n, M) of M channels due to n single touches, volts, as `touch_changes`
         does. Raises `RuntimeError` in the cases of `touch_changes`."""
-        touched_at = touched_nodes(self.model, touched, self.strips)
+        touch_geometry = touched_nodes(self.model, touched, self.strips)
         cells, relative_changes = np.asarray(touched.cells), np.asarray(touched.change)
         num_changed_cells = np.count_nonzero(relative_changes, axis=1)
         sizes = np.stack(
             [
-                _padded_size((touched_at.nodes < touched_at.nodes[:, -1:]).sum(axis=1) + 1, _NODE_SIZE_RATIO),
+                _padded_size((touch_geometry.nodes < touch_geometry.nodes[:, -1:]).sum(axis=1) + 1, _NODE_SIZE_RATIO),
                 _padded_size(num_changed_cells, _CELL_SIZE_RATIO),
             ],
             axis=1,
@@ -316,28 +318,38 @@ class RestingSkin(Module):
         skin_fields_and_inverse = self.fields, self.inverse
         for size in np.unique(sizes[num_changed_cells > 0], axis=0):
             touches_of_size = np.flatnonzero((sizes == size).all(axis=1) & (num_changed_cells > 0))
-            padded_nodes = _pad_rows(touched_at.nodes, size[0], "edge")
-            arrays = (_pad_rows(array, size[1], "constant") for array in (cells, relative_changes, touched_at.corners))
+            padded_nodes = _pad_rows(touch_geometry.nodes, size[0], "edge")
+            arrays = (
+                _pad_rows(array, size[1], "constant") for array in (cells, relative_changes, touch_geometry.corners)
+            )
             padded_cells, padded_changes, padded_corners = arrays
             for chunk in np.split(touches_of_size, range(_TOUCHES_PER_CALL, len(touches_of_size), _TOUCHES_PER_CALL)):
                 rows = chunk[np.minimum(np.arange(_TOUCHES_PER_CALL), len(chunk) - 1)]
                 touches = on_device(
                     (padded_cells[rows], padded_changes[rows], padded_nodes[rows], padded_corners[rows])
                 )
-                work = partial(changes_between, self.model.protocol, self.element, skin_fields_and_inverse, touches)
-                voltage_changes[chunk] = np.asarray(over_cores(work, _TOUCHES_PER_CALL, EXACT_BATCH_SIZE))[: len(chunk)]
+                compute_changes = partial(
+                    exact_voltage_changes, self.model.protocol, self.element, skin_fields_and_inverse, touches
+                )
+                voltage_changes[chunk] = np.asarray(over_cores(compute_changes, _TOUCHES_PER_CALL, EXACT_BATCH_SIZE))[
+                    : len(chunk)
+                ]
         check_finite_changes(voltage_changes, np.asarray(touched.places))
         return voltage_changes
 
-    def changes_together(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
+    def changes_of_equal_touches(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
         """As `changes` (n, M), in volts, for touches of about equal numbers of cells and nodes: all are padded to the
         largest, and one program computes them. One is compiled for each number of touches, and for each size."""
-        touched_at = touched_nodes(self.model, touched, self.strips)
-        nodes = _pad_rows(touched_at.nodes, int(_padded_size(touched_at.nodes.shape[1], _NODE_SIZE_RATIO)), "edge")
-        touches = on_device((touched.cells, touched.change, nodes, touched_at.corners))
+        touch_geometry = touched_nodes(self.model, touched, self.strips)
+        nodes = _pad_rows(
+            touch_geometry.nodes, int(_padded_size(touch_geometry.nodes.shape[1], _NODE_SIZE_RATIO)), "edge"
+        )
+        touches = on_device((touched.cells, touched.change, nodes, touch_geometry.corners))
         skin_fields_and_inverse = self.fields, self.inverse
-        work = partial(changes_between, self.model.protocol, self.element, skin_fields_and_inverse, touches)
-        return np.asarray(_changes_over_cores(work, touched))
+        compute_changes = partial(
+            exact_voltage_changes, self.model.protocol, self.element, skin_fields_and_inverse, touches
+        )
+        return np.asarray(_changes_over_cores(compute_changes, touched))
 
 
 def _padded_size(count, ratio: float):

@@ -65,8 +65,8 @@ def check_points(study: Study) -> None:
     """Check all points of a study by creating their skins, touches and electrodes. Raises `ValueError` for a mesh that
     is too coarse."""
     checked_keys = set()
-    for index in itertools.chain.from_iterable(study.chunks):  # points grouped by shape
-        point = study.points[index]
+    for point_index in itertools.chain.from_iterable(study.chunks):  # points grouped by shape
+        point = study.points[point_index]
         key = (id(point.layout), point.shape)
         if key in checked_keys:
             continue
@@ -100,7 +100,7 @@ def solve_chunk(study: Study, number: int, solved: Callable[[int], None] | None 
     and is divided among the devices of JAX. Exact maps are computed one after the other; after each map but the last,
     `solved` is called with the number of finished maps.
     """
-    points = [study.points[index] for index in study.chunks[number]]
+    points = [study.points[point_index] for point_index in study.chunks[number]]
     shared = _shared_data(study, points[0].shape)
     options = {"scores": study.scores, "num_taxels": study.num_taxels, "threshold": study.threshold}
     if study.exact:
@@ -266,7 +266,7 @@ def _optimality_scores(
     """Compute the optimality scores from linearised voltage changes. In a batch, the Jacobian has been computed
     already, and XLA reuses the Jacobian."""
     model, _ = _model_and_touched_cells(shared, point_data)
-    touches = touches.at_thickness(point_data.thickness)
+    touches = touches.with_thickness(point_data.thickness)
     layout_score_values = layout_scores(model, point_data.conductivity, touches, prior=prior, noise=point_data.noise)
     results = {}
     if "information" in scores:

@@ -72,7 +72,7 @@ def study_contents(study: Study) -> Contents:
         for axis, values in enumerate(np.asarray(grid.places).T):
             _write_array(zarr_group, axes[axis], "place", np.round(1e3 * values, 9).tolist())
         num_points, num_places = len(study.points), len(grid.places)
-        for name, (unit, meaning) in arrays.items():
+        for name, (unit, description) in arrays.items():
             has_place_axis = name == "sensitivity"
             zarr_group.create_array(
                 name,
@@ -81,7 +81,7 @@ def study_contents(study: Study) -> Contents:
                 dtype="float64",
                 fill_value=np.nan,
                 dimension_names=("point", "place") if has_place_axis else ("point",),
-                attributes={"units": unit, "long_name": meaning},
+                attributes={"units": unit, "long_name": description},
             )
 
     attributes = {"coordinates": " ".join([*parameter_values, *axes]), "name": study.name, "study": study.text}

@@ -23,9 +23,9 @@ _MAX_BYTES = 4096
 
 
 @contextlib.contextmanager
-def locked(path: Path, contents: str) -> Iterator[None]:
-    """Context in which no other process writes the store of results at `path`. `contents`: one word for the contents of
-    the store, for messages.
+def lock_store(path: Path, content_name: str) -> Iterator[None]:
+    """Context in which no other process writes the store of results at `path`. `content_name`: one word for the
+    contents of the store, for messages.
 
     The lock is a `flock` on the file `.NAME.lock` beside the store. The system releases the lock when the process ends
     for any reason. The content of the file names the owner, the process that writes the store. If the owner is on
@@ -37,10 +37,10 @@ def locked(path: Path, contents: str) -> Iterator[None]:
     lock_path = path.with_name(f".{path.name}.lock")
     try:
         lock_path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = _acquire(lock_path, path, contents)
+        descriptor = _acquire(lock_path, path, content_name)
     except OSError as error:
         verb = "written" if path.exists() else "made"
-        reason = f"the {contents}'s store cannot be {verb} ({error.strerror})"
+        reason = f"the {content_name}'s store cannot be {verb} ({error.strerror})"
         raise OSError(error.errno, reason, str(path)) from error
     try:
         yield
@@ -50,20 +50,20 @@ def locked(path: Path, contents: str) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _acquire(lock_path: Path, store_path: Path, contents: str) -> int:
+def _acquire(lock_path: Path, store_path: Path, content_name: str) -> int:
     """Open the lock file and acquire the lock. Returns the file descriptor."""
     while True:
         descriptor = os.open(lock_path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
         try:
             is_locked = _try_to_lock(descriptor)
-            if is_locked and not _is_file_at(
+            if is_locked and not _is_current_lock_file(
                 descriptor, lock_path
             ):  # the previous owner has just ended and removed the lock file
                 os.close(descriptor)
                 continue
             owner = _read_owner(descriptor)
-            if is_locked is False or (owner and not _has_ended(owner, certain=is_locked is True)):
-                raise ValueError(_refusal_message(owner, lock_path, store_path, contents))
+            if is_locked is False or (owner and not _has_ended(owner, is_lock_released=is_locked is True)):
+                raise ValueError(_refusal_message(owner, lock_path, store_path, content_name))
             try:
                 _write_owner(descriptor)
             except OSError:  # a full disk
@@ -90,7 +90,7 @@ def _try_to_lock(descriptor: int) -> bool | None:
     return True
 
 
-def _is_file_at(descriptor: int, lock_path: Path) -> bool:
+def _is_current_lock_file(descriptor: int, lock_path: Path) -> bool:
     """Whether the open file `descriptor` is still the file at the path of the lock."""
     try:
         return os.path.samestat(os.fstat(descriptor), lock_path.stat())
@@ -117,10 +117,10 @@ def _read_owner(descriptor: int) -> dict:
     return owner if isinstance(owner, dict) else {}
 
 
-def _has_ended(owner: dict, *, certain: bool) -> bool:
-    """Whether the process that owns the lock file has ended. `certain`: whether the owner is known not to hold the
-    file's lock any more, which is conclusive only for an owner on this machine."""
-    return _is_on_this_machine(owner) and (certain or not is_alive(owner.get("pid")))
+def _has_ended(owner: dict, *, is_lock_released: bool) -> bool:
+    """Whether the process that owns the lock file has ended. `is_lock_released`: whether the owner is known not to hold
+    the file's lock any more, which is conclusive only for an owner on this machine."""
+    return _is_on_this_machine(owner) and (is_lock_released or not is_alive(owner.get("pid")))
 
 
 def _is_on_this_machine(owner: dict) -> bool:
@@ -129,16 +129,16 @@ def _is_on_this_machine(owner: dict) -> bool:
     return owner.get("host") == platform.node() or (bool(boot_identifier()) and owner.get("boot") == boot_identifier())
 
 
-def _refusal_message(owner: dict, lock_path: Path, store_path: Path, contents: str) -> str:
+def _refusal_message(owner: dict, lock_path: Path, store_path: Path, content_name: str) -> str:
     owner_text = f"process {describe(owner['pid'])}" if "pid" in owner else "another process"
     since_text = f" since {describe(owner['since']).strip(chr(39))}" if "since" in owner else ""
     if not owner or (_is_on_this_machine(owner) and fcntl is not None):
         owner_text = "this process" if owner.get("pid") == os.getpid() else owner_text
-        remedy = f"wait until it ends, or stop it, then resume the {contents}."
+        remedy = f"wait until it ends, or stop it, then resume the {content_name}."
         return f"{store_path} is being written by {owner_text}{since_text}; {remedy}"
     machine = "this machine" if _is_on_this_machine(owner) else describe(owner.get("host"))
     return (
         f"{store_path} is being written by {owner_text} on {machine}{since_text}, or was when that was killed: from "
         f"here this cannot be seen. Where it still runs, wait; where it does not, delete {lock_path} and resume the "
-        f"{contents}."
+        f"{content_name}."
     )

@@ -72,17 +72,17 @@ _Result = TypeVar("_Result")
 
 
 def solve_on_cluster(
-    client: Any, solve: Callable[[Any, int], _Result], work: Any, numbers: Iterable[int]
+    client: Any, solve: Callable[[Any, int], _Result], shared_data: Any, numbers: Iterable[int]
 ) -> Iterator[tuple[int, _Result]]:
-    """Yield the number of each chunk with its results `solve(work, number)`, in the order in which the workers of a
-    `dask.distributed.Client` complete the chunks. Chunks of a lost worker are solved again."""
+    """Yield the number of each chunk with its results `solve(shared_data, number)`, in the order in which the workers
+    of a `dask.distributed.Client` complete the chunks. Chunks of a lost worker are solved again."""
     distributed = optional("distributed", "a cluster")
-    # The data `work` is sent once, as a task, so that it is sent again if the only worker that has it is lost.
-    # Scattered data would then be lost, and sending `work` with every chunk would transfer a layer of 70 MB a thousand
-    # times.
+    # `shared_data` is sent once, as a task, so that it is sent again if the only worker that has it is lost.
+    # Scattered data would then be lost, and sending `shared_data` with every chunk would transfer a layer of 70 MB a
+    # thousand times.
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sending large graph")
-        work_future = client.submit(_return_unchanged, work, pure=False)
+        work_future = client.submit(_return_unchanged, shared_data, pure=False)
     futures = {client.submit(solve, work_future, number, pure=False, retries=2): number for number in numbers}
     try:
         for future, results in distributed.as_completed(futures, with_results=True):
@@ -92,8 +92,8 @@ def solve_on_cluster(
         client.cancel([work_future, *futures])
 
 
-def _return_unchanged(work: Any) -> Any:
-    return work
+def _return_unchanged(data: Any) -> Any:
+    return data
 
 
 def run_study(

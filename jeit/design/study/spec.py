@@ -92,14 +92,14 @@ class Point:
         return {
             "layout": self.layout.name,
             "electrodes": self.layout.num_electrodes,
-            "diameter_mm": _without_rounding(1e3 * np.mean(self.layout.diameters)),
-            "contact_impedance_ohm_m2": _without_rounding(np.mean(np.asarray(self.layout.contact_impedance))),
-            "thickness_mm": _without_rounding(1e3 * self.thickness),
+            "diameter_mm": _remove_rounding_error(1e3 * np.mean(self.layout.diameters)),
+            "contact_impedance_ohm_m2": _remove_rounding_error(np.mean(np.asarray(self.layout.contact_impedance))),
+            "thickness_mm": _remove_rounding_error(1e3 * self.thickness),
             "conductivity_S_per_m": self.conductivity,
             "protocol": self.protocol,
             "pairs": self.pairs,
             "noise_V": self.noise,
-            "cell_mm": _without_rounding(1e3 * self.cell_size),
+            "cell_mm": _remove_rounding_error(1e3 * self.cell_size),
         }
 
 
@@ -157,17 +157,17 @@ class Study:
     def fingerprint(self) -> str:
         """SHA-256 hash of everything that determines the results, without comments and the study's name."""
         outline_values = [self.surface] if isinstance(self.outline, Triangles) else [*map(float, self.outline.extent)]
-        content = [_VERSION, *outline_values, type(self.indentation).__name__]
-        content += [*map(float, vars(self.indentation).values()), self.columns, self.rows, self.current]
-        content += [self.contrast, self.exact, *self.scores, self.num_taxels, self.threshold, self.correlation]
-        content += [self.seed, self.chunk_points]
+        hashed_values = [_VERSION, *outline_values, type(self.indentation).__name__]
+        hashed_values += [*map(float, vars(self.indentation).values()), self.columns, self.rows, self.current]
+        hashed_values += [self.contrast, self.exact, *self.scores, self.num_taxels, self.threshold, self.correlation]
+        hashed_values += [self.seed, self.chunk_points]
         for point in self.points:
-            content += [point.coordinates, point.layers]
+            hashed_values += [point.coordinates, point.layers]
             # The hash omits positions of built-in layouts, since their last digits depend on the compilation.
             if is_layout_file(point.layout.name):
                 arrays = (point.layout.centres, point.layout.diameters, point.layout.contact_impedance)
-                content += [(np.round(array, 12) + 0.0).tolist() for array in map(np.asarray, arrays)]
-        return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+                hashed_values += [(np.round(array, 12) + 0.0).tolist() for array in map(np.asarray, arrays)]
+        return hashlib.sha256(json.dumps(hashed_values).encode()).hexdigest()
 
     def __eq__(self, other) -> bool:
         return isinstance(other, Study) and self.fingerprint == other.fingerprint
@@ -422,7 +422,7 @@ def _to_metres(lengths: list[float]) -> list[float]:
     return [1e-3 * length for length in lengths]
 
 
-def _without_rounding(value) -> float:
+def _remove_rounding_error(value) -> float:
     """Round `value` to 12 digits, which removes rounding errors of unit conversion."""
     return float(f"{float(value):.12g}")
 

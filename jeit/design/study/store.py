@@ -31,7 +31,7 @@ import numpy as np
 from jeit.arguments import check_kind
 from jeit.arguments.extras import optional
 from jeit.design.study.contents import Contents, study_contents
-from jeit.design.study.lock import locked
+from jeit.design.study.lock import lock_store
 from jeit.design.study.spec import Study
 
 # Codecs allowed in a store, which only encode or compress bytes. Sharding is excluded, since it contains further
@@ -67,30 +67,30 @@ def find_danger(path: Path) -> str | None:
             if name in _FORMAT_2_FILES:
                 return f"'{entry.relative_to(path)}' is of Zarr's format 2, which jeit does not write"
     for file in path.rglob(_METADATA_FILE):
-        content = _read_json_object(file)  # a file that Zarr cannot read is damaged, but not dangerous
-        for location, node in [] if content is None else _metadata_nodes(content, str(file.relative_to(path))):
+        metadata = _read_json_object(file)  # a file that Zarr cannot read is damaged, but not dangerous
+        for location, node in [] if metadata is None else _metadata_nodes(metadata, str(file.relative_to(path))):
             reason = _find_node_danger(node)
             if reason:
                 return f"{location} {reason}"
     return None
 
 
-def find_damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
-    """Describe the first difference between a store and a store with the arrays `expected` (by name); None if there is
-    no difference. Raises `OSError` for files that cannot be read."""
-    content = _read_json_object(path / _METADATA_FILE)
-    if content is None:
+def find_damage(path: Path, expected_arrays: Mapping[str, ArrayShape]) -> str | None:
+    """Describe the first difference between a store and a store with the arrays `expected_arrays` (by name); None if
+    there is no difference. Raises `OSError` for files that cannot be read."""
+    metadata = _read_json_object(path / _METADATA_FILE)
+    if metadata is None:
         return _UNREADABLE_METADATA
     array_names = {folder.name for folder in path.iterdir() if folder.is_dir()}
-    if array_names != set(expected):
-        return f"its arrays are not those of its contents: {_short_text(array_names ^ set(expected))}"
-    if content.get("zarr_format") != 3 or content.get("node_type") != "group":
+    if array_names != set(expected_arrays):
+        return f"its arrays are not those of its contents: {_short_text(array_names ^ set(expected_arrays))}"
+    if metadata.get("zarr_format") != 3 or metadata.get("node_type") != "group":
         return "it is no group of Zarr's format 3"
-    consolidated = content.get("consolidated_metadata")
+    consolidated = metadata.get("consolidated_metadata")
     consolidated_nodes = consolidated.get("metadata") if isinstance(consolidated, dict) else None
-    if not isinstance(consolidated_nodes, dict) or set(consolidated_nodes) != set(expected):
+    if not isinstance(consolidated_nodes, dict) or set(consolidated_nodes) != set(expected_arrays):
         return "it does not name the arrays of its contents"
-    for name, array in expected.items():
+    for name, array in expected_arrays.items():
         if [*(path / name).rglob(_METADATA_FILE)] != [path / name / _METADATA_FILE]:
             return f"array '{name}' has not one {_METADATA_FILE}"
         array_node = _read_json_object(path / name / _METADATA_FILE)
@@ -118,26 +118,26 @@ def _chunk_damage(folder: Path, array: ArrayShape) -> str | None:
     return None
 
 
-def _unpacked_size(beginning: bytes, size: int) -> int | None:
-    """Unpacked size in bytes of a chunk, from its `beginning` and its `size` on disk: as stated in a zstd frame (RFC
+def _unpacked_size(first_bytes: bytes, size: int) -> int | None:
+    """Unpacked size in bytes of a chunk, from its `first_bytes` and its `size` on disk: as stated in a zstd frame (RFC
     8878) or a blosc header, otherwise `size` itself. None if a frame does not state its size."""
-    if beginning.startswith(b"\x28\xb5\x2f\xfd") and len(beginning) > 5:
-        descriptor = beginning[4]
+    if first_bytes.startswith(b"\x28\xb5\x2f\xfd") and len(first_bytes) > 5:
+        descriptor = first_bytes[4]
         is_single_segment = descriptor >> 5 & 1
         size_start = 5 + (1 - is_single_segment) + (0, 1, 2, 4)[descriptor & 3]
         num_size_bytes = (is_single_segment, 2, 4, 8)[descriptor >> 6]
-        content_size = int.from_bytes(beginning[size_start : size_start + num_size_bytes], "little")
+        content_size = int.from_bytes(first_bytes[size_start : size_start + num_size_bytes], "little")
         return content_size + (256 if num_size_bytes == 2 else 0) if num_size_bytes else None
-    if beginning[:1] == b"\x02" and len(beginning) >= 16:
-        return max(size, int.from_bytes(beginning[4:8], "little"))
+    if first_bytes[:1] == b"\x02" and len(first_bytes) >= 16:
+        return max(size, int.from_bytes(first_bytes[4:8], "little"))
     return size
 
 
-def _metadata_nodes(content: Any, location: str) -> Iterator[tuple[str, Any]]:
-    """Yield the location and the metadata of every group and array that `content` describes, including consolidated
+def _metadata_nodes(metadata: Any, location: str) -> Iterator[tuple[str, Any]]:
+    """Yield the location and the metadata of every group and array that `metadata` describes, including consolidated
     metadata at any depth."""
-    yield f"'{location}'", content
-    consolidated = content.get("consolidated_metadata") if isinstance(content, dict) else None
+    yield f"'{location}'", metadata
+    consolidated = metadata.get("consolidated_metadata") if isinstance(metadata, dict) else None
     nested_nodes = consolidated.get("metadata") if isinstance(consolidated, dict) else None
     for name, node in (nested_nodes if isinstance(nested_nodes, dict) else {}).items():
         yield from _metadata_nodes(node, f"{location}: {name}")
@@ -161,16 +161,16 @@ def _find_node_danger(node: Any) -> str | None:
     )
 
 
-def _find_node_damage(node: Any, expected: ArrayShape) -> str | None:
+def _find_node_damage(node: Any, array_shape: ArrayShape) -> str | None:
     grid = node.get("chunk_grid")
     configuration = grid.get("configuration") if isinstance(grid, dict) and grid.get("name") == "regular" else None
     chunks = configuration.get("chunk_shape") if isinstance(configuration, dict) else None
     if node.get("zarr_format") != 3 or node.get("node_type") != "array":
         return "is no array of Zarr's format 3"
-    if node.get("shape") != [*expected.shape] or chunks != [*expected.chunks]:
-        return f"is {node.get('shape')} in chunks of {chunks}, not {[*expected.shape]} in {[*expected.chunks]}"
-    if node.get("data_type") != expected.data_type:
-        return f"is of {node.get('data_type')}, not {expected.data_type}"
+    if node.get("shape") != [*array_shape.shape] or chunks != [*array_shape.chunks]:
+        return f"is {node.get('shape')} in chunks of {chunks}, not {[*array_shape.shape]} in {[*array_shape.chunks]}"
+    if node.get("data_type") != array_shape.data_type:
+        return f"is of {node.get('data_type')}, not {array_shape.data_type}"
     return None
 
 
@@ -282,14 +282,14 @@ class Store:
             first_row = last_row
 
     def _mark_finished(self, number: int, checksum: str) -> None:
-        content = _read_json(self.path)
-        finished = content["attributes"]["finished"] | {str(number): checksum}
-        content["attributes"]["finished"] = dict(sorted(finished.items(), key=lambda item: int(item[0])))
+        metadata = _read_json(self.path)
+        finished_checksums = metadata["attributes"]["finished"] | {str(number): checksum}
+        metadata["attributes"]["finished"] = dict(sorted(finished_checksums.items(), key=lambda item: int(item[0])))
         # The temporary file is beside the store, since Zarr would not recognise a file left behind inside the store.
         temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.tmp")
         try:
             with open(temporary, "w", encoding="utf-8") as file:
-                json.dump(content, file, indent=1, ensure_ascii=False)
+                json.dump(metadata, file, indent=1, ensure_ascii=False)
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(temporary, self.path / "zarr.json")
@@ -309,11 +309,11 @@ class Store:
         """Open the whole store as an `xarray.Dataset`, whose values are read from disk when they are needed."""
         return optional("xarray", _EXTRA_PURPOSE).open_zarr(str(self.path), chunks=None, zarr_format=3)
 
-    def _check(self, expected: Mapping[str, ArrayShape]) -> None:
+    def _check(self, expected_arrays: Mapping[str, ArrayShape]) -> None:
         """Check the metadata before Zarr opens the store. Raises `ValueError` if the store is dangerous or damaged."""
         try:
             danger = find_danger(self.path)
-            damage = None if danger else find_damage(self.path, expected)
+            damage = None if danger else find_damage(self.path, expected_arrays)
         except OSError as error:
             raise self._damage_error(error) from None
         if danger:
@@ -330,12 +330,12 @@ class Store:
         cannot be read.
         """
         try:
-            content = _read_json(self.path)
+            metadata = _read_json(self.path)
         except (FileNotFoundError, NotADirectoryError):
             return {}
         except (OSError, ValueError) as error:
             raise self._damage_error(error) from None
-        attributes = content.get("attributes") if isinstance(content, dict) else None
+        attributes = metadata.get("attributes") if isinstance(metadata, dict) else None
         if not isinstance(attributes, dict) or "finished" not in attributes:
             return {}
         if not all(isinstance(attributes.get(name), dict) for name in ("finished", "versions")):
@@ -361,7 +361,7 @@ def writing(work: Study | Contents, path: str | Path) -> Iterator[Store]:
     check_kind("path", path, (str, os.PathLike), _PATH_DESCRIPTION)
     contents = work if isinstance(work, Contents) else study_contents(work)
     path = Path(path)
-    with locked(path, contents.kind):
+    with lock_store(path, contents.kind):
         _remove_temporary_stores(path)
         store = Store(contents, path)
         for partial_file in path.rglob("*.partial"):  # temporary files of Zarr
@@ -418,8 +418,8 @@ def _store_shapes(zarr: ModuleType, contents: Contents) -> dict[str, ArrayShape]
 def _consecutive_runs(points: Sequence[int]) -> list[slice]:
     """Group numbers of points into slices of consecutive numbers."""
     point_numbers = np.asarray(points)
-    ends = np.flatnonzero(np.diff(point_numbers) != 1) + 1
-    return [slice(int(run[0]), int(run[-1]) + 1) for run in np.split(point_numbers, ends)]
+    end_indices = np.flatnonzero(np.diff(point_numbers) != 1) + 1
+    return [slice(int(run[0]), int(run[-1]) + 1) for run in np.split(point_numbers, end_indices)]
 
 
 def _create_store(zarr: ModuleType, contents: Contents, path: Path) -> None:

@@ -328,7 +328,7 @@ class PressedSkin(Module):
         """Exact changes (n, M), volts, of the voltages due to n touches of similar cost."""
         if self._resting_skin is None:
             return np.asarray(touch_changes(self.model, self.conductivity, touched))
-        return self._resting_skin.changes_together(touched)
+        return self._resting_skin.changes_of_equal_touches(touched)
 
     @cached_property
     def _resting_skin(self) -> RestingSkin | None:

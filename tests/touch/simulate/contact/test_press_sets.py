@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from studies import contents, in_another_process
 
-from jeit.design.study.lock import locked
+from jeit.design.study.lock import lock_store
 from jeit.design.study.store import Store
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
@@ -137,7 +137,7 @@ def test_a_finished_set_is_not_simulated_again(presses, whole, solved):
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
 def test_one_process_at_a_time_simulates_a_set(presses, whole):
     with (
-        locked(whole, "press set"),
+        lock_store(whole, "press set"),
         pytest.raises(ValueError, match=r"whole\.zarr is being written by this process .* resume the press set"),
     ):
         simulate_presses(presses, whole)
