@@ -201,10 +201,10 @@ class AttenuatedInverseSquare(AbstractDecay):
         return (*low[0], high[0][1]), (*low[1], high[1][1])
 
 
-def column(values: Float[Array, " M"], broadcast_to: Array) -> Array:
+def column(values: Float[Array, " M"], other_array: Array) -> Array:
     """Reshape `values` (M,), one per microphone, so that the values broadcast along the first axis of
-    `broadcast_to`."""
-    return values.reshape((-1,) + (1,) * (broadcast_to.ndim - 1))
+    `other_array`."""
+    return values.reshape((-1,) + (1,) * (other_array.ndim - 1))
 
 
 def _stack_logarithms(*parameters: Float[Array, " M"]) -> Float[Array, "K M"]:

@@ -71,10 +71,12 @@ class IntensityNoise(Module):
         )
         return cls(*(as_array(values) for values in (floor, deviations, 4 * floors / degrees, bounded_errors)))
 
-    def variance(self, received: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
-        """Variance (M, …) of the power minus the noise floor, for the expected power `received` (M, …)."""
-        relative, cross, deviation = (column(x, received) for x in (self.relative, self.cross, self.deviation))
-        return (relative**2 * received + cross) * received + deviation**2
+    def variance(self, received_power: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
+        """Variance (M, …) of the power minus the noise floor, for the expected power `received_power` (M, …)."""
+        relative, cross_coefficients, deviation = (
+            column(x, received_power) for x in (self.relative, self.cross, self.deviation)
+        )
+        return (relative**2 * received_power + cross_coefficients) * received_power + deviation**2
 
     def level(self, power: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
         """Level y = log(power + floor) for the `power` (M, …) minus the noise floor. The sum is bounded below by 0.05
@@ -82,9 +84,9 @@ class IntensityNoise(Module):
         floor, xp = column(self.floor, power), namespace(self, power)
         return xp.log(xp.maximum(power + floor, 0.05 * floor))
 
-    def level_variance(self, received: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
-        """Variance (M, …) of the level y, for the expected power `received` (M, …)."""
-        return self.variance(received) / (received + column(self.floor, received)) ** 2
+    def level_variance(self, received_power: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
+        """Variance (M, …) of the level y, for the expected power `received_power` (M, …)."""
+        return self.variance(received_power) / (received_power + column(self.floor, received_power)) ** 2
 
 
 def noise_from_negative_powers(power: np.ndarray, usable: np.ndarray) -> np.ndarray:
@@ -127,8 +129,8 @@ class MicrophoneArray(Module):
         sources = [unknowns[k : k + 3] for k in range(0, len(unknowns), 3)]
         xp = namespace(self, unknowns)
         powers = [xp.exp(source[2]) * self.response(source[:2]) for source in sources]
-        received = functools.reduce(operator.add, powers)
-        return xp.log(received + self.noise.floor[:, None]), self.noise.level_variance(received)
+        received_power = functools.reduce(operator.add, powers)
+        return xp.log(received_power + self.noise.floor[:, None]), self.noise.level_variance(received_power)
 
 
 def check_array(microphone_array: MicrophoneArray) -> None:

@@ -118,11 +118,11 @@ def report_track(located_touches: LocatedTouches) -> dict[str, Any]:
                 "greatest_strength": np.nanmax(strength),
             }
         )
-    second = np.flatnonzero(locations.status == LocationStatus.TWO_TOUCHES)
+    frames_with_two_touches = np.flatnonzero(locations.status == LocationStatus.TWO_TOUCHES)
     microphones = []
-    for number, (fault, used) in enumerate(zip(locations.faults, locations.used.T, strict=True)):
-        share = float(used.mean())
-        microphones.append({"microphone": number, "used_share": share, "fault": fault or None})
+    for number, (fault, is_used) in enumerate(zip(locations.faults, locations.used.T, strict=True)):
+        used_fraction = float(is_used.mean())
+        microphones.append({"microphone": number, "used_share": used_fraction, "fault": fault or None})
     return as_plain_values(
         {
             "recording": locations.name,
@@ -141,7 +141,7 @@ def report_track(located_touches: LocatedTouches) -> dict[str, Any]:
                     "positions_m": [locations.position[frame], locations.second[frame]],
                     "strengths": [locations.strength[frame], locations.second_strength[frame]],
                 }
-                for frame in second
+                for frame in frames_with_two_touches
             ],
             "microphones": microphones,
             "notes": list(locations.notes),
@@ -208,8 +208,8 @@ def _column_names(dimension: int) -> list[str]:
 def _track_rows(locations: Locations, track: Track):
     dimension = locations.position.shape[1]
     touch_numbers = np.zeros(len(locations.times), int)
-    for index, touch in enumerate(track.touches, 1):
-        touch_numbers[touch.first : touch.last + 1] = index
+    for touch_number, touch in enumerate(track.touches, 1):
+        touch_numbers[touch.first : touch.last + 1] = touch_number
     frame_deviations, track_deviations = (
         np.sqrt(np.diagonal(estimate.covariance, axis1=1, axis2=2)) for estimate in (locations, track)
     )

@@ -80,16 +80,16 @@ class CurvedSurface(AbstractSurface):
 
     def place(self, chart):
         """Points (3, …) of the surface in metres from chart coordinates (2, …)."""
-        flat = chart.reshape(2, -1)
-        squared = namespace(self, chart).sum((flat[:, None] - self.knots.T[:, :, None]) ** 2, axis=0)
-        height = self.weights @ _thin_plate(squared) + self.affine[0] + self.affine[1:] @ flat
-        points = self.origin[:, None] + self.axes @ flat + self.normal[:, None] * height
+        flat_chart = chart.reshape(2, -1)
+        squared = namespace(self, chart).sum((flat_chart[:, None] - self.knots.T[:, :, None]) ** 2, axis=0)
+        height = self.weights @ _thin_plate(squared) + self.affine[0] + self.affine[1:] @ flat_chart
+        points = self.origin[:, None] + self.axes @ flat_chart + self.normal[:, None] * height
         return points.reshape(3, *chart.shape[1:])
 
     def project(self, points):
         """Chart coordinates (2, …) of points (3, …) in metres, projected along the normal of the chart's plane."""
-        flat = points.reshape(3, -1) - self.origin[:, None]
-        return (self.axes.T @ flat).reshape(2, *points.shape[1:])
+        flat_points = points.reshape(3, -1) - self.origin[:, None]
+        return (self.axes.T @ flat_points).reshape(2, *points.shape[1:])
 
     @property
     def dimension(self):
@@ -111,8 +111,8 @@ def make_surface(outline: Domain | ArrayLike, points: ArrayLike | None = None) -
     try:
         vertices = np.asarray(outline, float)
     except (TypeError, ValueError):
-        expected = "an outline, such as Disk(0.1), or vertices (K, 2) or (K, 3) in metres"
-        raise ValueError(f"outline must be {expected}; it is {describe(outline)}.") from None
+        requirement = "an outline, such as Disk(0.1), or vertices (K, 2) or (K, 3) in metres"
+        raise ValueError(f"outline must be {requirement}; it is {describe(outline)}.") from None
     if vertices.ndim != 2 or vertices.shape[1] not in (2, 3) or len(vertices) < 3:
         raise ValueError(f"outline: give at least three vertices (K, 2) or (K, 3) in metres; got {vertices.shape}.")
     if vertices.shape[1] == 2:
@@ -129,7 +129,7 @@ def bounding_box(surface: AbstractSurface) -> tuple[Float[Array, " 2"], Float[Ar
     return vertices.min(axis=0), vertices.max(axis=0)
 
 
-def to_space(
+def to_three_dimensions(
     surface: AbstractSurface, chart: Float[Array, "2 F"], covariance: Float[Array, "2 2 F"]
 ) -> tuple[Float[Array, "F d"], Float[Array, "F d d"]]:
     """Transform positions (2, F) and covariances (2, 2, F) in the chart to positions (F, d) and covariances (F, d, d)

@@ -96,12 +96,12 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
     num_frames, dimension = locations.position.shape
     times, has_position = locations.times, locations.has_position
     position, velocity = np.full((num_frames, dimension), np.nan), np.full((num_frames, dimension), np.nan)
-    covariance, rejected = np.full((num_frames, dimension, dimension), np.nan), np.zeros(num_frames, bool)
+    covariance, is_rejected = np.full((num_frames, dimension, dimension), np.nan), np.zeros(num_frames, bool)
     intervals = _touch_intervals(times, has_position, gap)
     densities = _DENSITIES if acceleration is None else np.array([acceleration])
     touches = []
-    for first, last in intervals:
-        touch_frames = slice(first, last + 1)
+    for first_frame, last_frame in intervals:
+        touch_frames = slice(first_frame, last_frame + 1)
         measured = np.where(has_position[touch_frames, None], locations.position[touch_frames], 0.0)
         measured_covariance = (
             np.where(has_position[touch_frames, None, None], locations.covariance[touch_frames], np.eye(dimension))
@@ -110,16 +110,18 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
         # A minimum variance, the square of a tenth of a micrometre, is added, since covariances on a curved surface are
         # singular.
         measured_covariance = measured_covariance + 1e-14 * np.eye(dimension)
-        time_steps = np.diff(times[touch_frames], prepend=times[first])
+        time_steps = np.diff(times[touch_frames], prepend=times[first_frame])
         states, errors, is_accepted = _smooth_touch(
             time_steps, measured, measured_covariance, has_position[touch_frames], densities
         )
         position[touch_frames], velocity[touch_frames] = states[:, :dimension], states[:, dimension:]
         covariance[touch_frames] = errors[:, :dimension, :dimension]
-        rejected[touch_frames] = has_position[touch_frames] & ~is_accepted
+        is_rejected[touch_frames] = has_position[touch_frames] & ~is_accepted
         length = float(np.linalg.norm(np.diff(position[touch_frames], axis=0), axis=1).sum())
-        touches.append(Touch(float(times[first]), float(times[last]), int(first), int(last), length))
-    return Track(np.asarray(times), position, covariance, velocity, tuple(touches), rejected)
+        touches.append(
+            Touch(float(times[first_frame]), float(times[last_frame]), int(first_frame), int(last_frame), length)
+        )
+    return Track(np.asarray(times), position, covariance, velocity, tuple(touches), is_rejected)
 
 
 def _touch_intervals(times, has_position, gap: float) -> list[tuple[int, int]]:
@@ -128,10 +130,14 @@ def _touch_intervals(times, has_position, gap: float) -> list[tuple[int, int]]:
     located_indices = np.flatnonzero(has_position)
     if not located_indices.size:
         return []
-    breaks = np.flatnonzero(np.diff(times[located_indices]) > gap)
-    firsts, lasts = np.concatenate([[0], breaks + 1]), np.concatenate([breaks, [located_indices.size - 1]])
+    gap_indices = np.flatnonzero(np.diff(times[located_indices]) > gap)
+    start_indices, end_indices = (
+        np.concatenate([[0], gap_indices + 1]),
+        np.concatenate([gap_indices, [located_indices.size - 1]]),
+    )
     return [
-        (int(located_indices[first]), int(located_indices[last])) for first, last in zip(firsts, lasts, strict=True)
+        (int(located_indices[start]), int(located_indices[end]))
+        for start, end in zip(start_indices, end_indices, strict=True)
     ]
 
 
@@ -158,8 +164,8 @@ def _smooth_positions(time_steps, measured, measured_covariance, has_position, d
     of accepted positions.
     """
     xp, dimension = namespace(measured), measured.shape[1]
-    score, filtered = _kalman_filter(time_steps, measured, measured_covariance, has_position, densities)
-    best_index = xp.argmax(score)
+    log_likelihoods, filtered = _kalman_filter(time_steps, measured, measured_covariance, has_position, densities)
+    best_index = xp.argmax(log_likelihoods)
     mean, covariance, predicted_mean, predicted_covariance, is_accepted = (array[:, best_index] for array in filtered)
 
     def smooth_step(next_state, frame_data):
@@ -209,7 +215,9 @@ def _kalman_filter(step, measured, measured_covariance, has_position, densities)
         is_accepted = is_measured & (squared_distance < max_distance)
         log_determinant = xp.log(xp.linalg.det(innovation_covariance))
         # A rejected position lowers the likelihood of a density as much as a position at the limit of acceptance.
-        score = xp.where(is_measured, -0.5 * (xp.minimum(squared_distance, max_distance) + log_determinant), 0.0)
+        log_likelihood = xp.where(
+            is_measured, -0.5 * (xp.minimum(squared_distance, max_distance) + log_determinant), 0.0
+        )
         new_mean = xp.where(is_accepted[:, None], mean + xp.einsum("qij,qj->qi", gain, innovation), mean)
         # The Joseph form of the covariance update is accurate even for nearly exact positions, for which the difference
         # in the usual form is lost to rounding.
@@ -220,7 +228,7 @@ def _kalman_filter(step, measured, measured_covariance, has_position, densities)
         new_covariance = xp.where(
             is_accepted[:, None, None], (updated_covariance + xp.swapaxes(updated_covariance, 1, 2)) / 2, covariance
         )
-        return (new_mean, new_covariance), (score, new_mean, new_covariance, mean, covariance, is_accepted)
+        return (new_mean, new_covariance), (log_likelihood, new_mean, new_covariance, mean, covariance, is_accepted)
 
     initial_mean = xp.concatenate([measured[0], xp.zeros(dimension)])
     initial_variances = xp.concatenate(
@@ -231,8 +239,10 @@ def _kalman_filter(step, measured, measured_covariance, has_position, densities)
         xp.tile(initial_mean, (num_densities, 1)),
         xp.tile(xp.diag(initial_variances), (num_densities, 1, 1)),
     )
-    _, (score, *filtered) = scan(filter_step, initial_state, (step, measured, measured_covariance, has_position))
-    return xp.sum(score, axis=0), filtered
+    _, (log_likelihoods, *filtered) = scan(
+        filter_step, initial_state, (step, measured, measured_covariance, has_position)
+    )
+    return xp.sum(log_likelihoods, axis=0), filtered
 
 
 def _transition_matrix(step, dimension: int) -> Float[Array, "s s"]:

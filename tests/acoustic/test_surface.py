@@ -13,7 +13,7 @@ from jeit.acoustic.surface import (
     chart_grid,
     longer_side,
     outline_sides,
-    to_space,
+    to_three_dimensions,
 )
 from jeit.mesh import Disk, Polygon, Rectangle
 from jeit_solvers.engines import on_device, on_host
@@ -204,10 +204,12 @@ def test_slopes_of_a_curved_surface(skin):
     @jax.jit
     def compiled(at):
         made = on_device(skin)
-        return jax.jvp(made.place, (at,), (direction,)), to_space(made, at, covariance)
+        return jax.jvp(made.place, (at,), (direction,)), to_three_dimensions(made, at, covariance)
 
     (place, slope), spread = compiled(at)
-    for mine, theirs in zip((place, *spread), (skin.place(at), *to_space(skin, at, covariance)), strict=True):
+    for mine, theirs in zip(
+        (place, *spread), (skin.place(at), *to_three_dimensions(skin, at, covariance)), strict=True
+    ):
         np.testing.assert_allclose(mine, theirs, rtol=1e-9, atol=1e-15)
     rest = [np.abs(skin.place(at + h * direction) - place - h * slope).max() for h in (1e-3, 1e-4)]
     assert np.log10(float(rest[0] / rest[1])) > 1.8
@@ -219,7 +221,7 @@ def test_covariance_in_space(skin):
     chart = middle(4)
     root = np.random.default_rng(2).normal(size=(4, 2, 2)) * 1e-3
     covariance = root @ root.transpose(0, 2, 1)
-    place, found = to_space(skin, chart, np.asarray(covariance.transpose(1, 2, 0)))
+    place, found = to_three_dimensions(skin, chart, np.asarray(covariance.transpose(1, 2, 0)))
     # The order of summation differs.
     np.testing.assert_allclose(place, skin.place(chart).T, atol=1e-15)
     step = 1e-6

@@ -14,7 +14,12 @@ from jaxtyping import Bool, Float
 
 from jeit.acoustic.calibration.calibration import Calibration
 from jeit.acoustic.calibration.robust_least_squares import TapFit, fit_taps, standard_errors
-from jeit.acoustic.calibration.usable_microphones import LeftOutTaps, check_received, exclude_unusable, locate_left_out
+from jeit.acoustic.calibration.usable_microphones import (
+    LeftOutTaps,
+    check_received,
+    exclude_unusable,
+    locate_held_out_taps,
+)
 from jeit.acoustic.decay import DECAYS, AbstractDecay, find_decay
 from jeit.acoustic.microphones import IntensityNoise, MicrophoneArray, noise_from_negative_powers
 from jeit.acoustic.signal.faults import describe_faults, intensity_faults
@@ -82,9 +87,9 @@ class CalibrationFit(Module):
         errors are unknown."""
         if not self.left_out:
             return ""
-        selected_error, *other_errors = (_distance_text(error) for _, error in self.left_out)
+        selected_error, *other_model_errors = (_distance_text(error) for _, error in self.left_out)
         names = [name for name, _ in self.left_out[1:]]
-        comparison = ", ".join(f"{name} {error}" for name, error in zip(names, other_errors, strict=True))
+        comparison = ", ".join(f"{name} {error}" for name, error in zip(names, other_model_errors, strict=True))
         return f"locates taps left out of the fit to {selected_error}, median" + (
             f" ({comparison})" if comparison else ""
         )
@@ -191,13 +196,13 @@ def fit_each_decay(
             fitted_models[decay_class.name] = _fit_decay_model(decay_class, fit_input)
         except _NoFitError as error:
             rejection_reasons[decay_class.name] = str(error)
-    left_out = {name: fitted.left_out_taps.median for name, fitted in fitted_models.items()} | dict.fromkeys(
+    localisation_errors = {name: fitted.left_out_taps.median for name, fitted in fitted_models.items()} | dict.fromkeys(
         rejection_reasons, np.inf
     )
     fits = {}
     for name, fitted in fitted_models.items():
-        other_errors = tuple(item for item in left_out.items() if item[0] != name)
-        fits[name] = _calibration_fit(taps, fit_input, fitted, ((name, left_out[name]), *other_errors))
+        other_model_errors = tuple(item for item in localisation_errors.items() if item[0] != name)
+        fits[name] = _calibration_fit(taps, fit_input, fitted, ((name, localisation_errors[name]), *other_model_errors))
     return fits, rejection_reasons
 
 
@@ -251,8 +256,8 @@ def _read_taps(taps: Taps, intensity: IntensitySettings | None, place_error: flo
         noise = IntensityNoise.create(power.shape[1], deviation=noise_from_negative_powers(power, usable))
     else:
         settings = intensity if intensity is not None else IntensitySettings()
-        power, floor, freedom, usable, faults = tap_intensities(taps, settings)
-        noise = IntensityNoise.create(power.shape[1], floor=floor, freedom=np.median(freedom))
+        power, floor, degrees_of_freedom, usable, faults = tap_intensities(taps, settings)
+        noise = IntensityNoise.create(power.shape[1], floor=floor, freedom=np.median(degrees_of_freedom))
     usable_power = np.where(usable, power, np.nan).T
     noise_fields = noise, settings is not None, tuple(faults), settings
     return _FitInput(taps.microphones, surface, taps.positions, float(place_error), usable_power, *noise_fields)
@@ -271,7 +276,7 @@ def _fit_decay_model(decay_class: type[AbstractDecay], fit_input: _FitInput) -> 
     )
     initial_use = fit.use.T
     fit, is_usable, reasons, explained = exclude_unusable(fit, fit_input.faults)
-    left_out_taps = locate_left_out(fit, fit_input.microphones, fit_input.surface, fit_input.positions)
+    left_out_taps = locate_held_out_taps(fit, fit_input.microphones, fit_input.surface, fit_input.positions)
     if is_usable.sum() < 3 or (
         is_usable.sum() < _MIN_USABLE_SHARE * has_enough_taps.sum() and not left_out_taps.is_better_than_mean
     ):
@@ -283,9 +288,9 @@ def _fit_decay_model(decay_class: type[AbstractDecay], fit_input: _FitInput) -> 
     return _FittedModel(fit, initial_use, is_usable, reasons, explained, left_out_taps)
 
 
-def _calibration_fit(taps: Taps, fit_input: _FitInput, fitted: _FittedModel, left_out) -> CalibrationFit:
-    """Create the `CalibrationFit` of a fitted decay model. `left_out`: name and localisation error of each decay
-    model."""
+def _calibration_fit(taps: Taps, fit_input: _FitInput, fitted: _FittedModel, localisation_errors) -> CalibrationFit:
+    """Create the `CalibrationFit` of a fitted decay model. `localisation_errors`: name and localisation error of each
+    decay model."""
     fit, is_usable = fitted.fit, fitted.usable
     # Logarithm of the factor by which gains are divided and strengths are multiplied; see `Calibration`.
     log_gain = np.log(np.asarray(fit.kind.from_logarithms(host.asarray(fit.logarithms)).gain))[is_usable].mean()
@@ -305,7 +310,7 @@ def _calibration_fit(taps: Taps, fit_input: _FitInput, fitted: _FittedModel, lef
         _strength_range(strength[is_loud]),
         fitted.left_out_taps.widening,
     )
-    remaining_fields = strength, fit.outlier, fitted.explained, shared, fit.displacement, left_out
+    remaining_fields = strength, fit.outlier, fitted.explained, shared, fit.displacement, localisation_errors
     distance = np.linalg.norm(fit_input.positions[:, None] - microphones, axis=-1)
     return CalibrationFit(calibration, distance, fit_input.power.T, fitted.initial_use, *remaining_fields)
 

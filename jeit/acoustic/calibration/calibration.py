@@ -129,20 +129,20 @@ class Calibration(Module):
             surface["curve"] = {key: _array_to_lists(getattr(microphone_array.surface, key)) for key in _CURVE_FIELDS}
         kind = type(microphone_array.decay)
         microphones = []
-        for index in range(self.num_microphones):
-            parameters = {key: float(getattr(microphone_array.decay, key)[index]) for key in kind.parameters}
-            errors = dict(zip(kind.parameters, self.standard_errors[:, index], strict=True))
+        for microphone_index in range(self.num_microphones):
+            parameters = {key: float(getattr(microphone_array.decay, key)[microphone_index]) for key in kind.parameters}
+            errors = dict(zip(kind.parameters, self.standard_errors[:, microphone_index], strict=True))
             microphones.append(
                 {
-                    "position": _array_to_lists(microphone_array.microphones[index]),
+                    "position": _array_to_lists(microphone_array.microphones[microphone_index]),
                     **parameters,
                     "relative_standard_error": {key: _number_or_none(error) for key, error in errors.items()},
-                    "relative_noise": float(microphone_array.noise.relative[index]),
-                    "noise_floor": float(microphone_array.noise.floor[index]),
-                    "noise_deviation": float(microphone_array.noise.deviation[index]),
-                    "noise_cross": float(microphone_array.noise.cross[index]),
-                    "usable": bool(self.usable[index]),
-                    "reason": self.reasons[index],
+                    "relative_noise": float(microphone_array.noise.relative[microphone_index]),
+                    "noise_floor": float(microphone_array.noise.floor[microphone_index]),
+                    "noise_deviation": float(microphone_array.noise.deviation[microphone_index]),
+                    "noise_cross": float(microphone_array.noise.cross[microphone_index]),
+                    "usable": bool(self.usable[microphone_index]),
+                    "reason": self.reasons[microphone_index],
                 }
             )
         settings = self.intensity
@@ -169,11 +169,11 @@ class Calibration(Module):
             DECAYS[table.decay],
             _surface_from_table(table.surface),
         )
-        for index, microphone in enumerate(microphone_tables):
+        for microphone_index, microphone in enumerate(microphone_tables):
             if len(microphone.position) != surface.dimension:
                 raise ValueError(
-                    f"microphones[{index}].position must be {surface.dimension} coordinates in metres; it has "
-                    f"{len(microphone.position)}."
+                    f"microphones[{microphone_index}].position must be {surface.dimension} coordinates in metres; it "
+                    f"has {len(microphone.position)}."
                 )
             missing_parameters = [key for key in decay_class.parameters if getattr(microphone, key) is None]
             missing_errors = [
@@ -181,7 +181,9 @@ class Calibration(Module):
             ]
             if missing_parameters or missing_errors:
                 key = missing_parameters[0] if missing_parameters else f"relative_standard_error.{missing_errors[0]}"
-                raise ValueError(f"microphones[{index}].{key} is missing; decay is '{decay_class.name}', which has it.")
+                raise ValueError(
+                    f"microphones[{microphone_index}].{key} is missing; decay is '{decay_class.name}', which has it."
+                )
 
         def column(key: str) -> Array:
             return as_array(np.array([getattr(microphone, key) for microphone in microphone_tables]))
@@ -286,8 +288,10 @@ def calibrated_intensities(
     if settings != calibration.intensity:
         if calibration.intensity is None:
             return recorded_intensities
-        note = "band or window are not the calibration's: its decay models may not hold; calibrate with the same."
-        return dataclasses.replace(recorded_intensities, notes=(note,))
+        settings_note = (
+            "band or window are not the calibration's: its decay models may not hold; calibrate with the same."
+        )
+        return dataclasses.replace(recorded_intensities, notes=(settings_note,))
     calibration_floor = np.asarray(calibration.microphone_array.noise.floor)
     ratio = np.where(
         calibration.usable, recorded_intensities.floor / np.where(calibration_floor > 0, calibration_floor, np.inf), 0.0
@@ -296,11 +300,11 @@ def calibrated_intensities(
         f"the noise floor, taken from the quietest windows, is up to {ratio.max():.3g} times the calibration's"
     )
     floor_faults = describe_faults([description if value > _MAX_FLOOR_RATIO else "" for value in ratio])
-    note = (
+    settings_note = (
         f"{floor_faults}. If the recording never pauses, touches count as silence: give a recording of the array "
         "untouched (silence=). If gain, unit, surroundings or microphones have changed, calibrate again."
     )
-    return dataclasses.replace(recorded_intensities, notes=(note,)) if floor_faults else recorded_intensities
+    return dataclasses.replace(recorded_intensities, notes=(settings_note,)) if floor_faults else recorded_intensities
 
 
 def _replace_floor(recorded_intensities: Intensities, silence: Intensities) -> Intensities:

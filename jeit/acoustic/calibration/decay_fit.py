@@ -62,7 +62,7 @@ class DecayProblem(NamedTuple):
         decay = self.decay.from_logarithms(values[: len(self.decay.parameters)])
         return np.asarray(decay.log_response(host.asarray(squared)))
 
-    def expected(
+    def expected_levels(
         self, values: Float[np.ndarray, "P M"], strength: Float[np.ndarray, " T"]
     ) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T"]]:
         """Expected levels m = log(e^s f + N) (M, T), where f is the response and N the noise floor, and the derivatives
@@ -75,9 +75,9 @@ class DecayProblem(NamedTuple):
     ) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T"]]:
         """Levels log(S + N) for the received power S and the noise floor N, and their derivatives with respect to log
         S; `log_received` is log S."""
-        received = np.exp(log_received)
-        total = received + self.floor[:, None]
-        return np.log(total), received / total
+        received_power = np.exp(log_received)
+        total = received_power + self.floor[:, None]
+        return np.log(total), received_power / total
 
     def expand(
         self, values: Float[np.ndarray, "P M"], strength: Float[np.ndarray, " T"]
@@ -113,9 +113,11 @@ def fit_strengths(
 
 
 def _minimise(expand, start, data, bounds) -> np.ndarray:
-    lower, upper = (bound[:, None] for bound in bounds)
-    max_step = np.full_like(lower, _MAX_LOG_STEP)
-    minimum = minimise_small(expand, start, data, lower=lower, upper=upper, largest_step=max_step, max_steps=_MAX_STEPS)
+    lower_bounds, upper_bounds = (bound[:, None] for bound in bounds)
+    max_step = np.full_like(lower_bounds, _MAX_LOG_STEP)
+    minimum = minimise_small(
+        expand, start, data, lower=lower_bounds, upper=upper_bounds, largest_step=max_step, max_steps=_MAX_STEPS
+    )
     return np.asarray(minimum.x)
 
 
@@ -123,16 +125,16 @@ def fit_jointly(
     problem: DecayProblem,
     start: Float[np.ndarray, "P M"],
     strength: Float[np.ndarray, " T"],
-    free: Bool[np.ndarray, "P M"],
+    is_fitted: Bool[np.ndarray, "P M"],
 ) -> tuple[Float[np.ndarray, "P M"], Float[np.ndarray, " T"]]:
-    """Fit the microphones' values in the mask `free` and the strengths of all taps jointly. Returns the values and the
-    logarithms of the strengths."""
+    """Fit the microphones' values in the mask `is_fitted` and the strengths of all taps jointly. Returns the values and
+    the logarithms of the strengths."""
 
     def unpack_unknowns(unknowns):
         return unknowns[: start.size].reshape(start.shape), unknowns[start.size :]
 
     def expand(unknowns, _):
-        cost, system = _normal_equations(problem, *unpack_unknowns(unknowns), free)
+        cost, system = _normal_equations(problem, *unpack_unknowns(unknowns), is_fitted)
 
         def solve_step(damping):
             value_step, strength_step = _solve_step(system, damping)
@@ -155,25 +157,25 @@ def fit_with_bounds(
     problem: DecayProblem,
     start: Float[np.ndarray, "P M"],
     strength: Float[np.ndarray, " T"],
-    received: Bool[np.ndarray, " M"],
+    is_usable: Bool[np.ndarray, " M"],
     bounds: tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]],
 ) -> tuple[Float[np.ndarray, "P M"], Float[np.ndarray, " T"], Bool[np.ndarray, "P M"]]:
     """Fit the microphones' values and the taps' strengths as `fit_jointly` does, with `bounds` on the values.
 
-    `received`: mask of the microphones with usable readings, whose parameters are fitted. Also returns the mask of the
-    parameters that are fixed at a bound. A fixed parameter is released if the cost decreases from the bound towards the
-    interior.
+    `is_usable`: mask of the microphones with usable readings, whose parameters are fitted. Also returns the mask of
+    the parameters that are fixed at a bound. A fixed parameter is released if the cost decreases from the bound towards
+    the interior.
     """
-    lower, upper = (bound[:, None] for bound in bounds)
-    is_fixed = ((start <= lower) | (start >= upper)) & received
+    lower_bounds, upper_bounds = (bound[:, None] for bound in bounds)
+    is_fixed = ((start <= lower_bounds) | (start >= upper_bounds)) & is_usable
     values = start
     for _ in range(_MAX_ACTIVE_SET_STEPS):
-        slope = _normal_equations(problem, values, strength, received & np.ones_like(is_fixed))[1].gradient
-        descends_inwards = np.where(values <= lower, slope < 0, slope > 0)
+        slope = _normal_equations(problem, values, strength, is_usable & np.ones_like(is_fixed))[1].gradient
+        descends_inwards = np.where(values <= lower_bounds, slope < 0, slope > 0)
         is_fixed &= ~descends_inwards
-        fitted_values, strength = fit_jointly(problem, values, strength, ~is_fixed & received)
-        values = np.clip(np.where(np.isfinite(fitted_values), fitted_values, values), lower, upper)
-        is_outside = (values != fitted_values) & ~is_fixed & received
+        fitted_values, strength = fit_jointly(problem, values, strength, ~is_fixed & is_usable)
+        values = np.clip(np.where(np.isfinite(fitted_values), fitted_values, values), lower_bounds, upper_bounds)
+        is_outside = (values != fitted_values) & ~is_fixed & is_usable
         is_fixed |= is_outside
         if not is_outside.any():
             break
@@ -181,17 +183,17 @@ def fit_with_bounds(
 
 
 def log_covariance(
-    problem: DecayProblem, values: Float[np.ndarray, "P M"], strength: Float[np.ndarray, " T"], free, scale
+    problem: DecayProblem, values: Float[np.ndarray, "P M"], strength: Float[np.ndarray, " T"], is_fitted, scale
 ) -> np.ndarray:
     """Covariance (P M, P M) of the fitted values, ordered by parameter and then by microphone.
 
     The weights of the `problem` must be inverse variances. The undetermined common factor of gains and strengths is
-    fixed by the condition `scale` · values = constant, with `scale` (P M,). Entries of values that are not `free` (P,
-    M) are NaN.
+    fixed by the condition `scale` · values = constant, with `scale` (P M,). Entries of values that are not `is_fitted`
+    (P, M) are NaN.
     """
-    schur = _schur_complement(_normal_equations(problem, values, strength, free)[1], 0.0)
+    schur = _schur_complement(_normal_equations(problem, values, strength, is_fitted)[1], 0.0)
     num_parameters, num_microphones = values.shape
-    is_free = np.asarray(free).ravel()
+    is_free = np.asarray(is_fitted).ravel()
     null_direction = np.concatenate([np.ones(num_microphones), np.zeros((num_parameters - 1) * num_microphones)])[
         is_free
     ]
@@ -211,7 +213,7 @@ class _NormalEquations(NamedTuple):
 
     **Fields**: `matrix`: block (M, P, P) of each microphone; `penalty`: matrices (P, M, M) of the penalty, which couple
     the microphones; `coupling`: block (P, M, T) between values and strengths; `tap_matrix`: diagonal (T,) of the
-    strengths; `gradient`, `tap_gradient`: gradients with respect to values (P, M) and strengths (T,); `free`: mask
+    strengths; `gradient`, `tap_gradient`: gradients with respect to values (P, M) and strengths (T,); `is_fitted`: mask
     (P, M) of the fitted values.
     """
 
@@ -221,24 +223,24 @@ class _NormalEquations(NamedTuple):
     tap_matrix: np.ndarray
     gradient: np.ndarray
     tap_gradient: np.ndarray
-    free: np.ndarray
+    is_fitted: np.ndarray
 
 
-def _normal_equations(problem: DecayProblem, values, strengths, free) -> tuple[np.ndarray, _NormalEquations]:
+def _normal_equations(problem: DecayProblem, values, strengths, is_fitted) -> tuple[np.ndarray, _NormalEquations]:
     residual, signal_share, jacobian = problem.expand(values, strengths)
     weight = problem.weight
     penalty = _penalty_matrices(problem)
     penalty_gradient = np.einsum("kmn,kn->km", penalty, values)
-    jacobian = np.where(free[:, :, None], jacobian, 0.0)
+    jacobian = np.where(is_fitted[:, :, None], jacobian, 0.0)
     weighted_jacobian = weight * jacobian
     system = _NormalEquations(
         matrix=np.einsum("kmt,lmt->mkl", weighted_jacobian, jacobian),
-        penalty=penalty * (free[:, :, None] & free[:, None]),
+        penalty=penalty * (is_fitted[:, :, None] & is_fitted[:, None]),
         coupling=weighted_jacobian * signal_share,
         tap_matrix=np.sum(weight * signal_share**2, axis=0),
-        gradient=np.where(free, penalty_gradient, 0.0) - np.sum(weighted_jacobian * residual, axis=-1),
+        gradient=np.where(is_fitted, penalty_gradient, 0.0) - np.sum(weighted_jacobian * residual, axis=-1),
         tap_gradient=-np.sum(weight * signal_share * residual, axis=0),
-        free=free,
+        is_fitted=is_fitted,
     )
     return 0.5 * np.sum(weight * residual**2) + 0.5 * np.sum(values * penalty_gradient), system
 
@@ -246,10 +248,12 @@ def _normal_equations(problem: DecayProblem, values, strengths, free) -> tuple[n
 def _penalty_matrices(problem: DecayProblem) -> Float[np.ndarray, "P M M"]:
     """Matrices (P, M, M) of the penalties Σ_m (v_m − v̄)² / spread², where v̄ is the mean over the microphones with at
     least one reading of nonzero weight, or 0 for displacements."""
-    received = (problem.weight > 0).any(axis=1).astype(float)
-    mean_matrix = np.outer(received, received) / max(received.sum(), 1.0)
+    usable_weights = (problem.weight > 0).any(axis=1).astype(float)
+    mean_matrix = np.outer(usable_weights, usable_weights) / max(usable_weights.sum(), 1.0)
     has_common_value = np.arange(len(problem.spread)) < len(problem.decay.parameters)
-    return (np.diag(received) - has_common_value[:, None, None] * mean_matrix) / problem.spread[:, None, None] ** 2
+    return (np.diag(usable_weights) - has_common_value[:, None, None] * mean_matrix) / problem.spread[
+        :, None, None
+    ] ** 2
 
 
 def _solve_step(system: _NormalEquations, damping):
@@ -259,10 +263,10 @@ def _solve_step(system: _NormalEquations, damping):
     # The step has no component along the undetermined direction, in which all gains increase and all strengths
     # decrease, nor along fixed parameters.
     null_direction = np.concatenate(
-        [np.where(system.free[0], 1.0, 0.0), np.zeros((num_parameters - 1) * num_microphones)]
+        [np.where(system.is_fitted[0], 1.0, 0.0), np.zeros((num_parameters - 1) * num_microphones)]
     )
     mean_diagonal = np.trace(schur) / schur.shape[0] + 1e-300
-    is_fixed = ~system.free.ravel()
+    is_fixed = ~system.is_fitted.ravel()
     schur = schur + mean_diagonal * (
         np.outer(null_direction, null_direction) / num_microphones + np.diag(np.where(is_fixed, 1.0, 1e-14))
     )

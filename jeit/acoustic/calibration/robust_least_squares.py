@@ -36,7 +36,7 @@ _MIN_TAPS = 8
 
 def relative_errors(
     noise: IntensityNoise,
-    received: Float[np.ndarray, "M T"],
+    received_power: Float[np.ndarray, "M T"],
     residual: Float[np.ndarray, "M T"],
     use: Bool[np.ndarray, "M T"],
     inflation: float,
@@ -44,37 +44,40 @@ def relative_errors(
     """Estimate the relative error τ of each microphone from the mean square of its level residuals in excess of the
     variance of additive noise. Outliers are excluded.
 
-    `received`: expected power. `use`: mask of the residuals to use. `inflation`: factor on squared residuals that
+    `received_power`: expected power. `use`: mask of the residuals to use. `inflation`: factor on squared residuals that
     corrects for the number of fitted parameters. Since the excess variance may be zero or negative if there are few
     taps, each estimate is shrunk towards the median over all microphones, with the weight of 20 taps.
     """
-    floor, deviation, cross = (np.asarray(x) for x in (noise.floor, noise.deviation, noise.cross))
-    num_inliers, excess = np.zeros(len(received)), np.zeros(len(received))
-    for k in range(len(received)):
-        is_used = use[k] & (received[k] > 3 * deviation[k])
+    floor, deviation, cross_coefficients = (np.asarray(x) for x in (noise.floor, noise.deviation, noise.cross))
+    num_inliers, excess_errors = np.zeros(len(received_power)), np.zeros(len(received_power))
+    for k in range(len(received_power)):
+        is_used = use[k] & (received_power[k] > 3 * deviation[k])
         if is_used.sum() < 3:
             continue
-        signal, used_residual = received[k, is_used], residual[k, is_used]
+        signal, used_residual = received_power[k, is_used], residual[k, is_used]
         squared_share = (signal / (signal + floor[k])) ** 2
-        additive_variance = (cross[k] * signal + deviation[k] ** 2) / (signal + floor[k]) ** 2
+        additive_variance = (cross_coefficients[k] * signal + deviation[k] ** 2) / (signal + floor[k]) ** 2
         is_inlier = np.abs(used_residual) <= _OUTLIER_DEVIATIONS * max(1.4826 * np.median(np.abs(used_residual)), 1e-15)
         for _ in range(3):
             is_inlier = np.abs(used_residual) <= _OUTLIER_DEVIATIONS * np.sqrt(np.mean(used_residual[is_inlier] ** 2))
         num_inliers[k] = is_inlier.sum()
-        excess[k] = (
+        excess_errors[k] = (
             inflation * np.mean(used_residual[is_inlier] ** 2) - np.mean(additive_variance[is_inlier])
         ) / np.mean(squared_share[is_inlier])
     if not num_inliers.any():
-        return np.full(len(received), 0.5)
-    median_excess = max(float(np.median(excess[num_inliers > 0])), 0.0)
-    shrunk_excess = (num_inliers * np.minimum(excess, 1.0) + _MEDIAN_WEIGHT * median_excess) / (
+        return np.full(len(received_power), 0.5)
+    median_excess = max(float(np.median(excess_errors[num_inliers > 0])), 0.0)
+    shrunk_excess = (num_inliers * np.minimum(excess_errors, 1.0) + _MEDIAN_WEIGHT * median_excess) / (
         num_inliers + _MEDIAN_WEIGHT
     )
     return np.sqrt(np.maximum(shrunk_excess, MIN_RELATIVE_ERROR**2))
 
 
 def additive_deviations(
-    power: Float[np.ndarray, "M T"], received: Float[np.ndarray, "M T"], use: Bool[np.ndarray, "M T"], inflation: float
+    power: Float[np.ndarray, "M T"],
+    received_power: Float[np.ndarray, "M T"],
+    use: Bool[np.ndarray, "M T"],
+    inflation: float,
 ) -> Float[np.ndarray, " M"]:
     """Estimate the additive deviation s of each microphone: the standard deviation of its intensity without a source.
     The estimate is needed if the noise was not measured.
@@ -84,29 +87,31 @@ def additive_deviations(
     estimate is at least half the median over all microphones, since few taps determine the noise poorly, and
     underestimated noise causes false detections.
     """
-    deviation = np.zeros(len(received))
+    deviation = np.zeros(len(received_power))
     trial_shares = np.concatenate([[0.0], np.geomspace(1e-6, 0.5, 18)])
     trial_errors = np.geomspace(MIN_RELATIVE_ERROR, 1.0, 30)
-    for k in range(len(received)):
+    for k in range(len(received_power)):
         if use[k].sum() < _MIN_TAPS:
             continue
-        tap_power, signal = power[k, use[k]], received[k, use[k]]
+        tap_power, signal = power[k, use[k]], received_power[k, use[k]]
         max_power = np.abs(tap_power).max()
         if max_power == 0:
             continue
 
-        def log_likelihood(shares, tap_power=tap_power, signal=signal, max_power=max_power):
+        def negative_log_likelihood(relative_deviations, tap_power=tap_power, signal=signal, max_power=max_power):
             variance = (
-                (trial_errors[:, None, None] * signal) ** 2 + (max_power * shares[:, None]) ** 2 + 1e-30 * max_power**2
+                (trial_errors[:, None, None] * signal) ** 2
+                + (max_power * relative_deviations[:, None]) ** 2
+                + 1e-30 * max_power**2
             )
             ratio = np.minimum(inflation * (tap_power - signal) ** 2 / variance, _OUTLIER_DEVIATIONS**2)
             return np.sum(ratio + np.log(variance), axis=-1).min(axis=0)
 
-        scores = log_likelihood(trial_shares)
+        scores = negative_log_likelihood(trial_shares)
         best_index = int(scores.argmin())
         if scores[best_index] < scores[0] - 6:
             fine_shares = trial_shares[best_index] * np.geomspace(0.5, 2.0, 9)
-            deviation[k] = max_power * fine_shares[log_likelihood(fine_shares).argmin()]
+            deviation[k] = max_power * fine_shares[negative_log_likelihood(fine_shares).argmin()]
     has_enough_taps = use.sum(axis=1) >= _MIN_TAPS
     median_deviation = float(np.median(deviation[has_enough_taps])) if has_enough_taps.any() else 0.0
     return np.where(has_enough_taps, np.maximum(deviation, 0.5 * median_deviation), deviation)
@@ -225,7 +230,7 @@ class TapFit(Module):
 
     def predicted_level(self) -> Float[np.ndarray, "M T"]:
         """Levels (M, T) predicted by the fitted decay models."""
-        return self.problem().expected(self.values, self.strength)[0]
+        return self.problem().expected_levels(self.values, self.strength)[0]
 
 
 def fit_taps(
@@ -241,15 +246,15 @@ def fit_taps(
     displacements. `microphones`, `tap_positions`: given positions in metres; the other arguments are fields of
     `TapFit`."""
     offset = microphones[:, None] - tap_positions
-    extent = float(np.linalg.norm(offset, axis=-1).max())
+    array_size = float(np.linalg.norm(offset, axis=-1).max())
     spacing = float(np.median(KDTree(microphones).query(microphones, k=2)[0][:, 1])) if len(microphones) > 1 else 0.0
     num_displacements = offset.shape[2] if place_error > 0 else 0
-    low, high = kind.bounds(extent)
-    lower, upper = (
+    low, high = kind.bounds(array_size)
+    lower_bounds, upper_bounds = (
         np.array([*low, *[-_MAX_DISPLACEMENT] * num_displacements]),
         np.array([*high, *[_MAX_DISPLACEMENT] * num_displacements]),
     )
-    start = np.asarray(kind.start(spacing if spacing > 0 else extent / 4, len(microphones)).logarithms())
+    start = np.asarray(kind.start(spacing if spacing > 0 else array_size / 4, len(microphones)).logarithms())
     start = np.concatenate([start, np.zeros((num_displacements, len(microphones)))])
     num_shapes, num_taps = len(kind.parameters) - 1, len(tap_positions)
     fit = TapFit(
@@ -259,14 +264,14 @@ def fit_taps(
         power,
         on_host(noise),
         known_noise,
-        values=np.clip(start, lower[:, None], upper[:, None]),
+        values=np.clip(start, lower_bounds[:, None], upper_bounds[:, None]),
         at_bound=np.zeros(start.shape, bool),
         spread=_prior_spread(np.full(num_shapes, _SHARED_SPREAD), np.full(num_displacements, _SHARED_SPREAD)),
         strength=np.zeros(num_taps),
         weight=np.zeros(power.shape),
         outlier=np.zeros(num_taps, bool),
         dropped=np.zeros(len(microphones), bool),
-        bounds=(lower, upper),
+        bounds=(lower_bounds, upper_bounds),
     )
     # The initial strength of a tap is estimated from the loudest microphone only.
     used_power = np.where(fit.use, power, -np.inf)
@@ -295,17 +300,17 @@ def refit_without(fit: TapFit, excluded: Bool[np.ndarray, " M"]) -> TapFit:
 def standard_errors(fit: TapFit) -> Float[np.ndarray, "P M"]:
     """Standard deviations (P, M) of the fitted values, for gains normalised as in a `Calibration`; NaN for values fixed
     at a bound."""
-    free = fit.free
-    if free[0].sum() < 2:
-        return np.full(free.shape, np.nan)
+    is_fitted = fit.free
+    if is_fitted[0].sum() < 2:
+        return np.full(is_fitted.shape, np.nan)
     num_parameters = len(fit.kind.parameters)
 
     def scale(values):
-        return np.where(free[0], np.log(fit.kind.from_logarithms(values[:num_parameters]).gain), 0.0)
+        return np.where(is_fitted[0], np.log(fit.kind.from_logarithms(values[:num_parameters]).gain), 0.0)
 
     gain_gradient = np.ravel(slopes(scale, fit.values)[1])
-    covariance = log_covariance(fit.problem(), fit.values, fit.strength, free, gain_gradient)
-    return np.sqrt(np.maximum(np.diag(covariance), 0)).reshape(free.shape)
+    covariance = log_covariance(fit.problem(), fit.values, fit.strength, is_fitted, gain_gradient)
+    return np.sqrt(np.maximum(np.diag(covariance), 0)).reshape(is_fitted.shape)
 
 
 def _alternate_fits(fit: TapFit, iterations: int, *, update_spread: bool = False) -> TapFit:
@@ -313,10 +318,10 @@ def _alternate_fits(fit: TapFit, iterations: int, *, update_spread: bool = False
     `iterations` iterations. If `update_spread`, the `spread` of the parameters is also re-estimated."""
     for _ in range(iterations):
         previous_values, has_readings = fit.values, np.asarray(fit.usable.any(axis=1))
-        values, strength, at_bound = fit_with_bounds(
+        values, strength, is_at_bound = fit_with_bounds(
             fit.problem(), previous_values, fit.strength, has_readings, fit.bounds
         )
-        fit = replace(fit, values=values, strength=strength, at_bound=at_bound)
+        fit = replace(fit, values=values, strength=strength, at_bound=is_at_bound)
         strength = fit_strengths(fit.problem(with_outliers=True), fit.values, fit.strength)
         fit = _update_noise_and_weights(replace(fit, strength=strength))
         if update_spread:
@@ -355,8 +360,8 @@ def _update_spread(fit: TapFit) -> Float[np.ndarray, " P"]:
 
 def _update_noise_and_weights(fit: TapFit) -> TapFit:
     """Re-estimate the microphones' noise, the outlying taps and the weights from the residuals of the fit."""
-    expected = fit.predicted_level()
-    received = np.maximum(np.exp(expected) - fit.noise.floor[:, None], 0.0)
+    expected_levels = fit.predicted_level()
+    received_power = np.maximum(np.exp(expected_levels) - fit.noise.floor[:, None], 0.0)
     # The residuals are smaller than the errors of the data, since strengths and parameters were fitted to the data;
     # `inflation` corrects for the difference.
     num_readings = fit.use.sum()
@@ -364,29 +369,31 @@ def _update_noise_and_weights(fit: TapFit) -> TapFit:
     inflation = num_readings / max(num_readings - num_fitted, 0.1 * num_readings)
     if not fit.known_noise:
         use = np.isfinite(fit.power) & ~fit.outlier
-        deviation = additive_deviations(fit.power, received, use, inflation)
+        deviation = additive_deviations(fit.power, received_power, use, inflation)
         negative_power_deviation = noise_from_negative_powers(fit.power.T, np.isfinite(fit.power.T))
         fit = replace(
             fit,
             noise=on_host(
-                IntensityNoise.create(len(received), deviation=np.maximum(deviation, negative_power_deviation))
+                IntensityNoise.create(len(received_power), deviation=np.maximum(deviation, negative_power_deviation))
             ),
         )
-    relative = relative_errors(fit.noise, received, _residual_for_equal_errors(fit, received), fit.use, inflation)
+    relative = relative_errors(
+        fit.noise, received_power, _residual_for_equal_errors(fit, received_power), fit.use, inflation
+    )
     fit = replace(fit, noise=replace(fit.noise, relative=relative))
-    residual = np.where(fit.usable, fit.level - expected, 0.0)
+    residual = np.where(fit.usable, fit.level - expected_levels, 0.0)
     squared_residual = residual**2 / np.maximum(
-        _power_variance(fit, np.maximum(received, 1e-150)), MIN_RELATIVE_ERROR**2
+        _power_variance(fit, np.maximum(received_power, 1e-150)), MIN_RELATIVE_ERROR**2
     )
     usable = fit.usable
     tap_mean_square = np.minimum(squared_residual, 100.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
     median_mean_square = float(np.median(tap_mean_square[usable.any(axis=0)]))
     fit = replace(fit, outlier=tap_mean_square > _OUTLIER_RATIO * max(median_mean_square, 0.2))
-    variance = _level_variance(fit, received)
+    variance = _level_variance(fit, received_power)
     return replace(fit, weight=(_T_FREEDOM + 1) / (_T_FREEDOM + residual**2 / variance) / variance)
 
 
-def _residual_for_equal_errors(fit: TapFit, received: np.ndarray) -> Float[np.ndarray, "M T"]:
+def _residual_for_equal_errors(fit: TapFit, received_power: np.ndarray) -> Float[np.ndarray, "M T"]:
     """Residuals (M, T) of the levels if the taps' strengths are estimated with the same relative error for all
     microphones.
 
@@ -395,17 +402,17 @@ def _residual_for_equal_errors(fit: TapFit, received: np.ndarray) -> Float[np.nd
     """
     relative = fit.noise.relative
     equal_fit = replace(fit, noise=replace(fit.noise, relative=np.full(len(relative), np.median(relative))))
-    equal_fit = replace(equal_fit, weight=1 / _level_variance(equal_fit, received))
+    equal_fit = replace(equal_fit, weight=1 / _level_variance(equal_fit, received_power))
     strength = fit_strengths(equal_fit.problem(with_outliers=True), fit.values, fit.strength)
     return np.where(fit.usable, fit.level - replace(equal_fit, strength=strength).predicted_level(), 0.0)
 
 
-def _level_variance(fit: TapFit, received: np.ndarray) -> np.ndarray:
-    """Variance (M, T) of the levels for the expected power `received`, which is bounded from below so that all weights
-    are finite."""
+def _level_variance(fit: TapFit, received_power: np.ndarray) -> np.ndarray:
+    """Variance (M, T) of the levels for the expected power `received_power`, which is bounded from below so that all
+    weights are finite."""
     floor = 1e-6 * np.nanmax(np.where(fit.use, fit.power, np.nan), axis=1, initial=1e-300)[:, None]
-    return _power_variance(fit, np.maximum(received, floor))
+    return _power_variance(fit, np.maximum(received_power, floor))
 
 
-def _power_variance(fit: TapFit, received: np.ndarray) -> np.ndarray:
-    return np.asarray(fit.noise.level_variance(host.asarray(received)))
+def _power_variance(fit: TapFit, received_power: np.ndarray) -> np.ndarray:
+    return np.asarray(fit.noise.level_variance(host.asarray(received_power)))

@@ -23,10 +23,10 @@ from jeit.acoustic.calibration.robust_least_squares import TapFit, refit_without
 from jeit.acoustic.decay import AbstractDecay
 from jeit.acoustic.localisation.likelihood import Likelihood
 from jeit.acoustic.localisation.localiser import Localiser
-from jeit.acoustic.localisation.pixels import Pixels, valleys
+from jeit.acoustic.localisation.pixels import Pixels, find_two_lowest_minima
 from jeit.acoustic.microphones import MicrophoneArray
 from jeit.acoustic.signal.faults import describe_faults
-from jeit.acoustic.surface import AbstractSurface, bounding_box, longer_side, to_space
+from jeit.acoustic.surface import AbstractSurface, bounding_box, longer_side, to_three_dimensions
 from jeit_solvers import inverse_small, minimise_small
 from jeit_solvers.engines import as_array, evaluate_in_numpy, host, namespace, on_device
 
@@ -91,7 +91,7 @@ def _exclusions_and_explained_variance(
 ) -> tuple[tuple[str, ...], Float[np.ndarray, " M"]]:
     """Return the reason why each microphone is unusable ("" if usable), and the fraction of the variance of its levels
     that its decay model explains. For excluded microphones this fraction is taken from `explained`."""
-    expected, level, use = fit.predicted_level(), fit.level, fit.use
+    expected_levels, level, use = fit.predicted_level(), fit.level, fit.use
     decreases = _response_decrease(fit)
     min_readings = len(fit.kind.parameters) + 2
     deviation, relative = fit.noise.deviation, fit.noise.relative
@@ -105,7 +105,7 @@ def _exclusions_and_explained_variance(
             reasons.append(fault)
             continue
         variance = np.var(level[k, is_used])
-        explained_share[k] = 1 - np.mean((level - expected)[k, is_used] ** 2) / variance if variance > 0 else 0.0
+        explained_share[k] = 1 - np.mean((level - expected_levels)[k, is_used] ** 2) / variance if variance > 0 else 0.0
         if decreases[k] < _MIN_DECREASE:
             reasons.append("its intensity does not fall with distance")
         elif is_used.sum() >= min_readings and not explained_share[k] >= _MIN_EXPLAINED:
@@ -179,7 +179,7 @@ class LeftOutTaps(NamedTuple):
         return self.median < 0.5 * self.mean_guess_error
 
 
-def locate_left_out(
+def locate_held_out_taps(
     fit: TapFit,
     microphones: Float[np.ndarray, "M d"],
     surface: AbstractSurface,
@@ -191,25 +191,25 @@ def locate_left_out(
     errors, squared_mahalanobis = np.full((2, len(tap_positions)), np.nan)
     raster = Localiser.create(_microphone_array(fit, fit.values, microphones, surface)).coarse
     for k in range(int(fold_indices.max()) + 1):
-        is_left_out = (fold_indices == k) & ~fit.outlier
+        is_held_out = (fold_indices == k) & ~fit.outlier
         training_fit = replace(fit, outlier=fit.outlier | (fold_indices == k))
         has_readings = np.asarray(training_fit.use.any(axis=1))
-        use = fit.usable[:, is_left_out] & has_readings[:, None]
-        if not is_left_out.any() or not (use.sum(axis=0) >= 3).any():
+        use = fit.usable[:, is_held_out] & has_readings[:, None]
+        if not is_held_out.any() or not (use.sum(axis=0) >= 3).any():
             continue
         values, _, _ = fit_with_bounds(training_fit.problem(), fit.values, fit.strength, has_readings, fit.bounds)
         array = _microphone_array(fit, values, microphones, surface)
         estimated_positions, covariance = evaluate_in_numpy(
-            _locate_most_likely, array, raster, np.nan_to_num(fit.power[:, is_left_out]), use
+            _locate_most_likely, array, raster, np.nan_to_num(fit.power[:, is_held_out]), use
         )
-        error_vectors = estimated_positions - tap_positions[is_left_out]
+        error_vectors = estimated_positions - tap_positions[is_held_out]
         # The pseudoinverse is used, since the covariance on a curved surface is singular.
         is_located = (
             np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(error_vectors).all(axis=1) & (use.sum(axis=0) >= 3)
         )
         inverse = np.linalg.pinv(np.where(is_located[:, None, None], covariance, 0.0), hermitian=True, rcond=1e-9)
-        errors[is_left_out] = np.where(is_located, np.linalg.norm(error_vectors, axis=1), np.nan)
-        squared_mahalanobis[is_left_out] = np.where(
+        errors[is_held_out] = np.where(is_located, np.linalg.norm(error_vectors, axis=1), np.nan)
+        squared_mahalanobis[is_held_out] = np.where(
             is_located, np.einsum("ni,nij,nj->n", np.nan_to_num(error_vectors), inverse, error_vectors), np.nan
         )
     mean_guess_error = float(np.median(np.linalg.norm(tap_positions - tap_positions.mean(axis=0), axis=1)))
@@ -231,13 +231,13 @@ def _locate_most_likely(array: MicrophoneArray, raster: Pixels, power, use):
         lambda tree: tree.noise.relative, array, xp.maximum(array.noise.relative, _SCREENING_ERROR)
     )
     maps = Likelihood.create(power, use, screening_array).screen(Likelihood.features(screening_array, raster.chart))
-    first, second, _ = valleys(maps, raster)
+    first_positions, second_positions, _ = find_two_lowest_minima(maps, raster)
     pair_likelihood = Likelihood.create(xp.tile(power, 2), xp.tile(use, 2), array)
     low, high = bounding_box(array.surface)
     surface_length, unbounded = longer_side(array.surface), xp.full(1, xp.inf)
     minimum = minimise_small(
         lambda unknowns, frames: Likelihood(frames[0], frames[1], frames[2], array).expand(unknowns),
-        pair_likelihood.start(xp.concatenate([first, second], axis=1)),
+        pair_likelihood.start(xp.concatenate([first_positions, second_positions], axis=1)),
         pair_likelihood.frames,
         lower=xp.concatenate([low, -unbounded])[:, None],
         upper=xp.concatenate([high, unbounded])[:, None],
@@ -249,7 +249,7 @@ def _locate_most_likely(array: MicrophoneArray, raster: Pixels, power, use):
     best_index = value.argmin(axis=0) * power.shape[1] + xp.arange(power.shape[1])
     unknowns = minimum.x[:, best_index]
     covariance = inverse_small(Likelihood.create(power, use, array).expand(unknowns)[2])[:2, :2]
-    return to_space(array.surface, unknowns[:2], covariance)
+    return to_three_dimensions(array.surface, unknowns[:2], covariance)
 
 
 def _assign_folds(tap_positions: Float[np.ndarray, "T d"]) -> Int[np.ndarray, " T"]:

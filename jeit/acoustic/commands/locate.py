@@ -161,15 +161,15 @@ def _table_rows(located: "LocatedTouches") -> Iterator[tuple[str, ...]]:
             # from the track.
             pair_positions = np.stack([locations.position[two_touch_frames], locations.second[two_touch_frames]])
             distances = np.linalg.norm(pair_positions - track.position[two_touch_frames], axis=-1)
-            other_position = 1e3 * pair_positions[distances.argmax(axis=0), np.arange(two_touch_frames.size), :2].mean(
-                axis=0
-            )
+            second_touch_position = 1e3 * pair_positions[
+                distances.argmax(axis=0), np.arange(two_touch_frames.size), :2
+            ].mean(axis=0)
             time_cells = (f"{locations.times[two_touch_frames[0]]:.3f}", f"{locations.times[two_touch_frames[-1]]:.3f}")
             pair_count = f"{two_touch_frames.size} {LocationStatus.TWO_TOUCHES}"
             yield (
                 f"{number}, other",
                 *time_cells,
-                *(f"{coordinates:z.1f}" for coordinates in other_position),
+                *(f"{coordinates:z.1f}" for coordinates in second_touch_position),
                 "",
                 "",
                 pair_count,

@@ -31,7 +31,7 @@ from scipy.special import chdtrc
 from jeit.acoustic.localisation.likelihood import Likelihood
 from jeit.acoustic.localisation.localiser import Localiser, SourceEstimate
 from jeit.acoustic.microphones import MicrophoneArray
-from jeit.acoustic.surface import longer_side, to_space
+from jeit.acoustic.surface import longer_side, to_three_dimensions
 from jeit_solvers import inverse_small
 from jeit_solvers.engines import as_array, host, on_device, on_host, slopes
 
@@ -112,16 +112,16 @@ def estimate_gain_changes(
     used_mask = use.any(axis=0).astype(float)
     # A factor common to all gains cannot be distinguished from the strengths of the touches.
     centring_matrix = np.diag(used_mask) - np.outer(used_mask, used_mask) / max(used_mask.sum(), 1.0)
-    no_changes = GainChanges(np.zeros(len(used_mask)), np.zeros_like(centring_matrix))
+    zero_changes = GainChanges(np.zeros(len(used_mask)), np.zeros_like(centring_matrix))
     if deviation == 0:
-        return (no_changes,)
+        return (zero_changes,)
     for factor in _DEVIATION_FACTORS:
         changes, explained_share = _estimate_gain_changes(
             microphone_array, power, use, factor * deviation * centring_matrix, locate_frames
         )
         if explained_share >= (_MIN_EXPLAINED_FIRST if factor == 1 else _MIN_EXPLAINED_LATER):
             return (changes,)
-    return no_changes, no_changes._replace(covariance=deviation**2 * centring_matrix)
+    return zero_changes, zero_changes._replace(covariance=deviation**2 * centring_matrix)
 
 
 def _estimate_gain_changes(
@@ -138,7 +138,7 @@ def _estimate_gain_changes(
         explained_share = float(np.mean(is_explained))
         if not is_explained.any():
             break
-        array_with_changes = _with_known_gains(microphone_array, changes)
+        array_with_changes = _set_gains_without_uncertainty(microphone_array, changes)
         matrix, right_hand_side = _normal_equations(
             array_with_changes,
             power[is_explained],
@@ -184,7 +184,7 @@ def covariance_with_gains(
     Jᵀ W S, and the covariance of the unknowns is F⁻¹ + B C Bᵀ.
     """
     array, unknowns = (
-        _with_known_gains(microphone_array, changes),
+        _set_gains_without_uncertainty(microphone_array, changes),
         _unknowns_of_sources(microphone_array, sources, slice(None)),
     )
     has_position = np.isfinite(unknowns).all(axis=0)
@@ -195,10 +195,12 @@ def covariance_with_gains(
     total_covariance = inverse_fisher[:2, :2] + host.einsum(
         "kmf,mn,lnf->klf", gain_derivatives, changes.covariance, gain_derivatives, optimize=True
     )
-    return np.where(has_position[:, None, None], to_space(array.surface, unknowns[:2], total_covariance)[1], np.nan)
+    return np.where(
+        has_position[:, None, None], to_three_dimensions(array.surface, unknowns[:2], total_covariance)[1], np.nan
+    )
 
 
-def _with_known_gains(microphone_array: MicrophoneArray, changes: GainChanges) -> MicrophoneArray:
+def _set_gains_without_uncertainty(microphone_array: MicrophoneArray, changes: GainChanges) -> MicrophoneArray:
     """Return the microphone array in NumPy arrays, with the changed gains but without the variances of the changes in
     its noise."""
     return on_host(changes._replace(covariance=np.zeros_like(changes.covariance)).apply(microphone_array))
@@ -285,24 +287,24 @@ def find_setup_changes(
         """Mean misfit per degree of freedom for each candidate change, given by the order and the mask of the
         channels."""
         estimates = localiser(
-            np.concatenate([power[:, order] for order, _ in states]),
-            np.concatenate([use[:, order] & mask for order, mask in states]),
+            np.concatenate([power[:, channel_order] for channel_order, _ in states]),
+            np.concatenate([use[:, channel_order] & mask for channel_order, mask in states]),
         )
         ratio = np.asarray(estimates.misfit) / np.maximum(np.asarray(estimates.freedom), 1)
         return np.minimum(np.nan_to_num(ratio, nan=_MAX_MISFIT), _MAX_MISFIT).reshape(len(states), -1).mean(axis=1)
 
     state = np.arange(power.shape[1]), np.ones(power.shape[1], bool)
     current_misfit = float(mean_misfit([state])[0])
-    remaining = np.flatnonzero(use.any(axis=0))
+    remaining_channels = np.flatnonzero(use.any(axis=0))
     while (
         current_misfit > _LARGE_MISFIT
         and len(changes.exchanged) + len(changes.altered) < _MAX_CHANGES
-        and remaining.size
+        and remaining_channels.size
     ):
         # Altered microphones come first among the candidate changes, since exchanging an altered microphone may lower
         # the misfit too.
-        singles = [(int(k),) for k in remaining if remaining.size > _MIN_REMAINING]
-        candidates = singles + [(int(k), int(m)) for k, m in combinations(remaining, 2)]
+        single_channels = [(int(k),) for k in remaining_channels if remaining_channels.size > _MIN_REMAINING]
+        candidates = single_channels + [(int(k), int(m)) for k, m in combinations(remaining_channels, 2)]
         candidate_states = [_apply_change(state, channels) for channels in candidates]
         misfits = mean_misfit(candidate_states)
         best_index = int(misfits.argmin())
@@ -314,16 +316,16 @@ def find_setup_changes(
             changes.exchanged.append((channels[0], channels[1]))
         else:
             changes.altered.append(channels[0])
-        remaining = remaining[~np.isin(remaining, channels)]
+        remaining_channels = remaining_channels[~np.isin(remaining_channels, channels)]
     return changes if current_misfit <= _LARGE_MISFIT else SetupChanges([], [])
 
 
 def _apply_change(state: tuple[np.ndarray, np.ndarray], channels: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return the order and the mask of the microphones' channels after exchanging two channels, or leaving out one
     channel."""
-    order, mask = (array.copy() for array in state)
+    channel_order, mask = (array.copy() for array in state)
     if len(channels) == 2:
-        order[list(channels)] = order[list(channels[::-1])]
+        channel_order[list(channels)] = channel_order[list(channels[::-1])]
     else:
         mask[channels[0]] = False
-    return order, mask
+    return channel_order, mask

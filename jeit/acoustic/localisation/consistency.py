@@ -61,8 +61,8 @@ class Consistency(Module):
         xp = namespace(power, use)
         used_power = xp.where(use, power, 0.0)
         scale = xp.max(used_power, axis=0)
-        loudest = xp.argmax(used_power, axis=0)
-        return cls(used_power / xp.where(scale > 0, scale, 1.0), loudest, scale, use, microphone_array)
+        loudest_microphones = xp.argmax(used_power, axis=0)
+        return cls(used_power / xp.where(scale > 0, scale, 1.0), loudest_microphones, scale, use, microphone_array)
 
     @property
     def frames(self) -> tuple[Array, ...]:
@@ -167,8 +167,8 @@ class Consistency(Module):
             xp.sum(difference_gradients, axis=1, keepdims=True) * estimates,
             -estimates * difference_gradients,
         )
-        received = strength / estimates
-        variance = self.microphone_array.noise.variance(received) / xp.where(self.scale > 0, self.scale, 1.0) ** 2
+        received_power = strength / estimates
+        variance = self.microphone_array.noise.variance(received_power) / xp.where(self.scale > 0, self.scale, 1.0) ** 2
         gradient_covariance = xp.einsum(
             "kmf,lmf,mf->klf", mixed_derivatives, mixed_derivatives, xp.where(self.use, variance, 0.0)
         )
@@ -190,34 +190,36 @@ _MAX_STEPS = 30
 _TOLERANCE = 1e-12
 
 
-def find_minima(objective, first, second, try_second):
-    """Minimise the objective of each frame from two starting positions, `first` and `second` (2, F).
+def find_minima(objective, first_start, second_start, has_second_start):
+    """Minimise the objective of each frame from two starting positions, `first_start` and `second_start` (2, F).
 
-    `try_second`: mask of the frames for which the second start is tried, or None for no frame; a second start is
+    `has_second_start`: mask of the frames for which the second start is tried, or None for no frame; a second start is
     abandoned if its cost is still clearly higher after a few steps. Returns the unknowns (n, F) at the minimum; the
     cost on the outline minus the cost of the minimum beyond the outline; the difference of cost between the two minima;
     whether the minimisation converged; and the start and end (2, 2, F) of the side of the outline to which the position
     was moved, NaN for positions inside.
     """
     surface = objective.microphone_array.surface
-    first_minimum = _minimise_in_plane(objective, objective.start(first), None)
+    first_minimum = _minimise_in_plane(objective, objective.start(first_start), None)
     unknowns, converged = first_minimum.x, first_minimum.converged
     xp = namespace(objective, unknowns)
     value = xp.where(xp.isfinite(first_minimum.value), first_minimum.value, xp.inf)
     is_inside = surface.outline.contains(unknowns[:2].T)
     rival_excess, lowest_value = xp.full(value.shape, xp.inf), value
-    if try_second is not None:
+    if has_second_start is not None:
         # After a few steps, the minimisation continues only in promising second valleys.
-        trial_minimum = _minimise_in_plane(objective, objective.start(second), ~try_second, max_steps=_TRIAL_STEPS)
-        try_second = try_second & (trial_minimum.value < value + _MAX_EXCESS)
-        second_minimum = _minimise_in_plane(objective, trial_minimum.x, ~try_second)
-        second_value = xp.where(try_second & xp.isfinite(second_minimum.value), second_minimum.value, xp.inf)
+        trial_minimum = _minimise_in_plane(
+            objective, objective.start(second_start), ~has_second_start, max_steps=_TRIAL_STEPS
+        )
+        has_second_start = has_second_start & (trial_minimum.value < value + _MAX_EXCESS)
+        second_minimum = _minimise_in_plane(objective, trial_minimum.x, ~has_second_start)
+        second_value = xp.where(has_second_start & xp.isfinite(second_minimum.value), second_minimum.value, xp.inf)
         second_is_inside = surface.outline.contains(second_minimum.x[:2].T)
         is_distinct = xp.linalg.norm(second_minimum.x[:2] - unknowns[:2], axis=0) > _MIN_VALLEY_DISTANCE * longer_side(
             surface
         )
         rival_excess = xp.where(
-            is_distinct & try_second & is_inside & second_is_inside, xp.abs(second_value - value), xp.inf
+            is_distinct & has_second_start & is_inside & second_is_inside, xp.abs(second_value - value), xp.inf
         )
         lowest_value = xp.minimum(value, second_value)
         # If one of the two minima is outside the outline, the minimum inside is selected. A position on the outline may
@@ -234,7 +236,7 @@ def find_minima(objective, first, second, try_second):
     # Minima outside the outline are replaced by the best position on the outline. A minimum inside is also compared
     # with the best position on the outline, if the other minimum is outside and has a lower cost.
     try_outline = xp.isfinite(value) & (~is_inside | (lowest_value < value))
-    no_side = xp.full((2, 2, value.size), xp.nan)
+    undefined_sides = xp.full((2, 2, value.size), xp.nan)
 
     def move_to_outline(_):
         outline_minimum, side = _minimise_on_outline(objective, ~try_outline)
@@ -243,11 +245,11 @@ def find_minima(objective, first, second, try_second):
             xp.where(is_moved, outline_minimum.x, unknowns),
             xp.where(try_outline, xp.where(is_moved, outline_minimum.value, value) - lowest_value, 0.0),
             xp.where(is_moved, outline_minimum.converged, converged),
-            xp.where(is_moved, side, no_side),
+            xp.where(is_moved, side, undefined_sides),
         )
 
     def keep_inside(_):
-        return unknowns, xp.zeros_like(value), converged, no_side
+        return unknowns, xp.zeros_like(value), converged, undefined_sides
 
     any_on_outline = xp.any(try_outline)
     minima = (
@@ -255,8 +257,8 @@ def find_minima(objective, first, second, try_second):
         if xp is np
         else jax.lax.cond(any_on_outline, move_to_outline, keep_inside, None)
     )
-    unknowns, excess, converged, side = minima
-    return unknowns, excess, rival_excess, converged, side
+    unknowns, excess_cost, converged, side = minima
+    return unknowns, excess_cost, rival_excess, converged, side
 
 
 def _minimise_in_plane(objective, start, skip, *, max_steps: int | None = None) -> Minimum:
@@ -269,7 +271,7 @@ def _minimise_in_plane(objective, start, skip, *, max_steps: int | None = None) 
     surface = objective.microphone_array.surface
     low, high = bounding_box(surface)
     xp = namespace(objective, start)
-    no_bounds = xp.full(start.shape[0] - 2, xp.inf)
+    infinite_bounds = xp.full(start.shape[0] - 2, xp.inf)
     skin_size = longer_side(surface)
 
     def expand_frames(frames):
@@ -281,9 +283,9 @@ def _minimise_in_plane(objective, start, skip, *, max_steps: int | None = None) 
         objective.frames,
         finish=None if max_steps is not None else lambda x, frames: _expand_exactly(expand_frames(frames), x),
         max_steps=max_steps or _MAX_STEPS,
-        lower=xp.concatenate([low - skin_size, -no_bounds])[:, None],
-        upper=xp.concatenate([high + skin_size, no_bounds])[:, None],
-        largest_step=xp.concatenate([xp.full(2, skin_size / 4), xp.full_like(no_bounds, 2.3)])[:, None],
+        lower=xp.concatenate([low - skin_size, -infinite_bounds])[:, None],
+        upper=xp.concatenate([high + skin_size, infinite_bounds])[:, None],
+        largest_step=xp.concatenate([xp.full(2, skin_size / 4), xp.full_like(infinite_bounds, 2.3)])[:, None],
         tolerance=_TOLERANCE,
         skip=skip,
     )
@@ -317,13 +319,13 @@ def _minimise_on_outline(objective, skip) -> tuple[Minimum, Array]:
     origin, directions = start[:, side_indices[best_candidates]], (end - start)[:, side_indices[best_candidates]]
     log_strengths = objective.start(chart[:, best_candidates])[2:]
 
-    def to_unknowns(side_unknowns, origin, directions):
+    def side_to_plane_unknowns(side_unknowns, origin, directions):
         return xp.concatenate([origin + side_unknowns[0] * directions, side_unknowns[1:]])
 
     def expand(side_unknowns, data):
         origin, directions, frames = data
         frame_objective = type(objective)(*frames, objective.microphone_array)
-        value, gradient, matrix = frame_objective.expand(to_unknowns(side_unknowns, origin, directions))
+        value, gradient, matrix = frame_objective.expand(side_to_plane_unknowns(side_unknowns, origin, directions))
         projected_gradient = xp.concatenate([xp.sum(directions * gradient[:2], axis=0)[None], gradient[2:]])
         rows = xp.concatenate([xp.einsum("kf,klf->lf", directions, matrix[:2])[None], matrix[2:]])
         projected_matrix = xp.concatenate(
@@ -343,10 +345,12 @@ def _minimise_on_outline(objective, skip) -> tuple[Minimum, Array]:
         skip=skip,
     )
     side_ends = origin + directions
-    in_corner = (minimum.x[0] <= 0) | (minimum.x[0] >= 1)
+    is_in_corner = (minimum.x[0] <= 0) | (minimum.x[0] >= 1)
     # A position in a corner of the outline cannot move along a side, so its side is replaced by a side of length zero.
-    side = xp.stack([origin, xp.where(in_corner, origin, side_ends)])
-    return Minimum(to_unknowns(minimum.x, origin, directions), minimum.value, minimum.converged, minimum.steps), side
+    side = xp.stack([origin, xp.where(is_in_corner, origin, side_ends)])
+    return Minimum(
+        side_to_plane_unknowns(minimum.x, origin, directions), minimum.value, minimum.converged, minimum.steps
+    ), side
 
 
 def differentiable_minima(objective, unknowns, side, skin_size):
@@ -366,11 +370,11 @@ def differentiable_minima(objective, unknowns, side, skin_size):
     hessian = hessian_small(undifferentiated(objective).cost, minimum)
     gradient = gradient_small(finite_cost, minimum)
     # Positions on the outline can move only along their side, so the step is projected onto the side.
-    on_outline = ~xp.isnan(side[0, 0])
-    direction = xp.where(on_outline, side[1] - side[0], 0.0)
+    is_on_outline = ~xp.isnan(side[0, 0])
+    direction = xp.where(is_on_outline, side[1] - side[0], 0.0)
     length = xp.linalg.norm(xp.where(direction == 0, 1e-300, direction), axis=0)
     direction = xp.where(length > 1e-12 * skin_size, direction / length, 0.0)
-    tangent_projector = xp.where(on_outline, direction[:, None] * direction[None], xp.eye(2)[:, :, None])
+    tangent_projector = xp.where(is_on_outline, direction[:, None] * direction[None], xp.eye(2)[:, :, None])
     projector = set_at(xp.zeros_like(hessian) + xp.eye(len(minimum))[:, :, None], np.s_[:2, :2], tangent_projector)
     gradient = xp.einsum("klf,lf->kf", projector, gradient)
     projected_hessian = xp.einsum("klf,lmf,mnf->knf", projector, hessian, projector)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jeit.acoustic.microphones import MicrophoneArray, check_array
-from jeit.acoustic.surface import to_space
+from jeit.acoustic.surface import to_three_dimensions
 from jeit_solvers import inverse_small, symmetric_small
 from jeit_solvers.engines import computed_once, either_engine, namespace, slopes
 from jeit_solvers.module import Module
@@ -76,19 +76,19 @@ class Likelihood(Module):
         # derivative of log v.
         mean, variance, derivatives = computed_once((mean, variance, [(dm, dv / variance) for dm, dv in derivatives]))
         xp = namespace(self, mean)
-        used = xp.where(self.use, 1.0, 0.0)
+        use_weights = xp.where(self.use, 1.0, 0.0)
         residual = self.level - mean
-        weight = used / variance
+        weight = use_weights / variance
         weighted_residual = residual * weight
-        cost = 0.5 * xp.sum(weighted_residual * residual + used * xp.log(variance), axis=0)
-        variance_terms = 0.5 * (used - weighted_residual * residual)
-        weight, weighted_residual, variance_terms, used = computed_once(
-            (weight, weighted_residual, variance_terms, used)
+        cost = 0.5 * xp.sum(weighted_residual * residual + use_weights * xp.log(variance), axis=0)
+        variance_terms = 0.5 * (use_weights - weighted_residual * residual)
+        weight, weighted_residual, variance_terms, use_weights = computed_once(
+            (weight, weighted_residual, variance_terms, use_weights)
         )
         gradient = xp.stack([xp.sum(variance_terms * dv - weighted_residual * dm, axis=0) for dm, dv in derivatives])
         matrix = symmetric_small(
             [
-                [xp.sum(weight * dm * em + 0.5 * used * dv * ev, axis=0) for em, ev in derivatives[: k + 1]]
+                [xp.sum(weight * dm * em + 0.5 * use_weights * dv * ev, axis=0) for em, ev in derivatives[: k + 1]]
                 for k, (dm, dv) in enumerate(derivatives)
             ]
         )
@@ -106,8 +106,8 @@ class Likelihood(Module):
         power. The strength is positive."""
         weight, xp = self._power_weights(), namespace(self, response)
         fitted_strength = xp.sum(weight * self.power * response, axis=0) / xp.sum(weight * response**2, axis=0)
-        loudest = xp.max(xp.where(self.use, self.power / response, 0.0), axis=0)
-        return xp.maximum(fitted_strength, 1e-6 * loudest)
+        max_strength = xp.max(xp.where(self.use, self.power / response, 0.0), axis=0)
+        return xp.maximum(fitted_strength, 1e-6 * max_strength)
 
     @staticmethod
     def features(microphone_array: MicrophoneArray, chart: Float[Array, "2 P"]) -> Float[Array, "M P"]:
@@ -171,4 +171,4 @@ def _bound_covariance(microphone_array: MicrophoneArray, position, strength, use
     use = xp.broadcast_to(xp.asarray(used_microphones, bool)[:, None], (len(used_microphones), num_sources))
     # The Fisher matrix does not depend on the measured intensities.
     _, _, matrix = Likelihood.create(xp.ones(use.shape), use, microphone_array).expand(unknowns)
-    return to_space(microphone_array.surface, chart, inverse_small(matrix)[:2, :2])[1]
+    return to_three_dimensions(microphone_array.surface, chart, inverse_small(matrix)[:2, :2])[1]

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 
 from jeit.acoustic.localisation.consistency import Consistency, differentiable_minima, find_minima
 from jeit.acoustic.localisation.likelihood import Likelihood
-from jeit.acoustic.localisation.pixels import Pixels, valleys
+from jeit.acoustic.localisation.pixels import Pixels, find_two_lowest_minima
 from jeit.acoustic.microphones import MicrophoneArray, check_array
-from jeit.acoustic.surface import bounding_box, longer_side, to_space
+from jeit.acoustic.surface import bounding_box, longer_side, to_three_dimensions
 from jeit.arguments import check_name
 from jeit_solvers import inverse_small
 from jeit_solvers.engines import (
@@ -226,8 +226,8 @@ def _starting_positions(localiser: Localiser, power, use):
 
     def screen_chunk(power, use):
         maps = METHODS[localiser.method].create(power, use, constant_array).screen(features)
-        first, second, try_second = valleys(maps, pixels)
-        return first.T, second.T, try_second
+        first_start, second_start, has_second_start = find_two_lowest_minima(maps, pixels)
+        return first_start.T, second_start.T, has_second_start
 
     max_frames = _MAX_CHUNK_FRAMES if localiser.pixels is None else _MAX_MAP_FRAMES
     return _apply_in_chunks(screen_chunk, max_frames, undifferentiated(power), use)
@@ -241,31 +241,35 @@ def _usable_readings(localiser: Localiser, power, use):
 
 def _locate_sources(localiser: Localiser, power, use) -> SourceEstimate:
     use = _usable_readings(localiser, power, use)
-    first, second, try_second = _starting_positions(localiser, power, use)
+    first_start, second_start, has_second_start = _starting_positions(localiser, power, use)
 
-    def refine_chunk(power, use, first, second, try_second):
-        return _refine_positions(localiser, power, use, first, second, try_second[0])
+    def refine_chunk(power, use, first_start, second_start, has_second_start):
+        return _refine_positions(localiser, power, use, first_start, second_start, has_second_start[0])
 
-    return _apply_in_chunks(refine_chunk, _MAX_CHUNK_FRAMES, power, use, first, second, try_second[:, None])
+    return _apply_in_chunks(
+        refine_chunk, _MAX_CHUNK_FRAMES, power, use, first_start, second_start, has_second_start[:, None]
+    )
 
 
-def _refine_positions(localiser: Localiser, power, use, first, second, try_second) -> SourceEstimate:
-    """Minimise the objective of each frame from the starting positions `first` and `second` (2, F). `power`, `use`: (M,
-    F)."""
+def _refine_positions(localiser: Localiser, power, use, first_start, second_start, has_second_start) -> SourceEstimate:
+    """Minimise the objective of each frame from the starting positions `first_start` and `second_start` (2, F).
+    `power`, `use`: (M, F)."""
     microphone_array = localiser.microphone_array
     constant_array = undifferentiated(microphone_array)
     constant_objective = METHODS[localiser.method].create(undifferentiated(power), use, constant_array)
     # If there are maps, the minimisation starts from the best pixel only.
-    unknowns, excess, rival, converged, side = find_minima(
-        constant_objective, first, second, try_second if localiser.pixels is None else None
+    unknowns, excess_cost, cost_difference, converged, side = find_minima(
+        constant_objective, first_start, second_start, has_second_start if localiser.pixels is None else None
     )
     likelihood = Likelihood.create(power, use, microphone_array)
     objective = likelihood if localiser.method == "likelihood" else Consistency.create(power, use, microphone_array)
     unknowns = differentiable_minima(objective, unknowns, side, longer_side(constant_array.surface))
-    return _source_estimate(objective, likelihood, unknowns, excess, rival, converged)
+    return _source_estimate(objective, likelihood, unknowns, excess_cost, cost_difference, converged)
 
 
-def _source_estimate(objective, likelihood: Likelihood, unknowns, excess, rival, converged) -> SourceEstimate:
+def _source_estimate(
+    objective, likelihood: Likelihood, unknowns, excess_cost, cost_difference, converged
+) -> SourceEstimate:
     xp = namespace(likelihood, unknowns)
     surface, chart = likelihood.microphone_array.surface, unknowns[:2]
     if isinstance(objective, Likelihood):
@@ -275,7 +279,7 @@ def _source_estimate(objective, likelihood: Likelihood, unknowns, excess, rival,
         strength = likelihood.strength(likelihood.microphone_array.response(chart))
         chart_covariance = objective.covariance(chart, strength)
     misfit = likelihood.misfit(xp.concatenate([chart, xp.log(strength)[None]]))
-    position, covariance = to_space(surface, chart, chart_covariance)
+    position, covariance = to_three_dimensions(surface, chart, chart_covariance)
     num_used = xp.sum(likelihood.use, axis=0)
     has_position = (num_used >= 3) & xp.all(xp.isfinite(unknowns), axis=0)
     return SourceEstimate(
@@ -284,7 +288,7 @@ def _source_estimate(objective, likelihood: Likelihood, unknowns, excess, rival,
         strength=xp.where(has_position, strength, xp.nan),
         misfit=xp.where(has_position, misfit, xp.nan),
         freedom=xp.maximum(num_used - 3, 0),
-        excess=xp.where(has_position, 2 * excess, xp.nan),
-        rival=xp.where(has_position, 2 * rival, xp.nan),
+        excess=xp.where(has_position, 2 * excess_cost, xp.nan),
+        rival=xp.where(has_position, 2 * cost_difference, xp.nan),
         converged=converged & has_position,
     )

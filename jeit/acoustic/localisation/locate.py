@@ -166,7 +166,7 @@ def _locate_frames(
         microphone_array, power, use, settings.gain_drift, locate_most_likely
     )
 
-    def locate_with(changes: GainChanges) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    def locate_after_changes(changes: GainChanges) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         array = changes.apply(microphone_array)
         # The status of a frame is always determined from the likelihood, even if the position is estimated from the
         # consistency loss.
@@ -182,35 +182,37 @@ def _locate_frames(
             result["covariance"] = covariance_with_gains(microphone_array, power, use, selected_estimate, changes)
         status = _initial_status(likelihood_estimate, selected_estimate)
         _fit_two_sources(status, result, power, use, array, compiled)
-        excess = np.asarray(likelihood_estimate.excess)
-        status[(status == LocationStatus.MISFIT) & (excess > _MIN_OUTSIDE_EXCESS)] = LocationStatus.OUTSIDE
+        excess_cost = np.asarray(likelihood_estimate.excess)
+        status[(status == LocationStatus.MISFIT) & (excess_cost > _MIN_OUTSIDE_EXCESS)] = LocationStatus.OUTSIDE
         return status, result
 
     for changes in possible_changes:
-        status, result = locate_with(changes)
+        status, result = locate_after_changes(changes)
         if np.mean(status != LocationStatus.MISFIT) > _MIN_EXPLAINED:
             return status, result, changes
-    return *locate_with(last_changes), last_changes
+    return *locate_after_changes(last_changes), last_changes
 
 
 def _initial_status(most_likely: SourceEstimate, estimate: SourceEstimate) -> np.ndarray:
     """Status of the frames with a touch, before a fit of two sources is tried. `most_likely`: maximum-likelihood
     estimates, which determine the status; `estimate`: estimates of the selected method."""
-    misfit, freedom = np.asarray(most_likely.misfit), np.asarray(most_likely.freedom)
-    excess = np.asarray(most_likely.excess)
+    misfit, degrees_of_freedom = np.asarray(most_likely.misfit), np.asarray(most_likely.freedom)
+    excess_cost = np.asarray(most_likely.excess)
     has_rival = np.asarray(most_likely.rival) < _MAX_AMBIGUOUS_DIFFERENCE
     status = np.where(has_rival, LocationStatus.AMBIGUOUS, LocationStatus.TOUCH).astype(object)
-    status[_exceeds_noise(misfit, freedom)] = LocationStatus.MISFIT
+    status[_exceeds_noise(misfit, degrees_of_freedom)] = LocationStatus.MISFIT
     # A frame is "outside" if a source beyond the outline explains its intensities, and does so clearly better than any
     # source inside. One source beyond the outline does not explain the intensities of two sources.
-    status[(excess > _MIN_OUTSIDE_EXCESS) & ~_exceeds_noise(misfit - excess, freedom)] = LocationStatus.OUTSIDE
+    status[(excess_cost > _MIN_OUTSIDE_EXCESS) & ~_exceeds_noise(misfit - excess_cost, degrees_of_freedom)] = (
+        LocationStatus.OUTSIDE
+    )
     status[~np.isfinite(np.asarray(estimate.position)).all(axis=1)] = LocationStatus.UNUSABLE
     return status
 
 
-def _exceeds_noise(misfit: np.ndarray, freedom: np.ndarray) -> np.ndarray:
+def _exceeds_noise(misfit: np.ndarray, degrees_of_freedom: np.ndarray) -> np.ndarray:
     """Mask (F,) of the frames whose misfit noise alone does not explain."""
-    return (freedom > 0) & (chdtrc(np.maximum(freedom, 1), misfit) < _FALSE_MISFIT)
+    return (degrees_of_freedom > 0) & (chdtrc(np.maximum(degrees_of_freedom, 1), misfit) < _FALSE_MISFIT)
 
 
 def _fit_two_sources(
@@ -228,22 +230,22 @@ def _fit_two_sources(
         two_sources = locate_two(
             microphone_array, *_pad_frames(power[tried_frames], use[tried_frames], compiled), compiled=compiled
         )
-        misfit, freedom = (
+        misfit, degrees_of_freedom = (
             np.asarray(two_sources.misfit)[: tried_frames.size],
             np.asarray(two_sources.freedom)[: tried_frames.size],
         )
         stronger_strengths, weaker_strengths = np.asarray(two_sources.strength)[: tried_frames.size].T
         is_much_better = (misfit < _MAX_MISFIT_RATIO * result["misfit"][tried_frames]) & (
-            misfit < _MAX_MISFIT * freedom
+            misfit < _MAX_MISFIT * degrees_of_freedom
         )
-        is_accepted = (~_exceeds_noise(misfit, freedom) | is_much_better) & (
+        is_accepted = (~_exceeds_noise(misfit, degrees_of_freedom) | is_much_better) & (
             weaker_strengths > _MIN_STRENGTH_RATIO * stronger_strengths
         )
         accepted_frames, accepted_indices = tried_frames[is_accepted], np.flatnonzero(is_accepted)
         status[accepted_frames] = LocationStatus.TWO_TOUCHES
         result["misfit"][accepted_frames], result["freedom"][accepted_frames] = (
             misfit[is_accepted],
-            freedom[is_accepted],
+            degrees_of_freedom[is_accepted],
         )
         position, strength = (
             np.asarray(two_sources.position)[accepted_indices],
@@ -291,7 +293,9 @@ def _setup_notes(
     has_touch = ~np.isin(status, [LocationStatus.NO_TOUCH, LocationStatus.UNUSABLE])
     is_unexplained = np.isin(status, [LocationStatus.MISFIT, LocationStatus.OUTSIDE, LocationStatus.TWO_TOUCHES])
     if is_unexplained.sum() > _MAX_UNEXPLAINED * has_touch.sum():
-        exchanged, altered = find_setup_changes(microphone_array, intensities.power[has_touch], use[has_touch])
+        exchanged, altered_microphones = find_setup_changes(
+            microphone_array, intensities.power[has_touch], use[has_touch]
+        )
         notes += [
             f"microphones {microphone} and {other_microphone} look exchanged since the calibration: exchanged back, "
             "their intensities fit one source. The places are not corrected: exchange the channels and locate again."
@@ -300,11 +304,11 @@ def _setup_notes(
         notes += [
             f"microphone {microphone} does not measure as when it was calibrated: without it, one source explains the "
             "others. The places are not corrected: make its channel NaN and locate again, or calibrate anew."
-            for microphone in altered
+            for microphone in altered_microphones
         ]
         if (
             not exchanged
-            and not altered
+            and not altered_microphones
             and (status == LocationStatus.MISFIT).sum() > 2 * _MAX_UNEXPLAINED * has_touch.sum()
         ):
             notes.append("most touches fit no single source: is this the calibration of this array?")
@@ -392,8 +396,8 @@ def _detected_frames(intensities: Intensities, noise: IntensityNoise, use: np.nd
             chdtri(intensities.freedom, _FALSE_ALARM / use.shape[1]) / intensities.freedom - 1
         )
     else:
-        loudest = power.max(initial=0.0)
-        threshold = np.maximum(_ALARM_DEVIATIONS * np.asarray(noise.deviation), _DYNAMIC_RANGE * loudest)
+        max_power = power.max(initial=0.0)
+        threshold = np.maximum(_ALARM_DEVIATIONS * np.asarray(noise.deviation), _DYNAMIC_RANGE * max_power)
     return np.asarray((power > threshold).any(axis=1))
 
 
@@ -404,5 +408,5 @@ def _pad_frames(power: np.ndarray, use: np.ndarray, compiled: bool) -> tuple[np.
         return power, use
     num_frames = len(power)
     num_padded = max(64, 1 << (num_frames - 1).bit_length()) if num_frames <= 1024 else -(-num_frames // 1024) * 1024
-    index = np.minimum(np.arange(num_padded), num_frames - 1)
-    return power[index], use[index]
+    frame_indices = np.minimum(np.arange(num_padded), num_frames - 1)
+    return power[frame_indices], use[frame_indices]

@@ -41,28 +41,28 @@ class Pixels(Module):
         )
 
 
-def valleys(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[Array, Array, Array]:
+def find_two_lowest_minima(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[Array, Array, Array]:
     """Find the two lowest local minima (valleys) of each of F maps of P pixels.
 
     Returns the chart coordinates (2, F) of the lowest pixel and of the second lowest local minimum, and the mask (F,)
     of the frames in which the second minimum is low enough to start a minimisation there.
     """
     rows, columns = pixels.shape
-    inside, xp = pixels.inside.reshape(rows, columns), namespace(maps, pixels)
+    is_inside, xp = pixels.inside.reshape(rows, columns), namespace(maps, pixels)
 
-    def fill_outside(values, inside):
-        is_valid = ~xp.isnan(values) if pixels.full else inside & ~xp.isnan(values)
+    def fill_outside(values, is_inside):
+        is_valid = ~xp.isnan(values) if pixels.full else is_inside & ~xp.isnan(values)
         return xp.where(is_valid, values, xp.inf)
 
     # The row of the minimum is found first, and then the pixel in this row, which is faster than a single search.
     rasters = maps.reshape(-1, rows, columns)
-    best_rows = xp.argmin(xp.min(fill_outside(rasters, inside), axis=2), axis=1)
-    row_values = fill_outside(xp.take_along_axis(rasters, best_rows[:, None, None], axis=1)[:, 0], inside[best_rows])
+    best_rows = xp.argmin(xp.min(fill_outside(rasters, is_inside), axis=2), axis=1)
+    row_values = fill_outside(xp.take_along_axis(rasters, best_rows[:, None, None], axis=1)[:, 0], is_inside[best_rows])
     best_pixels = best_rows * columns + xp.argmin(row_values, axis=1)
     best_chart = pixels.chart[:, best_pixels]
     if rows * columns > _MAX_VALLEY_PIXELS:  # fine rasters have spurious local minima
         return best_chart, best_chart, xp.zeros(best_pixels.shape, bool)
-    rasters = fill_outside(rasters, inside)
+    rasters = fill_outside(rasters, is_inside)
     values = rasters.reshape(len(best_pixels), -1)
     padded_rasters = xp.pad(rasters, ((0, 0), (1, 1), (1, 1)), constant_values=xp.inf)
     neighbours = [

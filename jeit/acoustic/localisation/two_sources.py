@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from jeit.acoustic.localisation.likelihood import Likelihood
 from jeit.acoustic.localisation.pixels import Pixels
 from jeit.acoustic.microphones import MicrophoneArray
-from jeit.acoustic.surface import bounding_box, longer_side, to_space
+from jeit.acoustic.surface import bounding_box, longer_side, to_three_dimensions
 from jeit_solvers import inverse_small, minimise_small
 from jeit_solvers.engines import evaluate_in_numpy, has_values, namespace, on_device, on_host, scan
 from jeit_solvers.module import Module
@@ -72,10 +72,14 @@ def locate_two(
     columns, rows = (max(3, round(side / spacing)) for side in high - low)
     pixels = Pixels.create(microphone_array.surface, columns, rows)
     arguments = microphone_array, pixels, power.T, use.T
-    return on_device(evaluate_in_numpy(_locate_two, *arguments)) if use_numpy else jax.jit(_locate_two)(*arguments)
+    return (
+        on_device(evaluate_in_numpy(_locate_two_sources, *arguments))
+        if use_numpy
+        else jax.jit(_locate_two_sources)(*arguments)
+    )
 
 
-def _locate_two(microphone_array: MicrophoneArray, pixels: Pixels, power, use) -> TwoSources:
+def _locate_two_sources(microphone_array: MicrophoneArray, pixels: Pixels, power, use) -> TwoSources:
     use = use & (power + microphone_array.noise.floor[:, None] > 0)
     likelihood = Likelihood.create(power, use, microphone_array)
     response = microphone_array.response(pixels.chart)
@@ -89,13 +93,13 @@ def _locate_two(microphone_array: MicrophoneArray, pixels: Pixels, power, use) -
     start = pair_unknowns.transpose(2, 1, 0).reshape(6, -1)  # (6, starts · F)
     low, high = bounding_box(microphone_array.surface)
     skin_size = longer_side(microphone_array.surface)
-    no_bound = xp.full(1, xp.inf)
+    infinite_bound = xp.full(1, xp.inf)
     minimum = minimise_small(
         lambda unknowns, data: Likelihood(data[0], data[1], data[2], microphone_array).expand(unknowns),
         start,
         jax.tree.map(lambda array: xp.tile(array, _NUM_STARTS), likelihood.frames),
-        lower=xp.concatenate([low, -no_bound, low, -no_bound])[:, None],
-        upper=xp.concatenate([high, no_bound, high, no_bound])[:, None],
+        lower=xp.concatenate([low, -infinite_bound, low, -infinite_bound])[:, None],
+        upper=xp.concatenate([high, infinite_bound, high, infinite_bound])[:, None],
         largest_step=xp.tile(xp.array([0.1, 0.1, 2.3]) * xp.array([skin_size, skin_size, 1.0]), 2)[:, None],
         max_steps=60,
         tolerance=1e-10,
@@ -110,7 +114,7 @@ def _locate_two(microphone_array: MicrophoneArray, pixels: Pixels, power, use) -
     num_used = xp.sum(use, axis=0)
     has_positions = (num_used >= 6) & xp.isfinite(xp.min(values, axis=0))
     sources = [
-        to_space(microphone_array.surface, unknowns[k : k + 2], unknowns_covariance[k : k + 2, k : k + 2])
+        to_three_dimensions(microphone_array.surface, unknowns[k : k + 2], unknowns_covariance[k : k + 2, k : k + 2])
         for k in (0, 3)
     ]
 

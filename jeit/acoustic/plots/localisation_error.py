@@ -11,7 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import ArrayLike
 
-from jeit.acoustic.plots.surface_view import ESTIMATE_COLOUR, AnySurface, draw_legend, draw_surface, view_of
+from jeit.acoustic.plots.surface_view import ESTIMATE_COLOUR, AnySurface, create_view, draw_legend, draw_surface
 from jeit.arguments import check_kind, check_name
 from jeit.plot.axes import axes_or_new, draw_horizontal_grid, soften_axes
 from jeit.plot.colours import DARK_GREY, SERIES_COLOURS, SERIES_MARKERS
@@ -54,7 +54,7 @@ def plot_position_errors(
     ax = plot_position_errors(true, true + 2e-3, skin.microphones, calibration)
     ```
     """
-    view = view_of(surface, microphones)
+    view = create_view(surface, microphones)
     true_points, estimated_points = view.chart(true, "true"), view.chart(found, "found")
     if true_points.shape != estimated_points.shape:
         raise ValueError(

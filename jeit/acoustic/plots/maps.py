@@ -20,11 +20,11 @@ from jeit.acoustic.plots.surface_view import (
     MICROPHONE_COLOUR,
     AnySurface,
     View,
+    create_view,
     draw_ellipse,
     draw_legend,
     draw_surface,
-    outline_of,
-    view_of,
+    outline_path,
 )
 from jeit.arguments import check_kind, check_name
 from jeit.plot.axes import axes_or_new, soften_axes
@@ -107,7 +107,7 @@ def plot_loss_map(
     if pixels.ndim != 2 or not np.isfinite(pixels).any():
         raise ValueError(f"values has shape {pixels.shape}; give (rows, columns) with at least one finite value.")
     check_name("method", method, _MAP_LABELS)
-    view = view_of(surface, microphones)
+    view = create_view(surface, microphones)
     num_microphones = len(view.microphones)
     level = None if received is None else np.asarray(received, float)
     if level is not None and level.shape != (num_microphones,):
@@ -120,7 +120,7 @@ def plot_loss_map(
     image = ax.imshow(
         map_values, extent=view.extent, origin="lower", interpolation="nearest", cmap=colour_map, clim=(0, max_value)
     )
-    image.set_clip_path(outline_of(view), ax.transData)
+    image.set_clip_path(outline_path(view), ax.transData)
     handles = draw_surface(ax, view, microphones=level is None and num_microphones > 0)
     if level is not None:
         handles.append(_draw_levels(ax, view.microphones, level))
@@ -163,12 +163,12 @@ def _above_minimum(pixels: np.ndarray, method: str) -> np.ndarray:
     return 10 * np.log10(np.maximum(pixels, lower_limit) / lower_limit)
 
 
-def _draw_levels(ax: Axes, microphones: np.ndarray, received: np.ndarray) -> Line2D:
+def _draw_levels(ax: Axes, microphones: np.ndarray, received_power: np.ndarray) -> Line2D:
     """Draw the microphones as circles whose area grows linearly with the received level in decibels; return the legend
     entry."""
-    positive = np.isfinite(received) & (received > 0)
-    loudest = received[positive].max(initial=1e-300)
-    level = 10 * np.log10(np.where(positive, received, 1e-300) / loudest)
+    positive = np.isfinite(received_power) & (received_power > 0)
+    max_power = received_power[positive].max(initial=1e-300)
+    level = 10 * np.log10(np.where(positive, received_power, 1e-300) / max_power)
     area = 8 + 150 * np.clip(1 + level / _DYNAMIC_RANGE, 0, 1)
     ax.scatter(
         *microphones.T, s=area, facecolor="white", edgecolor=MICROPHONE_COLOUR, linewidth=1.2, alpha=0.9, zorder=3
@@ -241,23 +241,28 @@ def plot_receptive_fields(
     low = min(curves.min(), np.quantile(positive_values, 0.02) if positive_values.size else np.inf) / 1.5
     high = max(curves.max(), np.quantile(positive_values, 0.999) if positive_values.size else 0.0) * 1.8
     panel_width, panel_height = 1 / columns, 1 / rows
-    for panel_index, index in enumerate(selected):
+    for panel_index, microphone_index in enumerate(selected):
         row, column = divmod(panel_index, columns)
         panel = ax.inset_axes(
             (column * panel_width, 1 - (row + 1) * panel_height, 0.93 * panel_width, 0.9 * panel_height)
         )
         panel.set_in_layout(False)  # the labels of panels extend beyond the axes
         _draw_receptive_field(
-            panel, fit, int(index), relative[:, index], (distance, curve[index], noise[index]), columns
+            panel,
+            fit,
+            int(microphone_index),
+            relative[:, microphone_index],
+            (distance, curve[microphone_index], noise[microphone_index]),
+            columns,
         )
         panel.set_xlim(0, 1e3 * distance[-1])
         panel.set_ylim(low, high)
         panel.tick_params(labelleft=column == 0, labelbottom=panel_index + columns >= selected.size)
-    _label_panels(ax, fit, noise_shown=bool(noise[selected].max() > low))
+    _label_panels(ax, fit, has_noise_curve=bool(noise[selected].max() > low))
     return ax
 
 
-def _label_panels(ax: Axes, fit: CalibrationFit, *, noise_shown: bool) -> None:
+def _label_panels(ax: Axes, fit: CalibrationFit, *, has_noise_curve: bool) -> None:
     """Draw the axis labels shared by all panels, and the legend above the panels."""
     label_style: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "color": DARK_GREY}
     label_style["annotation_clip"] = False
@@ -271,7 +276,7 @@ def _label_panels(ax: Axes, fit: CalibrationFit, *, noise_shown: bool) -> None:
             [], [], color=DARK_GREY, linewidth=1.6, label=f"fit, {type(fit.calibration.microphone_array.decay).name}"
         ),
     ]
-    if noise_shown:
+    if has_noise_curve:
         handles.append(Line2D([], [], color=LIGHT_GREY, linewidth=1.0, linestyle=(0, (4, 3)), label="noise, 1 σ"))
     if fit.outlier.any():
         ring_style: dict[str, Any] = {"marker": "o", "linestyle": "none", "fillstyle": "none", "markersize": 4}
@@ -291,11 +296,13 @@ def _tap_strengths(fit: CalibrationFit) -> Float[np.ndarray, " T"]:
     return np.where(np.isfinite(fit.strength), fit.strength, median)
 
 
-def _draw_receptive_field(panel: Axes, fit: CalibrationFit, index: int, relative, lines, columns: int) -> None:
+def _draw_receptive_field(
+    panel: Axes, fit: CalibrationFit, microphone_index: int, relative, lines, columns: int
+) -> None:
     """Draw the panel of one microphone: taps, fitted decay model and noise. `lines`: distances in metres, the response
     at these distances, and the noise."""
     distance, curve, noise = lines
-    reason = fit.calibration.reasons[index]
+    reason = fit.calibration.reasons[microphone_index]
     is_positive = np.isfinite(relative) & (relative > 0)
     panel.set_yscale("log")
     for mask, style in (
@@ -306,20 +313,29 @@ def _draw_receptive_field(panel: Axes, fit: CalibrationFit, index: int, relative
         ),
     ):
         size = 9 if columns <= 2 else 5
-        panel.scatter(1e3 * fit.distance[mask, index], relative[mask], s=size, rasterized=True, **style)
+        panel.scatter(1e3 * fit.distance[mask, microphone_index], relative[mask], s=size, rasterized=True, **style)
     style = (
         {"color": LIGHT_GREY, "linewidth": 1.2, "linestyle": (0, (1, 1))}
         if reason
         else {"color": DARK_GREY, "linewidth": 1.6}
     )
     # No curve is drawn for a microphone without positive intensities.
-    is_in_range = (distance <= fit.distance[:, index].max()) & is_positive.any()
+    is_in_range = (distance <= fit.distance[:, microphone_index].max()) & is_positive.any()
     panel.plot(1e3 * distance[is_in_range], curve[is_in_range], zorder=3, **style)
     if noise > 0:
         panel.axhline(noise, color=LIGHT_GREY, linewidth=1.0, linestyle=(0, (4, 3)), zorder=1)
     fontsize = 8.5 if columns <= 5 else 7
     text_style: dict[str, Any] = {"transform": panel.transAxes, "va": "top", "path_effects": HALO, "zorder": 4}
-    panel.text(0.05, 0.97, str(index), ha="left", fontsize=fontsize, fontweight="bold", color=DARK_GREY, **text_style)
+    panel.text(
+        0.05,
+        0.97,
+        str(microphone_index),
+        ha="left",
+        fontsize=fontsize,
+        fontweight="bold",
+        color=DARK_GREY,
+        **text_style,
+    )
     if reason:
         short_reason = textwrap.shorten(reason.split(" (")[0], 60, placeholder=" …")
         wrapped_reason = textwrap.fill(short_reason, 24 if columns <= 5 else 18)

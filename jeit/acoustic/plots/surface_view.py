@@ -48,7 +48,7 @@ class View(NamedTuple):
     def chart(self, points: ArrayLike, name: str) -> np.ndarray:
         """Chart coordinates (n, 2) of `points` (n, d) in metres. Raises `ValueError` for other shapes; `name` is the
         argument's name in the message."""
-        return chart_of(self.surface, points, name)
+        return project_to_chart(self.surface, points, name)
 
     def chart_point(self, point: ArrayLike, name: str) -> np.ndarray:
         """Chart coordinates (2,) of one `point` (d,) in metres. Raises `ValueError` for a different shape; `name` is
@@ -73,7 +73,7 @@ class View(NamedTuple):
         return jacobian @ matrix @ jacobian.T
 
 
-def view_of(surface: AnySurface, microphones: ArrayLike | None = None, usable: ArrayLike | None = None) -> View:
+def create_view(surface: AnySurface, microphones: ArrayLike | None = None, usable: ArrayLike | None = None) -> View:
     """Create the view of the surface of a calibration, a microphone array, a surface or an outline.
 
     `microphones` (M, d): positions of the microphones in metres, by default those of the calibration or array. `usable`
@@ -86,7 +86,7 @@ def view_of(surface: AnySurface, microphones: ArrayLike | None = None, usable: A
         microphones = surface.microphones if microphones is None else microphones
         surface = surface.surface
     host_surface: AbstractSurface = on_host(surface if isinstance(surface, AbstractSurface) else make_surface(surface))
-    positions = np.zeros((0, 2)) if microphones is None else chart_of(host_surface, microphones, "microphones")
+    positions = np.zeros((0, 2)) if microphones is None else project_to_chart(host_surface, microphones, "microphones")
     usable_mask = np.ones(len(positions), bool) if usable is None else np.asarray(usable, bool)
     if usable_mask.shape != (len(positions),):
         raise ValueError(
@@ -95,7 +95,7 @@ def view_of(surface: AnySurface, microphones: ArrayLike | None = None, usable: A
     return View(host_surface, positions, usable_mask)
 
 
-def chart_of(surface: AbstractSurface, points: ArrayLike, name: str) -> np.ndarray:
+def project_to_chart(surface: AbstractSurface, points: ArrayLike, name: str) -> np.ndarray:
     """Chart coordinates (n, 2) of `points` (n, d) in metres. Raises `ValueError` for other shapes; `name` is the
     argument's name in the message."""
     coordinates = np.asarray(points, float)
@@ -104,7 +104,7 @@ def chart_of(surface: AbstractSurface, points: ArrayLike, name: str) -> np.ndarr
     return np.asarray(surface.project(host.asarray(coordinates.T))).T
 
 
-def outline_of(view: View) -> Path:
+def outline_path(view: View) -> Path:
     """Path of the surface's outline and its holes in chart coordinates."""
     loops = (Path(np.concatenate([loop, loop[:1]]), closed=True) for loop in view.surface.outline.loops())
     return Path.make_compound_path(*loops)
@@ -114,7 +114,7 @@ def draw_surface(ax: Axes, view: View, *, microphones: bool = True, faint: bool 
     """Draw the surface's outline, a scale bar and the microphones, with crosses for unusable microphones. Returns the
     legend entries."""
     ax.add_patch(
-        PathPatch(outline_of(view), facecolor="none", edgecolor=DARK_GREY, linewidth=0.9, joinstyle="round", zorder=2)
+        PathPatch(outline_path(view), facecolor="none", edgecolor=DARK_GREY, linewidth=0.9, joinstyle="round", zorder=2)
     )
     # Microphones may lie outside the outline.
     shown_points = np.concatenate([np.reshape(view.extent, (2, 2)).T, view.microphones])
@@ -148,13 +148,13 @@ def draw_surface(ax: Axes, view: View, *, microphones: bool = True, faint: bool 
     return handles
 
 
-def draw_ellipse(ax: Axes, middle: np.ndarray, covariance: np.ndarray, *, colour: str = ESTIMATE_COLOUR) -> None:
-    """Draw the 95 % ellipse of a normal distribution with mean `middle` (2,) in metres and `covariance` (2, 2) in
+def draw_ellipse(ax: Axes, centre: np.ndarray, covariance: np.ndarray, *, colour: str = ESTIMATE_COLOUR) -> None:
+    """Draw the 95 % ellipse of a normal distribution with mean `centre` (2,) in metres and `covariance` (2, 2) in
     m²."""
     variances, axes = np.linalg.eigh(covariance)
     major_axis, minor_axis = 2 * _ELLIPSE_RADIUS * np.sqrt(np.maximum(variances[::-1], 0))
     angle = np.degrees(np.arctan2(axes[1, 1], axes[0, 1]))
-    x, y = middle
+    x, y = centre
     ellipse = Ellipse(
         (x, y), major_axis, minor_axis, angle=angle, fill=False, edgecolor=colour, linewidth=1.4, zorder=4
     )

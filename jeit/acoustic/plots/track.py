@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from jeit.acoustic import Calibration, MicrophoneArray
 from jeit.acoustic.localisation.locations import Locations, LocationStatus
-from jeit.acoustic.plots.surface_view import View, draw_ellipse, draw_legend, draw_surface, outline_of, view_of
+from jeit.acoustic.plots.surface_view import View, create_view, draw_ellipse, draw_legend, draw_surface, outline_path
 from jeit.acoustic.touch_tracks import Touch, Track
 from jeit.arguments import check_kind
 from jeit.plot.axes import axes_or_new
@@ -77,7 +77,7 @@ def plot_track(
     """
     check_kind("track", track, Track, "a Track, as of jeit.acoustic.track(locations)")
     check_kind("locations", locations, Locations, "Locations, as of jeit.acoustic.locate")
-    view = view_of(array)
+    view = create_view(array)
     num_microphones = len(view.microphones)
     if locations.used.shape != (len(track.times), num_microphones) or track.position.shape != locations.position.shape:
         raise ValueError(
@@ -95,7 +95,7 @@ def plot_track(
     if image is not None:
         style: dict[str, Any] = {"interpolation": "bilinear", "cmap": _OVERLAY_COLOURS, "clim": (0, 1)}
         image_artist = ax.imshow(np.nan_to_num(image), extent=view.extent, origin="lower", **style)
-        image_artist.set_clip_path(outline_of(view), ax.transData)
+        image_artist.set_clip_path(outline_path(view), ax.transData)
     handles = draw_surface(ax, view, faint=True)
     ax.set_title(title or "")
     if true_path is not None:
@@ -158,17 +158,17 @@ def _draw_touch(
         )
         return [] if "touch, 95 %" in existing_labels else [dot_handle]
     segments = np.stack([positions[:-1], positions[1:]], axis=1)
-    for width, colours, order in (
+    for width, colours, draw_order in (
         (5.0, "white", 3.4),
         (3.0, time_colours.to_rgba((frame_times[:-1] + frame_times[1:]) / 2), 3.5),
     ):
-        line = LineCollection(list(segments), colors=colours, linewidths=width, capstyle="round", zorder=order)
+        line = LineCollection(list(segments), colors=colours, linewidths=width, capstyle="round", zorder=draw_order)
         ax.add_collection(line)
-    ends = []
+    end_handles = []
     for position, marker, name in ((positions[0], "o", "onset"), (positions[-1], "s", "offset")):
         end = ax.plot(*position, marker=marker, markersize=7.5, markerfacecolor="white", **mark_style, label=name)
-        ends += [] if name in existing_labels else end
-    return ends
+        end_handles += [] if name in existing_labels else end
+    return end_handles
 
 
 def _draw_frames(ax: Axes, view: View, track: Track, locations: Locations, time_colours: ScalarMappable) -> list:

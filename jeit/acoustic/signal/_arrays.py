@@ -18,15 +18,15 @@ _MAX_OUTSIDE_SHARE, _MIN_SPACING = 0.05, 1e-6  # of the length; m
 _MAX_COORDINATE = 1e9
 
 
-def choose_array(arrays: dict[str, np.ndarray], first: str, second: str) -> str:
-    """Return which of two alternative arrays a file contains: the name `first` or `second`. Raises `ValueError` if the
-    file contains both arrays or neither."""
-    if first in arrays and second in arrays:
-        raise ValueError(f"it holds both '{first}' and '{second}'; keep the one to use.")
-    if second not in arrays and first not in arrays:
+def choose_array(arrays: dict[str, np.ndarray], first_name: str, second_name: str) -> str:
+    """Return which of two alternative arrays a file contains: the name `first_name` or `second_name`. Raises
+    `ValueError` if the file contains both arrays or neither."""
+    if first_name in arrays and second_name in arrays:
+        raise ValueError(f"it holds both '{first_name}' and '{second_name}'; keep the one to use.")
+    if second_name not in arrays and first_name not in arrays:
         names = ", ".join(str(name) for name in arrays[""][:12]) or "nothing"
-        raise ValueError(f"there is neither '{second}' nor '{first}'; the file holds {names}.")
-    return first if first in arrays else second
+        raise ValueError(f"there is neither '{second_name}' nor '{first_name}'; the file holds {names}.")
+    return first_name if first_name in arrays else second_name
 
 
 def short_text(values: np.ndarray) -> str:
@@ -101,11 +101,11 @@ def check_coordinates(value, label: str, dimension: tuple[int, ...]) -> np.ndarr
 def check_extent(points: np.ndarray, label: str) -> None:
     """Raise `ValueError` if the extent of points (n, d) along an axis exceeds the maximum plausible length of a
     skin."""
-    extent = np.ptp(points, axis=0).max()
-    if extent > MAX_EXTENT:
+    largest_side = np.ptp(points, axis=0).max()
+    if largest_side > MAX_EXTENT:
         raise ValueError(
-            f"{label} spread over {extent:.4g}: are these metres? Divide millimetres by 1000; no side may be longer "
-            f"than {MAX_EXTENT:g} m."
+            f"{label} spread over {largest_side:.4g}: are these metres? Divide millimetres by 1000; no side may be "
+            f"longer than {MAX_EXTENT:g} m."
         )
 
 
@@ -113,34 +113,34 @@ def check_microphones(positions: np.ndarray, skin: np.ndarray) -> None:
     """Raise `ValueError` if two microphones with `positions` (M, d) coincide, or if a microphone is farther from the
     bounding box of the points `skin` (n, d) than the length of this box. All coordinates are in metres."""
     low, high = skin.min(axis=0), skin.max(axis=0)
-    extent = (high - low).max()
+    largest_side = (high - low).max()
     distances = np.linalg.norm(positions - np.clip(positions, low, high), axis=1)
-    farthest = int(distances.argmax())
-    if distances[farthest] > extent:
+    farthest_index = int(distances.argmax())
+    if distances[farthest_index] > largest_side:
         raise ValueError(
-            f"microphones: number {farthest} at {positions[farthest].tolist()} is {distances[farthest]:.3g} m away "
-            f"from a skin that is only {extent:.3g} m long: are these metres, in the outline's coordinates? Divide "
-            "millimetres by 1000."
+            f"microphones: number {farthest_index} at {positions[farthest_index].tolist()} is "
+            f"{distances[farthest_index]:.3g} m away from a skin that is only {largest_side:.3g} m long: are these "
+            "metres, in the outline's coordinates? Divide millimetres by 1000."
         )
     pairs = sorted(KDTree(positions).query_pairs(_MIN_SPACING))
     if pairs:
-        first, second = pairs[0]
+        first_index, second_index = pairs[0]
         raise ValueError(
-            f"microphones: numbers {first} and {second} are at the same place, {positions[first].tolist()}; give each "
-            "its own."
+            f"microphones: numbers {first_index} and {second_index} are at the same place, "
+            f"{positions[first_index].tolist()}; give each its own."
         )
 
 
 def check_taps(positions: np.ndarray, outline: np.ndarray) -> None:
     """Raise `ValueError` if one of the taps at `positions` (T, 2) is outside the `outline` (K, 2) by more than 5 % of
     the skin's length."""
-    extent = np.ptp(outline, axis=0).max()
-    outside = np.flatnonzero(~is_inside_loops(positions, [outline]))
-    distances = distance(positions[outside], outline, np.roll(outline, -1, axis=0)).min(axis=1)
-    if outside.size and distances.max() > _MAX_OUTSIDE_SHARE * extent:
-        row = int(outside[distances.argmax()])
+    largest_side = np.ptp(outline, axis=0).max()
+    indices_outside = np.flatnonzero(~is_inside_loops(positions, [outline]))
+    distances = distance(positions[indices_outside], outline, np.roll(outline, -1, axis=0)).min(axis=1)
+    if indices_outside.size and distances.max() > _MAX_OUTSIDE_SHARE * largest_side:
+        row = int(indices_outside[distances.argmax()])
         raise ValueError(
             f"positions: row {row}, {positions[row].tolist()}, is {1e3 * distances.max():.3g} mm outside the outline; "
-            f"taps must be on the skin, or within {1e3 * _MAX_OUTSIDE_SHARE * extent:.3g} mm of it. Correct the place, "
-            "or leave the tap out."
+            f"taps must be on the skin, or within {1e3 * _MAX_OUTSIDE_SHARE * largest_side:.3g} mm of it. Correct the "
+            "place, or leave the tap out."
         )

@@ -48,10 +48,10 @@ def sample_faults(
         if not is_finite.any():
             return codes, "dead: every sample is NaN or infinite"
         samples = np.where(is_finite, samples, np.nan)
-    lowest, highest = np.fmin.reduce(samples), np.fmax.reduce(samples)
-    if lowest == highest:
-        return codes, f"dead: every {'' if all_finite else 'finite '}sample is {lowest:g}"
-    is_stuck = _stuck_samples(samples, rate, float(highest - lowest))
+    min_sample, max_sample = np.fmin.reduce(samples), np.fmax.reduce(samples)
+    if min_sample == max_sample:
+        return codes, f"dead: every {'' if all_finite else 'finite '}sample is {min_sample:g}"
+    is_stuck = _stuck_samples(samples, rate, float(max_sample - min_sample))
     # A channel that stays at one end of its range is stuck, and does not clip.
     moving_samples = samples if is_stuck is None else np.where(is_stuck, np.nan, samples)
     is_clipped = _clipped_samples(moving_samples, full_scale)
@@ -63,28 +63,28 @@ def sample_faults(
 
 
 def window_faults(
-    codes: UInt8[np.ndarray, "*batch S"], dead: str, length: int, hop: int
+    codes: UInt8[np.ndarray, "*batch S"], dead_reason: str, length: int, hop: int
 ) -> tuple[Bool[np.ndarray, "*batch F"], str]:
     """Return the mask of the usable windows of one channel, and a description of the channel's faults ("" for none).
 
-    `codes`, `dead`: as returned by `sample_faults`. Windows of `length` samples begin every `hop` samples along the
-    last axis. A window with at least one faulty sample is not usable.
+    `codes`, `dead_reason`: as returned by `sample_faults`. Windows of `length` samples begin every `hop` samples along
+    the last axis. A window with at least one faulty sample is not usable.
     """
     num_windows = 1 + (codes.shape[-1] - length) // hop
     usable = np.ones((*codes.shape[:-1], num_windows), bool)
-    if dead:
-        return np.zeros_like(usable), dead
+    if dead_reason:
+        return np.zeros_like(usable), dead_reason
     if not codes.any():
         return usable, ""
     starts = hop * np.arange(num_windows)
     reasons = []
-    for code, word in _FAULT_WORDS.items():
+    for code, fault_name in _FAULT_WORDS.items():
         counts = np.cumsum(codes == code, axis=-1)
         counts = np.concatenate([np.zeros((*codes.shape[:-1], 1), int), counts], axis=-1)
         is_faulty = counts[..., starts + length] > counts[..., starts]
         if is_faulty.any():
             usable &= ~is_faulty
-            reasons.append(f"{word} in {_format_share(is_faulty)} windows")
+            reasons.append(f"{fault_name} in {_format_share(is_faulty)} windows")
     return usable, "; ".join(reasons)
 
 
@@ -139,9 +139,9 @@ def _converter_step(samples: np.ndarray) -> float:
     return float(np.fmin.reduce(np.where(change > 0, change, np.inf)))
 
 
-def _stuck_samples(samples: np.ndarray, rate: float, extent: float) -> Bool[np.ndarray, " S"] | None:
+def _stuck_samples(samples: np.ndarray, rate: float, sample_range: float) -> Bool[np.ndarray, " S"] | None:
     """Mask of the stuck samples, those in long constant stretches; None if no sample is stuck, or if the signal also
-    comes to rest elsewhere. `extent`: difference between the largest and smallest sample."""
+    comes to rest elsewhere. `sample_range`: difference between the largest and smallest sample."""
     min_length = max(_STUCK_SAMPLES, round(_STUCK_TIME * rate))
     # A stuck stretch covers at least two whole blocks. Stretches are searched for only if a block is constant, which
     # saves time.
@@ -151,29 +151,29 @@ def _stuck_samples(samples: np.ndarray, rate: float, extent: float) -> Bool[np.n
     if not (block_ranges == 0).any():
         return None
     # Each flag stands for a pair of equal successive samples, so a run of n flags is a stretch of n + 1 samples.
-    start, stop = _true_runs(samples[1:] == samples[:-1])
-    is_long = stop - start + 1 >= min_length
+    run_starts, run_ends = _true_runs(samples[1:] == samples[:-1])
+    is_long = run_ends - run_starts + 1 >= min_length
     if not is_long.any():
         return None
     is_stuck = np.zeros(samples.shape, bool)
-    for first_flag, last_flag in zip(start[is_long], stop[is_long], strict=True):
+    for first_flag, last_flag in zip(run_starts[is_long], run_ends[is_long], strict=True):
         is_stuck[first_flag : last_flag + 1] = True
     # Silence can be constant too: with a coarse converter, or in a simulation without noise. The sound then fades into
     # silence, so that some other blocks are almost constant. In a stuck channel with noise, no other block is almost
     # constant.
     is_moving = ~is_stuck[: blocks.size].reshape(blocks.shape).any(axis=1) & np.isfinite(block_ranges)
-    rest_range = max(_REST_STEPS * _converter_step(samples), _REST_RANGE * extent)
+    rest_range = max(_REST_STEPS * _converter_step(samples), _REST_RANGE * sample_range)
     return None if is_moving.any() and block_ranges[is_moving].min() <= rest_range else is_stuck
 
 
 def _clipped_samples(samples: np.ndarray, full_scale: float | None) -> Bool[np.ndarray, " S"] | None:
     """Mask of the samples at an end of the channel's range, if the channel's peaks are cut off there; None if no peak
     is cut off."""
-    lowest, highest = np.fmin.reduce(samples), np.fmax.reduce(samples)
+    min_sample, max_sample = np.fmin.reduce(samples), np.fmax.reduce(samples)
     is_clipped = None
     step = samples_per_value = 0.0
-    for sign, peak in ((1.0, highest), (-1.0, -lowest)):
-        heights = [_TOP_RANGE * (highest - lowest)]
+    for sign, peak in ((1.0, max_sample), (-1.0, -min_sample)):
+        heights = [_TOP_RANGE * (max_sample - min_sample)]
         if full_scale is not None and peak >= (1 - _TOP_FULL_SCALE) * full_scale:
             heights.append(peak - (1 - _TOP_FULL_SCALE) * full_scale)
         distance_below_top = peak - sign * samples
@@ -183,16 +183,16 @@ def _clipped_samples(samples: np.ndarray, full_scale: float | None) -> Bool[np.n
         if not samples_per_value:
             step, samples_per_value = _converter_step(samples), _samples_per_value(samples)
         for height in heights:
-            near_top = distance_below_top <= height + step
-            if _has_clipped_peak(distance_below_top, near_top, height + 2 * step, samples_per_value):
-                is_clipped = near_top if is_clipped is None else is_clipped | near_top
+            is_near_top = distance_below_top <= height + step
+            if _has_clipped_peak(distance_below_top, is_near_top, height + 2 * step, samples_per_value):
+                is_clipped = is_near_top if is_clipped is None else is_clipped | is_near_top
     return is_clipped
 
 
 def _has_clipped_peak(
-    distance_below_top: np.ndarray, near_top: Bool[np.ndarray, " S"], height: float, samples_per_value: float
+    distance_below_top: np.ndarray, is_near_top: Bool[np.ndarray, " S"], height: float, samples_per_value: float
 ) -> bool:
-    """Whether any run of samples in the mask `near_top` is a clipped peak.
+    """Whether any run of samples in the mask `is_near_top` is a clipped peak.
 
     `distance_below_top` (S,): distance of each sample below the top. `samples_per_value`: number of samples per
     converted value. An unclipped peak is nearly a parabola: if n successive converted values stay within `height` of
@@ -200,15 +200,15 @@ def _has_clipped_peak(
     falls by much more, about the height that was cut off. Slow or loud peaks are thus accepted, however many samples
     are near the top, and so is a single value that the converter holds for several samples.
     """
-    start, stop = _true_runs(near_top)
-    values_per_run = (stop - start) / samples_per_value
+    run_starts, run_ends = _true_runs(is_near_top)
+    values_per_run = (run_ends - run_starts) / samples_per_value
     for run_index in np.flatnonzero(values_per_run >= _MIN_FLAT_VALUES):
-        num_values, first, last = values_per_run[run_index], start[run_index], stop[run_index]
+        num_values, run_start, run_end = values_per_run[run_index], run_starts[run_index], run_ends[run_index]
         num_values_beyond = max(1, int(num_values) // 2)
         num_samples_beyond = int(num_values_beyond * samples_per_value)
         sides = (
-            distance_below_top[max(0, first - num_samples_beyond) : first],
-            distance_below_top[last : last + num_samples_beyond],
+            distance_below_top[max(0, run_start - num_samples_beyond) : run_start],
+            distance_below_top[run_end : run_end + num_samples_beyond],
         )
         smallest_fall = min(np.fmax.reduce(side) if side.size else np.inf for side in sides)
         if (

@@ -96,14 +96,14 @@ def band_power(samples: np.ndarray, grid: WindowGrid) -> np.ndarray:
     windows = sliding_window_view(samples, grid.length, axis=-1)[:, :: grid.hop]
     num_microphones, num_windows = windows.shape[:2]
     power = np.empty((num_windows, num_microphones))
-    last = grid.first + len(grid.weights)
+    last_bin = grid.first + len(grid.weights)
     chunk_size = max(1, _MAX_CHUNK_SAMPLES // (num_microphones * grid.length))
-    taper_spectrum = np.fft.rfft(grid.taper)[grid.first : last]
+    taper_spectrum = np.fft.rfft(grid.taper)[grid.first : last_bin]
     buffer = np.empty(num_microphones * min(chunk_size, num_windows) * grid.length)
     for start in range(0, num_windows, chunk_size):
         chunk = windows[:, start : start + chunk_size]
         tapered = np.multiply(chunk, grid.taper, out=buffer[: chunk.size].reshape(chunk.shape))
-        spectrum = np.asarray(scipy.fft.rfft(tapered, workers=2))[..., grid.first : last]
+        spectrum = np.asarray(scipy.fft.rfft(tapered, workers=2))[..., grid.first : last_bin]
         if grid.first < 2:
             # In bins from 2 on, the transform of the Hann window is zero, and the mean of the window has no effect.
             spectrum = spectrum - chunk.mean(axis=-1)[..., None] * taper_spectrum
@@ -252,15 +252,15 @@ def intensities(
     ]
     usable = np.stack([usable_windows for usable_windows, _ in fault_results], axis=1)
     power = band_power(samples, grid)
-    freedom = white_noise_degrees_of_freedom(grid)
-    noise = noise_floor(power, usable, freedom) if floor is None else _check_floor(floor, samples.shape[0])
+    degrees_of_freedom = white_noise_degrees_of_freedom(grid)
+    noise = noise_floor(power, usable, degrees_of_freedom) if floor is None else _check_floor(floor, samples.shape[0])
     times = (grid.hop * np.arange(len(power)) + grid.length / 2) / rate
     faults = tuple(reason for _, reason in fault_results)
     return Intensities(
         times,
         power - noise,
         floor=noise,
-        freedom=freedom,
+        freedom=degrees_of_freedom,
         overlap=grid.length / grid.hop,
         usable=usable,
         faults=faults,
@@ -275,9 +275,9 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     The loudness of a window is the sum over microphones of (power − floor) / floor; the tap is audible where the
     loudness is at least half its maximum. A microphone with a fault in one of the audible windows is not usable for the
     tap, since other windows have a different loudness. The noise floor is estimated from the quietest windows of all
-    taps, so the recordings should include some silence before or after the taps. The field `freedom` of the result
-    accounts for the overlap of windows (exactly for white noise), but not for the selection of windows. If a tap is not
-    audible at all, the loudest windows of noise are selected, and the power of the tap is somewhat too high.
+    taps, so the recordings should include some silence before or after the taps. The field `freedom` of the
+    result accounts for the overlap of windows (exactly for white noise), but not for the selection of windows. If a tap
+    is not audible at all, the loudest windows of noise are selected, and the power of the tap is somewhat too high.
 
     **Arguments:**
 
@@ -307,15 +307,15 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     for m in range(samples.shape[1]):
         # All taps of a microphone are tested for faults together, since range, converter step and silence are
         # properties of the channel.
-        codes, dead = sample_faults(samples[:, m].ravel(), rate, taps.full_scale)
-        mask, reason = window_faults(codes.reshape(-1, samples.shape[-1]), dead, grid.length, grid.hop)
+        codes, dead_reason = sample_faults(samples[:, m].ravel(), rate, taps.full_scale)
+        mask, reason = window_faults(codes.reshape(-1, samples.shape[-1]), dead_reason, grid.length, grid.hop)
         usable_masks.append(mask)
         faults.append(reason)
     usable = np.stack(usable_masks, axis=-1)
     power = np.stack([band_power(tap, grid) for tap in samples])
     num_taps, num_windows, num_microphones = power.shape
-    freedom = white_noise_degrees_of_freedom(grid)
-    floor = noise_floor(power.reshape(-1, num_microphones), usable.reshape(-1, num_microphones), freedom)
+    degrees_of_freedom = white_noise_degrees_of_freedom(grid)
+    floor = noise_floor(power.reshape(-1, num_microphones), usable.reshape(-1, num_microphones), degrees_of_freedom)
     # A minimum noise floor prevents a simulated channel without noise from dominating the loudness. Dead channels are
     # ignored.
     is_alive = usable.any(axis=(0, 1))
@@ -326,29 +326,31 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     is_audible |= loudness == loudness.max(axis=1, keepdims=True)
     mean = np.einsum("tf,tfm->tm", is_audible, power) / is_audible.sum(axis=1)[:, None]
     correlation = noise_correlation(grid, num_windows)
-    tap_freedom = np.array([freedom * mask.sum() ** 2 / correlation[np.ix_(mask, mask)].sum() for mask in is_audible])
+    tap_freedom = np.array(
+        [degrees_of_freedom * mask.sum() ** 2 / correlation[np.ix_(mask, mask)].sum() for mask in is_audible]
+    )
     all_usable = (usable | ~is_audible[..., None]).all(axis=1)
     return TapIntensities(mean - floor, floor, tap_freedom, all_usable, tuple(faults))
 
 
 def noise_floor(
-    power: Float[np.ndarray, "F M"], usable: Bool[np.ndarray, "F M"], freedom: float, share: float = 0.2
+    power: Float[np.ndarray, "F M"], usable: Bool[np.ndarray, "F M"], degrees_of_freedom: float, share: float = 0.2
 ) -> Float[np.ndarray, " M"]:
     """Estimate the noise floor (M,), the mean band power of the noise, from F windows of which some contain touches.
 
-    `share`: minimum fraction of the windows that are free of touches. `freedom`: degrees of freedom ν of the power of
-    noise. The initial estimate is a low quantile of the powers divided by the same quantile of χ²_ν / ν, as in minimum
-    statistics (R. Martin, IEEE Trans. Speech Audio Process. 9, 504-512, 2001). The initial estimate is too high by up
-    to a few tenths of the floor if most windows are loud, since the actual fraction of quiet windows is unknown. The
-    floor is refined iteratively: the new floor is the mean of the powers below c times the floor, divided by the mean
-    of χ²_ν / ν truncated at c. If ν is infinite, the low quantile itself is returned. The floor of a channel without
-    usable windows is 0.
+    `share`: minimum fraction of the windows that are free of touches. `degrees_of_freedom`: degrees of freedom ν of the
+    power of noise. The initial estimate is a low quantile of the powers divided by the same quantile of χ²_ν / ν, as in
+    minimum statistics (R. Martin, IEEE Trans. Speech Audio Process. 9, 504-512, 2001). The initial estimate is too high
+    by up to a few tenths of the floor if most windows are loud, since the actual fraction of quiet windows is unknown.
+    The floor is refined iteratively: the new floor is the mean of the powers below c times the floor, divided by the
+    mean of χ²_ν / ν truncated at c. If ν is infinite, the low quantile itself is returned. The floor of a channel
+    without usable windows is 0.
 
     If the noise is not white, its power varies more than ν indicates, and the noise floor is underestimated: by 8 % for
     a spectrum 1/f from 50 to 1000 Hz, and by a third for 1/f².
 
-    Raises `ValueError` for shapes that disagree, usable windows whose power is not finite, and a `share` or `freedom`
-    out of range.
+    Raises `ValueError` for shapes that disagree, usable windows whose power is not finite, and a `share` or
+    `degrees_of_freedom` out of range.
     """
     power, usable = np.asarray(power, float), np.asarray(usable)
     if power.ndim != 2 or usable.shape != power.shape or usable.dtype != bool:
@@ -358,8 +360,8 @@ def noise_floor(
         )
     if not 0 < share <= 1:
         raise ValueError(f"share must be a part of the windows, above 0 and up to 1; it is {share!r}.")
-    if not freedom > 0:
-        raise ValueError(f"freedom must be positive; it is {freedom!r}.")
+    if not degrees_of_freedom > 0:
+        raise ValueError(f"freedom must be positive; it is {degrees_of_freedom!r}.")
     if not (np.isfinite(power) | ~usable).all():
         raise ValueError("power is NaN or infinite in windows that usable calls usable; mark those False.")
     num_usable = usable.sum(axis=0)
@@ -368,9 +370,9 @@ def noise_floor(
     rank = np.clip(np.floor(0.5 * share * num_usable).astype(int), 0, max(len(power) - 1, 0))
     floor = np.take_along_axis(sorted_power, rank[None], axis=0)[0] if len(power) else np.zeros(power.shape[1])
     floor = np.where(num_usable > 0, floor, 0.0)
-    if np.isinf(freedom):
+    if np.isinf(degrees_of_freedom):
         return floor
-    half_freedom = freedom / 2
+    half_freedom = degrees_of_freedom / 2
     # Quantiles of χ²_ν / ν, and the mean of χ²_ν / ν below the cut-off c: ∫_0^c y p(y) dy is the distribution function
     # of χ² with ν + 2 degrees of freedom, at ν c.
     floor = floor / (gammaincinv(half_freedom, 0.5 * share) / half_freedom)

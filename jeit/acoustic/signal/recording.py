@@ -139,8 +139,10 @@ class Intensities(Module):
         )
         shape, num_windows = self.power.shape, len(self.times)
         if shape[0] != num_windows:
-            hint = " It looks transposed: give (windows, microphones)." if shape[1] == num_windows else ""
-            raise ValueError(f"intensity has shape {shape}, but there are {num_windows} times, one a window.{hint}")
+            shape_hint = " It looks transposed: give (windows, microphones)." if shape[1] == num_windows else ""
+            raise ValueError(
+                f"intensity has shape {shape}, but there are {num_windows} times, one a window.{shape_hint}"
+            )
         if not np.isfinite(self.times).all() or (np.diff(self.times) <= 0).any():
             raise ValueError("times must be finite and increasing, in seconds: the middle of each window.")
         self.floor = np.zeros(shape[1]) if floor is None else real_array_of(floor, "floor", "microphones")
@@ -236,19 +238,22 @@ class Taps(Module):
         if is_plane:
             check_taps(self.positions, self.outline)
         if (power is None) == (samples is None):
-            supplied = "neither" if power is None else "both"
-            raise ValueError(f"taps need either intensity or samples with their rate; {supplied} were given.")
-        expected = (len(self.positions), len(self.microphones))
+            given_arrays = "neither" if power is None else "both"
+            raise ValueError(f"taps need either intensity or samples with their rate; {given_arrays} were given.")
+        expected_shape = (len(self.positions), len(self.microphones))
         self.power = None if power is None else real_array_of(power, "intensity", "taps, microphones")
         self.samples = None if samples is None else real_array_of(samples, "samples", "taps, microphones, samples")
         label, values = ("intensity", self.power) if self.samples is None else ("samples", self.samples)
         assert values is not None
-        if values.shape[:2] != expected:
-            transposed = values.shape == expected[::-1] or (values.ndim == 3 and values.shape[::2] == expected)
-            hint = " It looks transposed." if transposed else ""
+        if values.shape[:2] != expected_shape:
+            transposed = values.shape == expected_shape[::-1] or (
+                values.ndim == 3 and values.shape[::2] == expected_shape
+            )
+            shape_hint = " It looks transposed." if transposed else ""
             raise ValueError(
-                f"{label} has shape {values.shape}, but there are {expected[0]} positions and {expected[1]} "
-                f"microphones: give (taps, microphones{', samples' if values.ndim == 3 else ''}).{hint}"
+                f"{label} has shape {values.shape}, but there are {expected_shape[0]} positions and "
+                f"{expected_shape[1]} microphones: give (taps, microphones{', samples' if values.ndim == 3 else ''})."
+                f"{shape_hint}"
             )
         if self.samples is not None and rate is None:
             raise ValueError("rate is missing: samples need the samples a second of each microphone, in Hz.")
@@ -287,8 +292,8 @@ def read_recording(path: str | Path) -> Recording | Intensities:
         arrays = npz_arrays(
             path, "samples", "rate", "full_scale", "intensity", "times", *optional, otherwise=_UNKNOWN_FORMAT
         )
-        content = choose_array(arrays, "intensity", "samples")
-        if content == "samples":
+        array_name = choose_array(arrays, "intensity", "samples")
+        if array_name == "samples":
             if arrays["samples"].ndim == 3:
                 raise ValueError("samples has three axes, as a file of taps has: read that with read_taps.")
             require_arrays(arrays, "rate")
@@ -325,9 +330,9 @@ def read_taps(path: str | Path) -> Taps:
         keys = (*geometry, "intensity", "samples", "rate", "full_scale")
         arrays = npz_arrays(path, *keys, otherwise=_UNKNOWN_FORMAT)
         require_arrays(arrays, *geometry)
-        content = choose_array(arrays, "intensity", "samples")
-        arguments = {"power" if content == "intensity" else "samples": arrays[content]}
-        if content == "samples":
+        array_name = choose_array(arrays, "intensity", "samples")
+        arguments = {"power" if array_name == "intensity" else "samples": arrays[array_name]}
+        if array_name == "samples":
             require_arrays(arrays, "rate")
             arguments |= {"rate": arrays["rate"]}
         full_scale = arrays.get("full_scale")

@@ -324,9 +324,14 @@ def simulate_sound_clips(
     return _generate_clips(key, skin, people, each, tuple(modalities), duration)
 
 
-def _generate_clips(key, skin, people, num_each, modalities, duration) -> Iterator[SoundClip]:
+def _generate_clips(key, skin, people, num_clips_per_label, modalities, duration) -> Iterator[SoundClip]:
     num_samples = len(sample_times(skin, duration))
-    labels = [(person, modality) for person in range(len(people)) for modality in modalities for _ in range(num_each)]
+    labels = [
+        (person, modality)
+        for person in range(len(people))
+        for modality in modalities
+        for _ in range(num_clips_per_label)
+    ]
     for clip_index, (person, modality) in enumerate(labels):
         touch_key, noise_key, room_key, level_key = jax.random.split(jax.random.fold_in(key, clip_index), 4)
         touch = people[person].touch(touch_key, modality, skin, duration=duration)

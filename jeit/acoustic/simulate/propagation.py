@@ -18,22 +18,22 @@ def band_filter(skin: SoundingSkin, frequencies: Float[Array, " F"]) -> Float[Ar
     band, and 0 more than half an octave outside."""
     octaves = jnp.log2(jnp.maximum(frequencies, 1e-9))
     low, high = jnp.log2(skin.readout.band[0]), jnp.log2(skin.readout.band[1])
-    rising, falling = jnp.clip(octaves - low + 0.5, 0, 1), jnp.clip(high - octaves + 0.5, 0, 1)
-    return (jnp.sin(jnp.pi / 2 * rising) * jnp.sin(jnp.pi / 2 * falling)) ** 2
+    rising_edge, falling_edge = jnp.clip(octaves - low + 0.5, 0, 1), jnp.clip(high - octaves + 0.5, 0, 1)
+    return (jnp.sin(jnp.pi / 2 * rising_edge) * jnp.sin(jnp.pi / 2 * falling_edge)) ** 2
 
 
 def source_density(skin: SoundingSkin, frequencies: Float[Array, " F"]) -> Float[Array, " F"]:
     """Power spectral density (F,) of a source of strength 1 at `frequencies` (F,) in Hz, in 1/Hz. The integral of the
     density over positive frequencies is 1."""
 
-    lowest, highest = skin.readout.band
+    lowest_frequency, highest = skin.readout.band
 
     def unnormalised_density(f):
-        return band_filter(skin, f) * (jnp.maximum(f, 1e-9) / lowest) ** -skin.spectral_slope
+        return band_filter(skin, f) * (jnp.maximum(f, 1e-9) / lowest_frequency) ** -skin.spectral_slope
 
     # The integral uses a uniform grid of log-frequency, in which both edges of the band filter have the same width: ∫ S
     # df = ∫ S f d(ln f).
-    grid = lowest * jnp.exp(jnp.linspace(-0.35, jnp.log(highest / lowest) + 0.35, 2001))
+    grid = lowest_frequency * jnp.exp(jnp.linspace(-0.35, jnp.log(highest / lowest_frequency) + 0.35, 2001))
     return unnormalised_density(frequencies) / jnp.trapezoid(unnormalised_density(grid) * grid, jnp.log(grid))
 
 
@@ -62,17 +62,17 @@ def transfer(skin: SoundingSkin, frequencies: Float[Array, " F"], position: Floa
         * skin.gain[:, None]
     )
     decay = layer.material.loss(frequencies) + 1j * layer.material.wavenumber(frequencies)
-    received = jnp.sum(amplitude[..., None] * jnp.exp(-path_lengths[..., None] * decay), axis=1)
+    received_amplitude = jnp.sum(amplitude[..., None] * jnp.exp(-path_lengths[..., None] * decay), axis=1)
     if not skin.readout.multiplexed:
-        return received
+        return received_amplitude
     # Microphone i is connected to slot i mod 4 of multiplexer i div 4. The slot read 25 µs earlier may have no
     # microphone.
     index = np.arange(skin.num_microphones)
     previous_index = index - index % NUM_SLOTS + (index - 1) % NUM_SLOTS
     has_previous = previous_index < skin.num_microphones
-    crosstalk = jnp.where(has_previous[:, None], received[np.where(has_previous, previous_index, 0)], 0)
-    received += skin.readout.coupling * crosstalk * jnp.exp(-2j * jnp.pi * frequencies * SLOT_TIME)
-    return received * jnp.exp(2j * jnp.pi * frequencies * skin.stagger[:, None])
+    crosstalk = jnp.where(has_previous[:, None], received_amplitude[np.where(has_previous, previous_index, 0)], 0)
+    received_amplitude += skin.readout.coupling * crosstalk * jnp.exp(-2j * jnp.pi * frequencies * SLOT_TIME)
+    return received_amplitude * jnp.exp(2j * jnp.pi * frequencies * skin.stagger[:, None])
 
 
 def expected_power(skin: SoundingSkin, positions) -> Float[np.ndarray, "P M"]:

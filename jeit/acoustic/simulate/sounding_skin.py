@@ -233,17 +233,17 @@ class ElastomerLayer(Module):
         if not np.isfinite(positions).all():
             raise ValueError(f"{name}: row {np.argmin(np.isfinite(positions).all(axis=1))} is not finite.")
         half_size = np.array([self.width, self.height]) / 2 * (1 + 1e-9)
-        outside = (np.abs(positions) > half_size).any(axis=1)
-        if outside.any():
-            row = int(np.argmax(outside))
-            in_millimetres = (np.abs(positions) > 10 * half_size).any() and (
+        is_outside = (np.abs(positions) > half_size).any(axis=1)
+        if is_outside.any():
+            row = int(np.argmax(is_outside))
+            looks_like_millimetres = (np.abs(positions) > 10 * half_size).any() and (
                 np.abs(positions) <= 1000 * half_size
             ).all()
-            hint = " Are they in millimetres? Divide by 1000." if in_millimetres else ""
+            unit_hint = " Are they in millimetres? Divide by 1000." if looks_like_millimetres else ""
             raise ValueError(
                 f"{name}: row {row}, ({positions[row, 0]:g}, {positions[row, 1]:g}) m, lies off the skin, which is "
                 f"{self.width:g} m by {self.height:g} m about the origin. Positions are in metres from its middle."
-                f"{hint}"
+                f"{unit_hint}"
             )
         return positions
 

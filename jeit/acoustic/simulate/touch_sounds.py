@@ -359,9 +359,9 @@ def _tap_samples(skin, keys, positions, strengths, envelope, level, size, bins):
                 spectrum += noise_spectrum(skin, noise_key, level, size, bins)
             return jnp.fft.irfft(spectrum, size)[:, : len(envelope)]
 
-        repeats = len(tap_strengths)
+        num_repetitions = len(tap_strengths)
         return jax.vmap(samples_of_tap)(
-            jax.random.split(source_key, repeats), jax.random.split(noise_key, repeats), tap_strengths
+            jax.random.split(source_key, num_repetitions), jax.random.split(noise_key, num_repetitions), tap_strengths
         )
 
     return jax.lax.map(samples_at_position, (keys, positions, strengths))

@@ -142,18 +142,18 @@ def _received_power(skin: SoundingSkin, positions: Array, frequencies: Array) ->
     by the total power of the sources."""
     total = jnp.zeros((skin.microphones.shape[0], len(frequencies)))
 
-    def add_source(index, total):
-        return total + jnp.abs(transfer(skin, frequencies, positions[index])) ** 2
+    def add_source(source_index, total):
+        return total + jnp.abs(transfer(skin, frequencies, positions[source_index])) ** 2
 
     return jax.lax.fori_loop(0, len(positions), add_source, total) / len(positions)
 
 
-def _spectral_density(skin: SoundingSkin, slope: float, received: ArrayLike) -> Float[np.ndarray, "M G"]:
-    """Power spectral densities (M, G) at the microphones, in 1/Hz, for sources of total mean square 1. `received` (M,
-    G): received power divided by the power of the sources."""
+def _spectral_density(skin: SoundingSkin, slope: float, received_power: ArrayLike) -> Float[np.ndarray, "M G"]:
+    """Power spectral densities (M, G) at the microphones, in 1/Hz, for sources of total mean square 1. `received_power`
+    (M, G): received power divided by the power of the sources."""
     grid = _frequency_grid(skin)
     shape = np.asarray(band_filter(skin, jnp.asarray(grid))) * (grid / grid[0]) ** -slope
-    return np.asarray(received) * shape / np.trapezoid(shape, grid)
+    return np.asarray(received_power) * shape / np.trapezoid(shape, grid)
 
 
 def _coloured_noise(skin: SoundingSkin, key: Array, density: Float[np.ndarray, "M G"], count: int) -> np.ndarray:
