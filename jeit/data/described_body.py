@@ -37,10 +37,10 @@ def warn_large_body(table: GeometryTable, body: Body, origin: str) -> None:
     lengths = {key: float(getattr(table, key, None) or 0) for key in _SIZE_FACTORS}
     large_lengths = {key: length for key, length in lengths.items() if _SIZE_FACTORS[key] * length > MAX_PLAUSIBLE_SIZE}
     if isinstance(body, OwnMesh):
-        key_names, size = "mesh", _extent(body.given.points)
+        key_names, size = "mesh", _largest_side(body.given.points)
         suggestions = {unit: f"scale = {factor * getattr(table, 'scale', 1.0):g}" for unit, factor in _UNITS.items()}
     elif isinstance(table, PolygonTable) and not large_lengths:
-        key_names, size = "vertices", _extent(table.vertices)
+        key_names, size = "vertices", _largest_side(table.vertices)
         suggestions = {unit: f"{factor:g} times those" for unit, factor in _UNITS.items()}
     else:
         key_names, size = (
@@ -64,7 +64,7 @@ def warn_large_body(table: GeometryTable, body: Body, origin: str) -> None:
     )
 
 
-def _extent(points) -> float:
+def _largest_side(points) -> float:
     return float(np.ptp(np.asarray(points), axis=0).max())
 
 
@@ -95,8 +95,11 @@ def check_on_solid(electrodes: AbstractElectrodes, body: Solid) -> None:
         max_width = max(side_lengths) if isinstance(body.outline, Disk | Rectangle) else float(np.hypot(*side_lengths))
         check_size("width", np.asarray(electrodes.width), max_width, "the body")
     z, body_height = positions[:, 2], body.thickness
-    overhangs, on_wall = np.maximum(height / 2 - z, z + height / 2 - body_height), _surface_distance(body, positions)[1]
-    for electrode_index in np.flatnonzero(on_wall & (overhangs > _MAX_OVERHANG * height))[:1]:
+    overhangs, is_on_wall = (
+        np.maximum(height / 2 - z, z + height / 2 - body_height),
+        _surface_distance(body, positions)[1],
+    )
+    for electrode_index in np.flatnonzero(is_on_wall & (overhangs > _MAX_OVERHANG * height))[:1]:
         lower_end, upper_end = (
             z[electrode_index] - height[electrode_index] / 2,
             z[electrode_index] + height[electrode_index] / 2,
@@ -116,10 +119,12 @@ def _surface_distance(body: Solid, points: Float[np.ndarray, "L 3"]):
         np.asarray(body.outline.signed_distance(points[:, :2])),
         np.minimum(z, body.thickness - z),
     )
-    to_wall, to_lid = np.abs(wall_distances), np.abs(lid_distances)
+    distances_to_wall, distances_to_lid = np.abs(wall_distances), np.abs(lid_distances)
     # Outside the body, the distances beyond the wall and beyond the lid are the legs of a right triangle.
     outside_distances = np.hypot(np.minimum(wall_distances, 0), np.minimum(lid_distances, 0))
-    return np.where(outside_distances > 0, outside_distances, np.minimum(to_wall, to_lid)), to_wall <= to_lid
+    return np.where(
+        outside_distances > 0, outside_distances, np.minimum(distances_to_wall, distances_to_lid)
+    ), distances_to_wall <= distances_to_lid
 
 
 def _box(width: float, depth: float, height: float) -> Solid:
@@ -216,10 +221,10 @@ def described_electrodes(table: ElectrodesTable, body: Body | None, origin: str)
             electrodes.check(body.given)
         return electrodes
     except ValueError as error:
-        raise error_with_location(_with_description_key(str(error)), origin, "electrodes") from None
+        raise error_with_location(_replace_argument_by_key(str(error)), origin, "electrodes") from None
 
 
-def _with_description_key(message: str) -> str:
+def _replace_argument_by_key(message: str) -> str:
     """Replace the argument name at the beginning of an error message about electrodes by the corresponding key of the
     description."""
     argument, colon, problem = message.partition(": ")

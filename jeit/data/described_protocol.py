@@ -67,7 +67,7 @@ def protocol_table_variants(table: ProtocolTable) -> list[tuple[ProtocolTable, s
     fields = type(table).model_fields
     open_options = [name for name in _OPTION_VALUES if name in fields and name not in table.model_fields_set]
     open_options = [name for name in open_options if fields[name].default in _OPTION_VALUES[name]]
-    alternatives = []
+    variants = []
     for values in product(*(_OPTION_VALUES[name] for name in open_options)):
         changed_options = {
             name: value for name, value in zip(open_options, values, strict=True) if value != fields[name].default
@@ -75,8 +75,8 @@ def protocol_table_variants(table: ProtocolTable) -> list[tuple[ProtocolTable, s
         assignments = [
             f"{name} = " + ("true" if value is True else f'"{value}"') for name, value in changed_options.items()
         ]
-        alternatives.append((table.model_copy(update=changed_options), ", ".join(assignments)))
-    return alternatives
+        variants.append((table.model_copy(update=changed_options), ", ".join(assignments)))
+    return variants
 
 
 def _construct(table: ConstructedTable, num_electrodes: int | None, path: Path, origin: str) -> Protocol:
@@ -154,11 +154,11 @@ def _current_amplitude(table: DrivenTable, path: Path) -> float:
 def number_in_name(pattern: str, name: str) -> float | None:
     """Return the first number, such as 30 or 0.5, at the position of {current} in the `pattern`, from the file name
     `name`; * in the pattern matches any text. None if the name does not match the pattern."""
-    prefix, _, suffix = pattern.partition("{current}")
+    text_before, _, text_after = pattern.partition("{current}")
     start = 0
     while start < len(name):
         end = _number_end(name, start)
-        if end > start and _matches(prefix, name[:start]) and _matches(suffix, name[end:]):
+        if end > start and _matches(text_before, name[:start]) and _matches(text_after, name[end:]):
             return float(name[start:end])
         start = max(end, start + 1)
     return None
@@ -226,8 +226,8 @@ def _read_matrices(path: Path, keys: tuple[str, ...]) -> list[np.ndarray]:
     if not path.is_file() or path.suffix.lower() not in (".mat", ".npz"):
         raise ValueError(f"kind = 'measured' takes the currents from a .mat or .npz file; {path.name[:60]!r} is none.")
     if path.suffix.lower() == ".mat":
-        content = matlab.load(path, *keys)
-        return [matlab.numbers(content, key, path) for key in keys]
+        matrices_by_name = matlab.load(path, *keys)
+        return [matlab.numbers(matrices_by_name, key, path) for key in keys]
     arrays = npz_arrays(path, *keys)
     missing_keys = [key for key in keys if key not in arrays]
     if missing_keys:

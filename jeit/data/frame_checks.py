@@ -135,22 +135,24 @@ class FrameQuality:
 
 def check_same_setup(measurement: Measurement, reference: Measurement) -> None:
     """Raise `ValueError` unless measurement and reference have the same electrodes, patterns, currents and unit."""
-    ours, theirs = measurement.protocol, reference.protocol
-    if ours.num_electrodes != theirs.num_electrodes:
+    protocol, reference_protocol = measurement.protocol, reference.protocol
+    if protocol.num_electrodes != reference_protocol.num_electrodes:
         raise ValueError(
-            f"'{measurement.name}' has {ours.num_electrodes} electrodes and the reference '{reference.name}' "
-            f"{theirs.num_electrodes}: they are not of the same set-up. Give a reference from the same body."
+            f"'{measurement.name}' has {protocol.num_electrodes} electrodes and the reference '{reference.name}' "
+            f"{reference_protocol.num_electrodes}: they are not of the same set-up. Give a reference from the same "
+            "body."
         )
-    if ours.num_measurements != theirs.num_measurements:
+    if protocol.num_measurements != reference_protocol.num_measurements:
         raise ValueError(
-            f"'{measurement.name}' has {ours.num_measurements} channels ({ours.name}) and the reference "
-            f"'{reference.name}' {theirs.num_measurements} ({theirs.name}). Both must use one protocol."
+            f"'{measurement.name}' has {protocol.num_measurements} channels ({protocol.name}) and the reference "
+            f"'{reference.name}' {reference_protocol.num_measurements} ({reference_protocol.name}). Both must use "
+            "one protocol."
         )
-    if not ours.same_patterns(theirs):
-        ratio = float(np.linalg.norm(ours.channel_drive) / np.linalg.norm(theirs.channel_drive))
-        scaled_drive = ratio * np.asarray(theirs.channel_drive)
-        if np.allclose(ours.channel_drive, scaled_drive, rtol=1e-6, atol=1e-12) and np.allclose(
-            ours.channel_measurement, theirs.channel_measurement, rtol=1e-6
+    if not protocol.same_patterns(reference_protocol):
+        ratio = float(np.linalg.norm(protocol.channel_drive) / np.linalg.norm(reference_protocol.channel_drive))
+        scaled_drive = ratio * np.asarray(reference_protocol.channel_drive)
+        if np.allclose(protocol.channel_drive, scaled_drive, rtol=1e-6, atol=1e-12) and np.allclose(
+            protocol.channel_measurement, reference_protocol.channel_measurement, rtol=1e-6
         ):
             raise ValueError(
                 f"'{measurement.name}' was driven with {ratio:.4g} times the current of the reference "
@@ -158,8 +160,8 @@ def check_same_setup(measurement: Measurement, reference: Measurement) -> None:
                 "at the same current, or divide both by their currents first."
             )
         raise ValueError(
-            f"'{measurement.name}' ({ours.name}) and the reference '{reference.name}' ({theirs.name}) drive "
-            "or read different electrodes. Give a reference measured with the same protocol."
+            f"'{measurement.name}' ({protocol.name}) and the reference '{reference.name}' ({reference_protocol.name}) "
+            "drive or read different electrodes. Give a reference measured with the same protocol."
         )
     if np.iscomplexobj(measurement.voltages) != np.iscomplexobj(reference.voltages):
         raise ValueError(
@@ -215,8 +217,8 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
     reference_signs, reference_error = impossible_signs(mean), reciprocity_error(mean)
     deviations = np.asarray(relative_noise(np.abs(np.asarray(mean.voltages)[0]), np.asarray(mean.mask)[0]))
     results = []
-    for index in range(measurement.num_frames):
-        frame = measurement.frame(index)
+    for frame_index in range(measurement.num_frames):
+        frame = measurement.frame(frame_index)
         common_mask = np.asarray(frame.mask) & np.asarray(mean.mask)
         change = Measurement(
             np.where(common_mask, np.asarray(frame.voltages) - np.asarray(mean.voltages), np.nan),
@@ -227,9 +229,11 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
         relative_difference = size / float(
             np.linalg.norm(np.where(common_mask, np.asarray(mean.filled()), 0)) or np.inf
         )
-        signs = [float(shares[0]) for shares in (impossible_signs(frame), reference_signs) if shares is not None]
+        signs = [
+            float(fractions[0]) for fractions in (impossible_signs(frame), reference_signs) if fractions is not None
+        ]
         num_usable = int(common_mask.sum())
-        cosine = _cosine(
+        cosine = _cosine_similarity(
             *(np.where(common_mask, np.asarray(each_frame.filled()), 0).ravel() for each_frame in (frame, mean))
         )
         error, evidence = (
@@ -238,13 +242,15 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
             else (None, None)
         )
         factor, common_share = _common_factor(change, mean, deviations)
-        noise_share, noisy_electrode = (None, None) if error is None else _noise_in(change, mean, deviations, factor)
+        noise_share, noisy_electrode = (
+            (None, None) if error is None else _find_noise_share(change, mean, deviations, factor)
+        )
         errors_by_name = {
             f"the reference '{reference.name}'": reference_error,
             "the frame": reciprocity_error(frame),
         }
         impossible_share = max(signs) if signs else None
-        rounding = float(np.linalg.norm(rounding_of_difference(frame, mean))) / size if size > 0 else 0.0
+        rounding_fraction = float(np.linalg.norm(rounding_of_difference(frame, mean))) / size if size > 0 else 0.0
         results.append(
             FrameQuality(
                 difference=relative_difference,
@@ -253,7 +259,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
                 difference_reciprocity_error=error,
                 impossible_signs=impossible_share,
                 usable_channels=num_usable,
-                rounding=rounding,
+                rounding=rounding_fraction,
                 noise_share=noise_share,
                 noisy_electrode=noisy_electrode,
                 common_factor=float(np.real(factor)) if common_share > _MOST_COMMON else 0.0,
@@ -261,7 +267,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
                     measurement.protocol.num_electrodes,
                     num_usable,
                     relative_difference,
-                    rounding,
+                    rounding_fraction,
                     impossible_share,
                     (error, evidence),
                     errors_by_name,
@@ -284,7 +290,7 @@ def _common_factor(
     return factor, float(np.abs(factor) ** 2 * power / change_power) if change_power > 0 else 0.0
 
 
-def _noise_in(
+def _find_noise_share(
     change: Measurement, mean: Measurement, deviations: Float[np.ndarray, " M"], factor: complex
 ) -> tuple[float | None, int | None]:
     """`FrameQuality.noise_share` and `FrameQuality.noisy_electrode` of a `change` from the reference `mean`.
@@ -292,17 +298,21 @@ def _noise_in(
     voltages have in common."""
     protocol = change.protocol
     voltages, levels = np.nan_to_num(np.asarray(change.voltages)[0]), np.nan_to_num(np.asarray(mean.voltages)[0])
-    rest = replace(change, voltages=as_array((voltages - factor * levels)[None]))
-    if not (error := reciprocity_error(rest, deviations)):
+    remaining_change = replace(change, voltages=as_array((voltages - factor * levels)[None]))
+    if not (error := reciprocity_error(remaining_change, deviations)):
         return error, None
-    share, electrode = min(1.0, error / np.sqrt(2)), None
-    if share > MOST_NOISE:
-        square = np.nan_to_num(channel_reciprocity_error(rest)[0] / deviations) ** 2
-        touching = np.array([protocol.channels_touching(one) for one in range(protocol.num_electrodes)])
-        worst = int(np.argmax(touching @ square / np.maximum(touching.sum(axis=1), 1)))
-        left = reciprocity_error(rest.masked(~touching[worst], "they use the noisy electrode."), deviations)
-        electrode = worst if left is not None and left < _MOST_LEFT * error else None
-    return share, electrode
+    noise_share, electrode = min(1.0, error / np.sqrt(2)), None
+    if noise_share > MOST_NOISE:
+        square = np.nan_to_num(channel_reciprocity_error(remaining_change)[0] / deviations) ** 2
+        touching = np.array(
+            [protocol.channels_touching(electrode_index) for electrode_index in range(protocol.num_electrodes)]
+        )
+        noisiest_electrode = int(np.argmax(touching @ square / np.maximum(touching.sum(axis=1), 1)))
+        remaining_error = reciprocity_error(
+            remaining_change.masked(~touching[noisiest_electrode], "they use the noisy electrode."), deviations
+        )
+        electrode = noisiest_electrode if remaining_error is not None and remaining_error < _MOST_LEFT * error else None
+    return noise_share, electrode
 
 
 def rounding_of_difference(frame: Measurement, reference: Measurement) -> Float[np.ndarray, " M"]:
@@ -334,9 +344,9 @@ def check_imageable(measurement: Measurement, reference: Measurement) -> list[Fr
     ```
     """
     qualities = assess(measurement, reference)
-    for index, quality in enumerate(qualities):
+    for frame_index, quality in enumerate(qualities):
         if not quality.imageable:
-            frame_text = f", frame {index}" if measurement.num_frames > 1 else ""
+            frame_text = f", frame {frame_index}" if measurement.num_frames > 1 else ""
             raise ValueError(f"'{measurement.name}'{frame_text} cannot be imaged: {quality.reason}")
     return qualities
 
@@ -345,15 +355,15 @@ def _rejection_reason(
     num_electrodes: int,
     num_usable: int,
     relative_difference: float,
-    rounding: float,
+    rounding_fraction: float,
     impossible_share: float | None,
-    of_difference: tuple[float | None, float | None],
+    error_and_evidence: tuple[float | None, float | None],
     errors_by_name: dict[str, float | None],
     cosine: float,
 ) -> str:
-    """Reason why a frame cannot be imaged; empty if it can. `of_difference`: reciprocity error of the difference and
-    the evidence that it is not noise; `errors_by_name`: reciprocity errors of frame and reference; `cosine`: cosine of
-    the angle between frame and reference."""
+    """Reason why a frame cannot be imaged; empty if it can. `error_and_evidence`: reciprocity error of the difference
+    and the evidence that it is not noise; `errors_by_name`: reciprocity errors of frame and reference; `cosine`: cosine
+    of the angle between frame and reference."""
     if num_usable < num_electrodes:
         return (
             f"only {counted(num_usable, 'channel')} usable in both it and its reference, for {num_electrodes} "
@@ -361,7 +371,7 @@ def _rejection_reason(
         )
     if relative_difference < 1e-12:
         return "it equals its reference, so there is no difference to image. Is it the same file?"
-    if rounding > _MAX_ROUNDING:
+    if rounding_fraction > _MAX_ROUNDING:
         return (
             f"its difference from the reference, {percent(relative_difference)}, is mostly rounding of the voltages: "
             "record them with more digits."
@@ -386,7 +396,7 @@ def _rejection_reason(
                 f"{name} breaks reciprocity by {percent(error)} on its own: it is too noisy, or its channels are in "
                 "another order than described. See `jeit info`."
             )
-    error, evidence = of_difference
+    error, evidence = error_and_evidence
     if error is not None and evidence is not None and evidence < MIN_SIGNAL_EVIDENCE:
         return (
             f"too noisy: the difference from the reference breaks reciprocity by {percent(error)}, as noise alone does "
@@ -396,8 +406,8 @@ def _rejection_reason(
     return ""
 
 
-def _cosine(first: np.ndarray, second: np.ndarray) -> float:
+def _cosine_similarity(first_frame: np.ndarray, second_frame: np.ndarray) -> float:
     """Cosine of the angle between two frames as vectors: 1 if the frames differ by a positive factor only, 0 if one
     frame is zero."""
-    size = float(np.linalg.norm(first) * np.linalg.norm(second))
-    return float(np.real(np.vdot(first, second))) / size if size > 0 else 0.0
+    size = float(np.linalg.norm(first_frame) * np.linalg.norm(second_frame))
+    return float(np.real(np.vdot(first_frame, second_frame))) / size if size > 0 else 0.0

@@ -38,11 +38,15 @@ def join(measurements: Sequence[Measurement]) -> Measurement:
     """
     if not measurements:
         raise ValueError("measurements: there is none; give at least one.")
-    first, *others = measurements
-    for other in others:
-        if other.protocol is not first.protocol and not other.protocol.same_patterns(first.protocol):
+    first_measurement, *other_measurements = measurements
+    for other_measurement in other_measurements:
+        if (
+            other_measurement.protocol is not first_measurement.protocol
+            and not other_measurement.protocol.same_patterns(first_measurement.protocol)
+        ):
             raise ValueError(
-                f"'{other.name}' ({other.protocol.name}) is read otherwise than '{first.name}'; join one set-up's."
+                f"'{other_measurement.name}' ({other_measurement.protocol.name}) is read otherwise than "
+                f"'{first_measurement.name}'; join one set-up's."
             )
     names = tuple(name for measurement in measurements for name in measurement.frame_names)
     time_arrays: list[Any] = [measurement.times for measurement in measurements]
@@ -50,7 +54,7 @@ def join(measurements: Sequence[Measurement]) -> Measurement:
     times = None if lacks_times else np.concatenate([np.asarray(times) for times in time_arrays])
     mask = np.concatenate([np.asarray(measurement.mask) for measurement in measurements])
     return replace(
-        first,
+        first_measurement,
         voltages=np.concatenate([np.asarray(measurement.voltages) for measurement in measurements]),
         mask=mask,
         frame_names=names if len(names) == len(mask) else (),
@@ -120,8 +124,8 @@ def read_frame_recording(path: str | Path, description: Description | None = Non
     try:
         arrays = npz_arrays(path, *_FRAME_KEYS, *_TIME_KEYS, "reference", *layout.keys) if path.suffix == ".npz" else {}
         (values, heading), seconds = _table(path, arrays, layout), None
-        in_rows = not arrays and layout.frames_in != "columns" and layout.time_column is not False
-        if in_rows and num_channels is not None and values.shape[1] == num_channels + 1:
+        are_frames_in_rows = not arrays and layout.frames_in != "columns" and layout.time_column is not False
+        if are_frames_in_rows and num_channels is not None and values.shape[1] == num_channels + 1:
             values, seconds, _ = frames_in_table(values, [num_channels], layout, heading)
         frames = _frames(values, layout, path.name, num_channels)
         seconds = next((_times(arrays[key], key, len(frames)) for key in _TIME_KEYS if key in arrays), seconds)
@@ -151,7 +155,7 @@ def _frames(values: np.ndarray, layout: TableLayout, name: str, num_channels: in
     """Voltages (frames, channels) of a table, in volts."""
     if values.dtype.kind not in "iufc":
         raise ValueError(f"frames are {values.dtype}; give numbers, in volts.")
-    frames = table.frames_from(values, layout, name)
+    frames = table.arrange_frames(values, layout, name)
     if np.iscomplexobj(frames):
         raise ValueError("frames are complex; choose a part with [data] component: real, imaginary or magnitude.")
     return _check_frames(
@@ -217,14 +221,14 @@ class GestureSet:
 
     def __post_init__(self):
         """Check the fields: raises `ValueError` for arrays whose shapes do not match, and for wrong types of values."""
-        for name, dtype_kinds, expected in (
+        for name, dtype_kinds, expected_type in (
             ("gesture", "U", "text"),
             ("person", "iuU", "whole numbers or text"),
             ("start", "iu", "whole numbers"),
         ):
             values = getattr(self, name)
             if values.dtype.kind not in dtype_kinds:
-                raise ValueError(f"{name} is {values.dtype}; give {expected}.")
+                raise ValueError(f"{name} is {values.dtype}; give {expected_type}.")
         for name in ("seconds", "voltages", "reference", "untouched"):
             if getattr(self, name).dtype.kind not in "fiu":
                 raise ValueError(f"{name} is {getattr(self, name).dtype}; give real numbers.")

@@ -81,22 +81,22 @@ def unmeasured_driven_channels(frames: Inexact[np.ndarray, "F M"], protocol: Pro
     return driven & zero & ~zero.all()
 
 
-def with_signs(measurement: Measurement, like: Measurement | None = None) -> Measurement:
+def correct_signs(measurement: Measurement, like: Measurement | None = None) -> Measurement:
     """The measurement with corrected signs of the voltages, and a note if a sign is changed. If all voltages have the
     same sign, i.e. are magnitudes, they receive the signs of a passive body; if their signs are opposite to those of
     `like`, a measurement of the same sensor, all signs are reversed."""
     values, usable = np.asarray(measurement.voltages), np.asarray(measurement.mask)
     if like is not None and like.protocol.same_patterns(measurement.protocol):
         common_channels = usable.all(axis=0) & np.asarray(like.mask).all(axis=0)
-        ours, theirs = (
+        usable_levels, theirs = (
             np.real(np.asarray(compared.voltages)).mean(axis=0)[common_channels] for compared in (measurement, like)
         )
-        size = np.linalg.norm(ours) * np.linalg.norm(theirs)
-        if size and ours @ theirs > -_OPPOSITE_COSINE * size:
+        size = np.linalg.norm(usable_levels) * np.linalg.norm(theirs)
+        if size and usable_levels @ theirs > -_OPPOSITE_COSINE * size:
             return measurement  # the signs agree with the reference
-        if size and ours @ theirs < _OPPOSITE_COSINE * size:
-            note = f"the voltages are reversed, to agree with '{like.name}' (polarity = \"reversed\")."
-            return _with_voltages(measurement, -values, note)
+        if size and usable_levels @ theirs < _OPPOSITE_COSINE * size:
+            sign_note = f"the voltages are reversed, to agree with '{like.name}' (polarity = \"reversed\")."
+            return _replace_voltages(measurement, -values, sign_note)
     known_voltages = np.real(values[usable])
     has_one_sign = (known_voltages >= 0).all() or (known_voltages <= 0).all()
     signs = _signs(measurement)
@@ -106,16 +106,18 @@ def with_signs(measurement: Measurement, like: Measurement | None = None) -> Mea
     if (signed_values[usable] == np.real(values)[usable]).all():
         return measurement
     if (signed_values[usable] == -np.real(values)[usable]).all():
-        note = 'all voltages have one sign, the opposite of what a body gives: it is reversed (polarity = "reversed").'
-        return _with_voltages(measurement, -values, note)
+        sign_note = (
+            'all voltages have one sign, the opposite of what a body gives: it is reversed (polarity = "reversed").'
+        )
+        return _replace_voltages(measurement, -values, sign_note)
     if np.iscomplexobj(values):
         return measurement
-    return _with_voltages(
+    return _replace_voltages(
         measurement, signed_values, "the voltages are magnitudes: they are given the signs that a body gives."
     )
 
 
-def _with_voltages(measurement: Measurement, values, note: str) -> Measurement:
+def _replace_voltages(measurement: Measurement, values, note: str) -> Measurement:
     return replace(measurement, voltages=values, notes=(*measurement.notes, note))
 
 
@@ -141,14 +143,14 @@ def channel_gains(measurement: Measurement) -> tuple[Float[np.ndarray, " K"] | N
     if len(pairs) < num_patterns:
         return None, None
     # log |v_b / (r v_a)| is the difference of the logarithms of the two gains.
-    first, second = pairs.T
-    log_ratios = np.log(np.abs(values[second] / (ratio * values[first])))
+    first_channels, second_channels = pairs.T
+    log_ratios = np.log(np.abs(values[second_channels] / (ratio * values[first_channels])))
     rows = np.zeros((len(pairs), num_patterns))
-    rows[np.arange(len(pairs)), measurement_index[second]] += 1
-    rows[np.arange(len(pairs)), measurement_index[first]] -= 1
+    rows[np.arange(len(pairs)), measurement_index[second_channels]] += 1
+    rows[np.arange(len(pairs)), measurement_index[first_channels]] -= 1
     if np.linalg.matrix_rank(rows) < num_patterns - 1:
         return None, None
-    weight = np.sqrt(np.abs(values[first] * values[second]))[:, None]
+    weight = np.sqrt(np.abs(values[first_channels] * values[second_channels]))[:, None]
     gains = np.exp(np.linalg.lstsq(weight * rows, weight[:, 0] * log_ratios, rcond=None)[0])
     remaining_error = reciprocity_error(
         replace(measurement, voltages=np.asarray(measurement.voltages) / gains[measurement_index])

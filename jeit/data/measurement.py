@@ -202,15 +202,15 @@ class Measurement(Module):
         Raises `ValueError` if no frame is named "reference", or if there is no other frame.
         """
         if "reference" not in self.frame_names or self.num_frames < 2:
-            alternative = "say which (--reference-frames 0-17; measurement.frames(slice(0, 18))), or "
+            remedy = "say which (--reference-frames 0-17; measurement.frames(slice(0, 18))), or "
             raise ValueError(
                 f"'{self.name}' holds no reference frame of its own. Measure the undisturbed body and give that file "
-                f"as the reference; or, if frames of this one are that, {alternative if self.num_frames > 1 else ''}"
+                f"as the reference; or, if frames of this one are that, {remedy if self.num_frames > 1 else ''}"
                 'name one "reference" in the description: [data] frame_names.'
             )
-        index = self.frame_names.index("reference")
-        others = np.array([k for k in range(self.num_frames) if k != index])
-        return self._frames(others), self._frames(np.array([index]))
+        reference_index = self.frame_names.index("reference")
+        other_indices = np.array([k for k in range(self.num_frames) if k != reference_index])
+        return self._frames(other_indices), self._frames(np.array([reference_index]))
 
     def mean_frame(self) -> "Measurement":
         """The mean of the usable voltages over all frames, as a measurement of one frame; a channel that is usable in
@@ -220,7 +220,7 @@ class Measurement(Module):
 
     def filled(self, value: float = 0.0) -> Inexact[Array, "F M"]:
         """Voltages (frames, channels) in volts, with `value` in place of masked voltages."""
-        return _filled(self.voltages, self.mask, value)
+        return _fill_masked(self.voltages, self.mask, value)
 
     def masked(self, usable: ArrayLike, reason: str) -> "Measurement":
         """The same measurement with fewer usable channels.
@@ -258,10 +258,10 @@ class Measurement(Module):
         usable = ~self.protocol.channels_on_driven_electrodes()
         return self.masked(usable, "they measure on driven electrodes.")
 
-    def _frames(self, index: np.ndarray) -> "Measurement":
-        names = tuple(self.frame_names[k] for k in index) if self.frame_names else ()
-        times = None if self.times is None else np.asarray(self.times)[index]
-        return self._replace(*_rows(self.voltages, self.mask, index), frame_names=names, times=times)
+    def _frames(self, frame_indices: np.ndarray) -> "Measurement":
+        names = tuple(self.frame_names[k] for k in frame_indices) if self.frame_names else ()
+        times = None if self.times is None else np.asarray(self.times)[frame_indices]
+        return self._replace(*_select_rows(self.voltages, self.mask, frame_indices), frame_names=names, times=times)
 
     def _replace(self, voltages, mask, **changes) -> "Measurement":
         fields = {"frame_names": self.frame_names, "notes": self.notes, "times": self.times, **changes}
@@ -291,13 +291,13 @@ def _frames(values):
 
 
 @either_engine
-def _filled(voltages, mask, value):
+def _fill_masked(voltages, mask, value):
     return namespace(voltages, mask).where(mask, voltages, value)
 
 
 @either_engine
-def _rows(voltages, mask, index):
-    return voltages[index], mask[index]
+def _select_rows(voltages, mask, row_indices):
+    return voltages[row_indices], mask[row_indices]
 
 
 @either_engine

@@ -99,11 +99,11 @@ def channel_reciprocity_error(measurement: Measurement) -> Float[np.ndarray, "F 
     result = np.full(voltages.shape, np.nan, dtype=voltages.dtype)
     if len(pairs) == 0:
         return np.abs(result)
-    first, second = pairs.T
-    usable_pairs = mask[:, first] & mask[:, second]
-    error = voltages[:, first] - voltages[:, second] / ratio
-    result[:, first] = np.where(usable_pairs, error, np.nan)
-    result[:, second] = np.where(usable_pairs, -error * ratio, np.nan)
+    first_channels, second_channels = pairs.T
+    usable_pairs = mask[:, first_channels] & mask[:, second_channels]
+    error = voltages[:, first_channels] - voltages[:, second_channels] / ratio
+    result[:, first_channels] = np.where(usable_pairs, error, np.nan)
+    result[:, second_channels] = np.where(usable_pairs, -error * ratio, np.nan)
     return np.real(result) if np.isrealobj(voltages) else np.abs(result)
 
 
@@ -163,13 +163,16 @@ def expected_signs(protocol: Protocol, order: Int[np.ndarray, " L"]) -> Int[np.n
     # Ranks are positions along the boundary counted from the source: the potential falls from rank 0 to sink, and rises
     # from sink to num_electrodes.
     sink = (rank[drive.argmin(axis=1)] - source) % num_electrodes
-    plus = (rank[measurement.argmax(axis=1)] - source) % num_electrodes
-    minus = (rank[measurement.argmin(axis=1)] - source) % num_electrodes
-    is_falling = (plus <= sink) & (minus <= sink)
-    signs = np.where(is_falling, np.sign(minus - plus), 0)
-    plus, minus = np.where(plus == 0, num_electrodes, plus), np.where(minus == 0, num_electrodes, minus)
-    is_rising = (plus >= sink) & (minus >= sink) & ~is_falling
-    return np.where(uses_pairs, np.where(is_rising, np.sign(plus - minus), signs), 0)
+    positive_rank = (rank[measurement.argmax(axis=1)] - source) % num_electrodes
+    negative_rank = (rank[measurement.argmin(axis=1)] - source) % num_electrodes
+    is_falling = (positive_rank <= sink) & (negative_rank <= sink)
+    signs = np.where(is_falling, np.sign(negative_rank - positive_rank), 0)
+    positive_rank, negative_rank = (
+        np.where(positive_rank == 0, num_electrodes, positive_rank),
+        np.where(negative_rank == 0, num_electrodes, negative_rank),
+    )
+    is_rising = (positive_rank >= sink) & (negative_rank >= sink) & ~is_falling
+    return np.where(uses_pairs, np.where(is_rising, np.sign(positive_rank - negative_rank), signs), 0)
 
 
 def impossible_signs(
@@ -345,15 +348,15 @@ _MAX_LISTED = 40
 _MAX_CHANCE_DIFFERENCE = 0.01
 
 
-def order_note(measurement: Measurement) -> str | None:
+def describe_electrode_order(measurement: Measurement) -> str | None:
     """A sentence that reports that electrodes are not numbered in their order along the edge; None if they are, or if
     they do not lie on an edge."""
     order = boundary_order(measurement)
     if order is None or len(order) < 4 or is_cyclic_sequence(order):
         return None
-    electrode_list = ", ".join(str(number + 1) for number in _starting_at_first(order)[:_MAX_LISTED])
+    electrode_list = ", ".join(str(number + 1) for number in _rotate_to_first(order)[:_MAX_LISTED])
     ellipsis = " …" if len(order) > _MAX_LISTED else ""
-    note = f"going round the edge, the positions of the electrodes come in the order {electrode_list}{ellipsis}"
+    order_text = f"going round the edge, the positions of the electrodes come in the order {electrode_list}{ellipsis}"
     position_signs, number_signs = (
         impossible_signs(measurement, electrode_order) for electrode_order in (order, np.arange(len(order)))
     )
@@ -362,13 +365,13 @@ def order_note(measurement: Measurement) -> str | None:
         or number_signs is None
         or abs(position_signs.mean() - number_signs.mean()) <= _MAX_CHANCE_DIFFERENCE
     ):
-        return f"{note}. If they are not numbered so, rows of the positions are exchanged."
+        return f"{order_text}. If they are not numbered so, rows of the positions are exchanged."
     if position_signs.mean() < number_signs.mean():
-        return f"{note}; the signs of the voltages agree."
+        return f"{order_text}; the signs of the voltages agree."
     return (
-        f"{note}, and the voltages contradict it: {100 * position_signs.mean():.0f} % of their signs are impossible at "
-        f"these positions, {100 * number_signs.mean():.0f} % if the electrodes followed each other by their numbers. "
-        "Rows of the positions are exchanged: mend them, or every image is wrong."
+        f"{order_text}, and the voltages contradict it: {100 * position_signs.mean():.0f} % of their signs are "
+        f"impossible at these positions, {100 * number_signs.mean():.0f} % if the electrodes followed each other by "
+        "their numbers. Rows of the positions are exchanged: mend them, or every image is wrong."
     )
 
 
@@ -378,7 +381,7 @@ def is_cyclic_sequence(order: Int[np.ndarray, " L"]) -> bool:
     return bool((steps == 1).all() or (steps == len(order) - 1).all())
 
 
-def _starting_at_first(order: Int[np.ndarray, " L"]) -> Int[np.ndarray, " L"]:
+def _rotate_to_first(order: Int[np.ndarray, " L"]) -> Int[np.ndarray, " L"]:
     """The cyclic `order` of electrodes rotated to begin at the first electrode, in the direction in which most numbers
     increase."""
     steps = (np.roll(order, -1) - order) % len(order)

@@ -152,9 +152,9 @@ def _recognise(file: Path, description: str | Path | None, like: Measurement | N
     for name, candidate in FORMATS.items():
         if candidate.recognises(file):
             if name == "table" and not has_description and candidate.reader.find_description(file) is None:
-                _check_mark(file)
+                _check_signature(file)
             return name
-    _check_mark(file)
+    _check_signature(file)
     if file.suffix.lower() == ".mat":
         from jeit.data.formats import eidors
         from jeit.data.formats.kuopio import Kit4, Ktc2023
@@ -184,21 +184,23 @@ def _recognise(file: Path, description: str | Path | None, like: Measurement | N
             f"{file.name}: its content is that of no known kind of file ending in '{suffix}' "
             f"({', '.join(known_formats)}). Is its start damaged, or is it of another program?"
         )
-    with file.open("rb") as content:
-        head = content.read(_HEAD_BYTES)
-    hint = next(
-        (f" It is {explanation}." for mark, explanation in _OTHER_PROGRAMS.items() if head.startswith(mark)), ""
+    with file.open("rb") as file_object:
+        head = file_object.read(_HEAD_BYTES)
+    program_hint = next(
+        (f" It is {explanation}." for signature, explanation in _OTHER_PROGRAMS.items() if head.startswith(signature)),
+        "",
     )
-    if not hint and _is_text(head):
-        hint = f" It is text: if it is a table of numbers, name it {file.stem[:40]}.txt."
+    if not program_hint and _is_text(head):
+        program_hint = f" It is text: if it is a table of numbers, name it {file.stem[:40]}.txt."
     raise ValueError(
-        f"{file.name}: files ending in '{file.suffix}' are of no known format.{hint} Known: {', '.join(FORMATS)}."
+        f"{file.name}: files ending in '{file.suffix}' are of no known format.{program_hint} Known: "
+        f"{', '.join(FORMATS)}."
     )
 
 
 _HEAD_BYTES = 65536
 # For each format, a regular expression that recognises damaged files and files with a wrong suffix.
-_FORMAT_MARKS = {
+_FORMAT_SIGNATURES = {
     "draeger": rb"Draeger EIT-Software|Framerate \[Hz\]:",
     "carefusion": rb"E\0I\0T\0_\0F\0i\0l\0e",
     "sciospec": rb"(?m)^MeasurementChannels(?:IndependentFromInjectionPattern)?:",
@@ -215,15 +217,15 @@ _OTHER_PROGRAMS = {
 }
 
 
-def _check_mark(file: Path) -> None:
-    """Raise `ValueError` if a file that no format recognises has the mark (`_FORMAT_MARKS`) of a format; the message
-    states what is damaged, or that the suffix is wrong."""
-    with file.open("rb") as content:
-        head = content.read(_HEAD_BYTES)
-    for name, mark in _FORMAT_MARKS.items():
-        if not re.search(mark, head):
+def _check_signature(file: Path) -> None:
+    """Raise `ValueError` if a file that no format recognises has the signature (`_FORMAT_SIGNATURES`) of a format; the
+    message states what is damaged, or that the suffix is wrong."""
+    with file.open("rb") as file_object:
+        head = file_object.read(_HEAD_BYTES)
+    for name, signature in _FORMAT_SIGNATURES.items():
+        if not re.search(signature, head):
             continue
-        reader, endings = FORMATS[name].reader, FORMATS[name].endings
+        reader, known_suffixes = FORMATS[name].reader, FORMATS[name].endings
         try:
             reader.read(file)
         except ValueError as error:
@@ -231,10 +233,10 @@ def _check_mark(file: Path) -> None:
                 f"{file.name} looks like a file of {name} ({reader.DESCRIPTION}), but is damaged or of a version that "
                 f"is not known: {str(error).removeprefix(file.name).lstrip(':, ')}"
             ) from None
-        if file.suffix.lower() not in endings:
+        if file.suffix.lower() not in known_suffixes:
             raise ValueError(
-                f"{file.name} is a file of {name} ({reader.DESCRIPTION}), which end in {names_text(endings)}: rename "
-                f"it, or give format='{name}' (--format {name})."
+                f"{file.name} is a file of {name} ({reader.DESCRIPTION}), which end in {names_text(known_suffixes)}: "
+                f"rename it, or give format='{name}' (--format {name})."
             )
 
 

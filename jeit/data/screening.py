@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from jeit.arguments import counted, measurable_values
 from jeit.data.frame_checks import rounding_of_difference
 from jeit.data.measurement import Measurement
-from jeit.data.quality import order_note
+from jeit.data.quality import describe_electrode_order
 from jeit.electrodes import AbstractElectrodes
 from jeit.inverse import relative_noise
 from jeit.mesh import Body, Mesh
@@ -85,7 +85,7 @@ def screen(
     ```
     """
     name = name.encode("utf-8", "backslashreplace").decode()  # the name of a file may not be valid text
-    values = _as_frames(voltages, protocol, name)
+    values = _convert_to_frames(voltages, protocol, name)
     usable = np.ones(values.shape, dtype=bool)
     note_list = list(notes)
 
@@ -96,13 +96,13 @@ def screen(
             note_list.append(f"{num_masked} of {values.size} voltages masked: {reason}")
 
     if mask is not None:
-        given_mask = np.broadcast_to(np.asarray(mask), values.shape)
-        if given_mask.dtype != bool:
-            raise ValueError(f"mask is {given_mask.dtype}; give booleans, True where a voltage is usable.")
-        exclude(~given_mask, "excluded by the mask given.")
+        mask_array = np.broadcast_to(np.asarray(mask), values.shape)
+        if mask_array.dtype != bool:
+            raise ValueError(f"mask is {mask_array.dtype}; give booleans, True where a voltage is usable.")
+        exclude(~mask_array, "excluded by the mask given.")
     values = measurable_values(values)
     is_missing = np.isnan(values)
-    exclude(is_missing, f"NaN, infinite or beyond any instrument{_of_electrodes(is_missing, protocol)}.")
+    exclude(is_missing, f"NaN, infinite or beyond any instrument{_describe_missing_electrodes(is_missing, protocol)}.")
     is_dead = ~np.any(np.where(usable, values, 0) != 0, axis=1)
     if is_dead.all():
         raise ValueError(
@@ -115,23 +115,23 @@ def screen(
     exclude(_find_saturated(values, usable, saturation), "saturated (stuck at an end of the instrument's range).")
     is_dead, is_alive = _drives_without_and_with_current(values, usable, protocol)
     exclude(is_dead[:, np.asarray(protocol.drive_index)], "their drive's current did not flow.")
-    driven, reads = (np.asarray(patterns) != 0 for patterns in (protocol.drive, protocol.channel_measurement))
-    unconnected = (is_dead @ driven) & ~(is_alive @ driven)
+    is_driven, is_read = (np.asarray(patterns) != 0 for patterns in (protocol.drive, protocol.channel_measurement))
+    unconnected = (is_dead @ is_driven) & ~(is_alive @ is_driven)
     numbers = ", ".join(str(electrode + 1) for electrode in np.flatnonzero(unconnected.any(axis=0)))
     connection_note = f"they read electrode {numbers}, through which no drive's current flowed: is it connected?"
-    exclude(unconnected @ reads.T, connection_note)
-    largest = np.abs(values[usable]).max(initial=0)
-    if largest > _MAX_VOLTAGE:
-        note_list.append(f"the largest voltage is {largest:.3g} V: are voltages in volts, and currents in amperes?")
+    exclude(unconnected @ is_read.T, connection_note)
+    max_voltage = np.abs(values[usable]).max(initial=0)
+    if max_voltage > _MAX_VOLTAGE:
+        note_list.append(f"the largest voltage is {max_voltage:.3g} V: are voltages in volts, and currents in amperes?")
     if not usable.any():
         raise ValueError(f"{name}: no usable voltage is left. {' '.join(note_list)}")
     fields = {"electrodes": electrodes, "domain": domain, "name": name, "source": source, "frame_names": frame_names}
     measurement = Measurement(values, usable, protocol, notes=tuple(note_list), **fields)
-    note = order_note(measurement)
-    return measurement if note is None else replace(measurement, notes=(*measurement.notes, note))
+    order_text = describe_electrode_order(measurement)
+    return measurement if order_text is None else replace(measurement, notes=(*measurement.notes, order_text))
 
 
-def _hint_of_number(number: int, channels: int) -> str:
+def _explain_number(number: int, channels: int) -> str:
     """Text on what may be wrong if `number` numbers are not complete frames of `channels` voltages: missing lines, or a
     different number of electrodes."""
     if 0 < channels - number <= channels // 4:
@@ -149,31 +149,34 @@ def _hint_of_number(number: int, channels: int) -> str:
     )
 
 
-def _of_electrodes(is_missing: Bool[np.ndarray, "F M"], protocol: Protocol) -> str:
+def _describe_missing_electrodes(is_missing: Bool[np.ndarray, "F M"], protocol: Protocol) -> str:
     """Clause that names the electrodes without any usable channel in some frame, unless they are all; otherwise
     empty."""
     touching = np.array([protocol.channels_touching(electrode) for electrode in range(protocol.num_electrodes)])
-    lost = [bool(channels.any()) and bool(is_missing[:, channels].all(axis=1).any()) for channels in touching]
-    if not any(lost) or all(lost):
+    is_lost = [bool(channels.any()) and bool(is_missing[:, channels].all(axis=1).any()) for channels in touching]
+    if not any(is_lost) or all(is_lost):
         return ""
-    numbers = ", ".join(str(electrode + 1) for electrode in np.flatnonzero(lost))
-    return f", among them all of electrode{'s' * (sum(lost) > 1)} {numbers}: check the connection"
+    numbers = ", ".join(str(electrode + 1) for electrode in np.flatnonzero(is_lost))
+    return f", among them all of electrode{'s' * (sum(is_lost) > 1)} {numbers}: check the connection"
 
 
-def _as_frames(voltages, protocol: Protocol, name: str) -> np.ndarray:
+def _convert_to_frames(voltages, protocol: Protocol, name: str) -> np.ndarray:
     values = np.asarray(voltages)
     if values.dtype.kind not in "fiuc":
         raise ValueError(f"{name}: voltages are {values.dtype}; they must be numbers, in volts.")
     values = np.atleast_2d(values.astype(complex if values.dtype.kind == "c" else float))
     num_channels = protocol.num_measurements
     if values.ndim != 2 or values.shape[0] == 0 or values.shape[1] != num_channels:
-        hint = " It looks transposed: give one row per frame." if values.shape[0] == num_channels else ""
-        if values.ndim == 2 and 0 < (num_extra := values.shape[1] - num_channels) <= _MAX_EXTRA_COLUMNS:
-            hint = f" There are {num_extra} too many: are there times, counters or states among them? Leave them out."
-        hint = hint or _hint_of_number(values.size, num_channels)
+        shape_hint = " It looks transposed: give one row per frame." if values.shape[0] == num_channels else ""
+        if values.ndim == 2 and 0 < (num_extra_columns := values.shape[1] - num_channels) <= _MAX_EXTRA_COLUMNS:
+            shape_hint = (
+                f" There are {num_extra_columns} too many: are there times, counters or states among them? Leave them "
+                "out."
+            )
+        shape_hint = shape_hint or _explain_number(values.size, num_channels)
         raise ValueError(
             f"{name}: the data have shape {values.shape}, but the protocol '{protocol.name}' has {num_channels} "
-            f"channels, so (frames, {num_channels}) is needed.{hint} Or describe the protocol that the data "
+            f"channels, so (frames, {num_channels}) is needed.{shape_hint} Or describe the protocol that the data "
             "were measured with."
         )
     return values
@@ -188,21 +191,21 @@ def _find_saturated(values: np.ndarray, usable: np.ndarray, saturation: float | 
     result = np.zeros(values.shape, dtype=bool)
     components = [np.real(values), np.imag(values)] if np.iscomplexobj(values) else [values]
     for component in components:
-        used = np.where(usable, component, np.nan)
-        repeated = _is_minimum_repeated(used) | _is_minimum_repeated(-used)
+        usable_values = np.where(usable, component, np.nan)
+        repeated = _is_minimum_repeated(usable_values) | _is_minimum_repeated(-usable_values)
         for frame in np.flatnonzero(repeated & (usable.sum(axis=1) >= 8)):
             row, row_usable = component[frame], usable[frame]
             levels, level_index, counts = np.unique(row[row_usable], return_inverse=True, return_counts=True)
-            for extreme in (0, len(levels) - 1):
+            for extreme_index in (0, len(levels) - 1):
                 # A coarse converter or a simulated symmetric body also produces exactly equal extremes, but then values
                 # between them repeat as often; in saturated data only the extreme value repeats.
                 other_counts = np.delete(counts, [0, len(levels) - 1]) if len(levels) > 2 else np.zeros(1)
                 if (
-                    levels[extreme] != 0
-                    and counts[extreme] >= _MIN_SATURATED
-                    and counts[extreme] >= 4 * other_counts.max(initial=0)
+                    levels[extreme_index] != 0
+                    and counts[extreme_index] >= _MIN_SATURATED
+                    and counts[extreme_index] >= 4 * other_counts.max(initial=0)
                 ):
-                    result[frame, np.flatnonzero(row_usable)[level_index == extreme]] = True
+                    result[frame, np.flatnonzero(row_usable)[level_index == extreme_index]] = True
     return result
 
 
@@ -210,8 +213,8 @@ def _is_minimum_repeated(rows: np.ndarray) -> Bool[np.ndarray, " F"]:
     """Whether at least `_MIN_SATURATED` values of a row equal its minimum. NaN is left out."""
     if rows.shape[1] < _MIN_SATURATED:
         return np.zeros(len(rows), bool)
-    smallest = np.partition(rows, _MIN_SATURATED - 1, axis=1)[:, :_MIN_SATURATED]
-    return smallest.min(axis=1) == smallest.max(axis=1)
+    smallest_values = np.partition(rows, _MIN_SATURATED - 1, axis=1)[:, :_MIN_SATURATED]
+    return smallest_values.min(axis=1) == smallest_values.max(axis=1)
 
 
 def _drives_without_and_with_current(
@@ -220,13 +223,13 @@ def _drives_without_and_with_current(
     """Masks (frames, drives) of the drives without current, whose voltages are a thousand times smaller than the
     voltages of the median drive, and of the drives with current. Both masks are False for drives without a usable
     voltage."""
-    index = np.asarray(protocol.drive_index)
-    largest = np.full((values.shape[0], protocol.num_drives), -1.0)
-    np.maximum.at(largest.T, index, np.where(usable, np.abs(values), -1.0).T)
+    drive_indices = np.asarray(protocol.drive_index)
+    max_magnitudes = np.full((values.shape[0], protocol.num_drives), -1.0)
+    np.maximum.at(max_magnitudes.T, drive_indices, np.where(usable, np.abs(values), -1.0).T)
     if protocol.num_drives < 3:
-        return np.zeros(largest.shape, dtype=bool), largest >= 0
-    threshold = 1e-3 * np.median(np.maximum(largest, 0), axis=1, keepdims=True)
-    return (largest >= 0) & (largest < threshold), largest >= threshold
+        return np.zeros(max_magnitudes.shape, dtype=bool), max_magnitudes >= 0
+    threshold = 1e-3 * np.median(np.maximum(max_magnitudes, 0), axis=1, keepdims=True)
+    return (max_magnitudes >= 0) & (max_magnitudes < threshold), max_magnitudes >= threshold
 
 
 def mask_spikes(measurement: Measurement, reference: Measurement, *, fill: bool = False) -> Measurement:
@@ -262,15 +265,15 @@ def mask_spikes(measurement: Measurement, reference: Measurement, *, fill: bool 
     distinct_masks, mask_index, num_frames = np.unique(
         masks & known_channels, axis=0, return_inverse=True, return_counts=True
     )
-    for index in np.argsort(-num_frames)[:_MAX_MASKS]:
-        mask = distinct_masks[index]
+    for pattern_index in np.argsort(-num_frames)[:_MAX_MASKS]:
+        mask = distinct_masks[pattern_index]
         basis = _possible_changes(measurement, weight, mask)
         if basis is None:
             continue
-        for frame in np.flatnonzero(mask_index.ravel() == index):
+        for frame in np.flatnonzero(mask_index.ravel() == pattern_index):
             change = ((voltages[frame] - base_voltages) / weight)[mask]
-            rounding = rounding_of_difference(measurement.frame(int(frame)), mean) / weight
-            is_spike = np.isin(np.arange(len(change)), _spikes(change, basis, rounding[mask]))
+            rounding_errors = rounding_of_difference(measurement.frame(int(frame)), mean) / weight
+            is_spike = np.isin(np.arange(len(change)), _find_spikes(change, basis, rounding_errors[mask]))
             spikes[frame, mask] = is_spike
             if fill and is_spike.any():
                 # A channel is determined by the other channels if their rows of the basis span its row.
@@ -284,8 +287,8 @@ def mask_spikes(measurement: Measurement, reference: Measurement, *, fill: bool 
                 is_filled[frame, determined_channels] = True
     reason = f"spikes, which contradict the other channels ({_listed_spikes(spikes)})."
     if is_filled.any():
-        note = f"{counted(int(is_filled.sum()), 'voltage')} replaced by what others determine: {reason}"
-        measurement = replace(measurement, voltages=voltages, notes=(*measurement.notes, note))
+        spike_note = f"{counted(int(is_filled.sum()), 'voltage')} replaced by what others determine: {reason}"
+        measurement = replace(measurement, voltages=voltages, notes=(*measurement.notes, spike_note))
     return measurement.masked(~spikes | is_filled, reason) if (spikes & ~is_filled).any() else measurement
 
 
@@ -317,10 +320,10 @@ def _possible_changes(
     return basis if basis.shape[1] < len(drive) else None
 
 
-def _spikes(
-    change: Inexact[np.ndarray, " n"], basis: Float[np.ndarray, "n r"], rounding: Float[np.ndarray, " n"]
+def _find_spikes(
+    change: Inexact[np.ndarray, " n"], basis: Float[np.ndarray, "n r"], rounding_errors: Float[np.ndarray, " n"]
 ) -> list[int]:
-    """Indices of the channels with spikes in a weighted `change` (n,) of n channels; `rounding` (n,): standard
+    """Indices of the channels with spikes in a weighted `change` (n,) of n channels; `rounding_errors` (n,): standard
     deviation of the change due to rounding.
 
     If a suspected channel may have any value, its unit vector is added to the basis. The power that this vector
@@ -334,7 +337,7 @@ def _spikes(
         worst_channels = np.flatnonzero(size > (1 - _MIN_FREE_SHARE) * size.max())
         if not 0 < len(worst_channels) <= 2:
             break
-        deviation = max(1.4826 * float(np.median(size[is_contradicted])), float(rounding[worst_channels].max()))
+        deviation = max(1.4826 * float(np.median(size[is_contradicted])), float(rounding_errors[worst_channels].max()))
         if not size.max() > _SPIKE_DEVIATIONS * deviation:
             break
         direction = np.zeros(len(change))

@@ -65,9 +65,9 @@ def transfer_impedance(measurement: Measurement) -> Inexact[np.ndarray, "F L L"]
                 f"{len(rows)} numbers. It takes {num_electrodes - 1} independent currents, read on all electrodes."
             )
         for frame in np.flatnonzero((masks == mask).all(axis=1)):
-            upper = np.zeros((num_electrodes - 1, num_electrodes - 1), voltages.dtype)
-            upper[rows, columns] = inverse @ voltages[frame, mask]
-            impedances[frame] = basis @ (upper + np.triu(upper, 1).T) @ basis.T
+            upper_triangle = np.zeros((num_electrodes - 1, num_electrodes - 1), voltages.dtype)
+            upper_triangle[rows, columns] = inverse @ voltages[frame, mask]
+            impedances[frame] = basis @ (upper_triangle + np.triu(upper_triangle, 1).T) @ basis.T
     return impedances
 
 
@@ -75,24 +75,28 @@ def as_driven(reference: Measurement, measurement: Measurement) -> Measurement:
     """Convert the reference to the protocol of a measurement on the same electrodes. The reference is returned
     unchanged if only the amplitude of the currents differs, or if its patterns do not determine the voltages of that
     protocol."""
-    ours, theirs = measurement.protocol, reference.protocol
-    if ours.num_electrodes != theirs.num_electrodes or ours.same_patterns(theirs) or _are_proportional(ours, theirs):
+    measurement_protocol, reference_protocol = measurement.protocol, reference.protocol
+    if (
+        measurement_protocol.num_electrodes != reference_protocol.num_electrodes
+        or measurement_protocol.same_patterns(reference_protocol)
+        or _are_proportional(measurement_protocol, reference_protocol)
+    ):
         return reference
     try:
-        return driven_by(reference, ours)
+        return driven_by(reference, measurement_protocol)
     except ValueError:
         return reference
 
 
-def _are_proportional(ours: Protocol, theirs: Protocol) -> bool:
+def _are_proportional(first_protocol: Protocol, second_protocol: Protocol) -> bool:
     """Whether two protocols have the same measurement patterns, and drive patterns that differ by a common factor."""
-    if ours.num_measurements != theirs.num_measurements:
+    if first_protocol.num_measurements != second_protocol.num_measurements:
         return False
-    first, second = np.asarray(ours.channel_drive), np.asarray(theirs.channel_drive)
-    ratio = np.linalg.norm(first) / np.linalg.norm(second)
-    return np.allclose(first, ratio * second, rtol=1e-6, atol=1e-6 * np.abs(first).max()) and np.allclose(
-        ours.channel_measurement, theirs.channel_measurement, rtol=1e-6
-    )
+    first_drives, second_drives = np.asarray(first_protocol.channel_drive), np.asarray(second_protocol.channel_drive)
+    ratio = np.linalg.norm(first_drives) / np.linalg.norm(second_drives)
+    return np.allclose(
+        first_drives, ratio * second_drives, rtol=1e-6, atol=1e-6 * np.abs(first_drives).max()
+    ) and np.allclose(first_protocol.channel_measurement, second_protocol.channel_measurement, rtol=1e-6)
 
 
 def driven_by(measurement: Measurement, protocol: Protocol) -> Measurement:
@@ -125,7 +129,9 @@ def driven_by(measurement: Measurement, protocol: Protocol) -> Measurement:
     )
     has_same_name = protocol.name == measurement.protocol.name
     explanation = "other currents of that name read" if has_same_name else f"'{protocol.name}' reads"
-    note = f"'{measurement.name}' was measured with '{measurement.protocol.name}', and turned into what {explanation}."
+    transfer_note = (
+        f"'{measurement.name}' was measured with '{measurement.protocol.name}', and turned into what {explanation}."
+    )
     return Measurement(
         voltages,
         np.ones(voltages.shape, bool),
@@ -135,7 +141,7 @@ def driven_by(measurement: Measurement, protocol: Protocol) -> Measurement:
         name=measurement.name,
         source=measurement.source,
         frame_names=measurement.frame_names,
-        notes=(*measurement.notes, note),
+        notes=(*measurement.notes, transfer_note),
         times=measurement.times,
         uncertainty=measurement.uncertainty,
     )

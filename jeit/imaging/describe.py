@@ -19,7 +19,7 @@ from jeit.data.description import parse_description
 from jeit.data.exchange import assignments
 from jeit.data.formats import quadrupoles
 from jeit.data.formats.boards import OpenEit
-from jeit.data.inferred_properties import channel_gains, with_signs
+from jeit.data.inferred_properties import channel_gains, correct_signs
 from jeit.data.quality import reciprocity_error
 from jeit.data.registry import format_with_protocol
 from jeit.electrodes.face_patches import body_mesh
@@ -197,7 +197,7 @@ def _described_body(
     tables = {"geometry": geometry, "electrodes": {"contact_impedance": 1.0, **placements}}
     description = parse_description(tables, "the description")
     empty_frame = replace(base.mean_frame(), domain=description.domain, electrodes=description.electrodes)
-    empty_frame = with_signs(replace(empty_frame, voltages=np.real(np.asarray(empty_frame.voltages))))
+    empty_frame = correct_signs(replace(empty_frame, voltages=np.real(np.asarray(empty_frame.voltages))))
     spread = spread_of(np.real(np.asarray(base.filled())))
     models: _Models = {}
     protocol = {"kind": format, "number": number}

@@ -15,7 +15,7 @@ from jeit.arguments import counted, did_you_mean, names_text
 from jeit.data import Measurement
 from jeit.data.description import Description, TableLayout, parse_description
 from jeit.data.formats.boards import OpenEit
-from jeit.data.formats.table import measurement_in
+from jeit.data.formats.table import create_measurement_of_frames
 from jeit.data.formats.text import Frames, frames_in_table, frames_in_text, read_text
 from jeit.data.quality import reciprocity_error
 from jeit.files import matlab, npy_array, npz_arrays, npz_shapes
@@ -280,6 +280,6 @@ def _measurement_of(
         num_frames = len(frames.table)
         chosen = np.unique(np.linspace(0, num_frames - 1, _MAX_FRAMES).round().astype(int))
         some_frames = frames._replace(table=frames.table[chosen], times=None)
-        return num_frames, measurement_in(numbers.path, description, some_frames, [(protocol, "")])
+        return num_frames, create_measurement_of_frames(numbers.path, description, some_frames, [(protocol, "")])
     except ValueError:
         return 0, None

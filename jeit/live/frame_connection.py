@@ -110,8 +110,8 @@ class SerialPort(AbstractConnection):
         device = self.device
         try:
             device.timeout = timeout
-            first = device.read(1)
-            return first + device.read(min(device.in_waiting, _MAX_READ_BYTES)) if first else b""
+            first_byte = device.read(1)
+            return first_byte + device.read(min(device.in_waiting, _MAX_READ_BYTES)) if first_byte else b""
         except TypeError:  # the port was closed by another thread
             raise OSError("the port was closed") from None
 
@@ -159,7 +159,7 @@ class TcpServer(AbstractConnection):
             self.socket = None
 
 
-def connection_to(text: str) -> AbstractConnection:
+def open_connection(text: str) -> AbstractConnection:
     """Create the connection that "-", "serial:PORT@BAUD" or "tcp:HOST:PORT" names. Without "@BAUD", the baud rate is
     115,200.
 
@@ -232,55 +232,59 @@ class LineSource(AbstractSource):
 
     def _read_until_lost(self) -> Iterator[LiveFrame]:
         """Yield frames until the connection is lost, the source has ended, or the source is closed."""
-        buffer, last_arrival, is_first = LineBuffer(), time.monotonic(), self.device.reconnects
+        buffer, last_arrival, is_first_line = LineBuffer(), time.monotonic(), self.device.reconnects
         while not self.closing.is_set():
             try:
-                received = self.device.read(_READ_TIMEOUT)
+                received_bytes = self.device.read(_READ_TIMEOUT)
             except OSError as error:
                 loss_reason = str(error)
                 break
-            arrived = time.monotonic()
-            if received is None:
+            arrival_time = time.monotonic()
+            if received_bytes is None:
                 loss_reason = "the other side has closed the connection"
                 break
-            if received:
-                last_arrival, self.connection = arrived, CONNECTED
-                for line in buffer.feed(received):
-                    yield from self._parse_line(line, arrived, is_first=is_first)
-                    is_first = False
-            elif arrived - last_arrival > _SILENCE_TIMEOUT and self.connection == CONNECTED:
+            if received_bytes:
+                last_arrival, self.connection = arrival_time, CONNECTED
+                for line in buffer.add_bytes(received_bytes):
+                    yield from self._parse_line(line, arrival_time, is_first_line=is_first_line)
+                    is_first_line = False
+            elif arrival_time - last_arrival > _SILENCE_TIMEOUT and self.connection == CONNECTED:
                 self.connection = "waiting: the device sends nothing"
                 self.say("The device is connected and sends nothing.")
         else:
             return
         self.device.close()
-        remainder = buffer.take_remainder()
+        last_line = buffer.take_incomplete_line()
         if self.device.reconnects:
             self.connection = f"waiting: {loss_reason}"[:300]
             self.say(f"Connection lost: {loss_reason}.")
-            if remainder.strip():
-                yield self.frame(f"cut off: {remainder[:200].decode('utf-8', 'replace')}")
-        elif remainder.strip():  # the last line of a file may have no line end
-            yield from self._parse_line(remainder, time.monotonic())
+            if last_line.strip():
+                yield self.frame(f"cut off: {last_line[:200].decode('utf-8', 'replace')}")
+        elif last_line.strip():  # the last line of a file may have no line end
+            yield from self._parse_line(last_line, time.monotonic())
 
-    def _parse_line(self, line: bytes, arrived: float, *, is_first: bool = False) -> Iterator[LiveFrame]:
-        """Yield the frame in a line, if the line is not a comment. `is_first`: whether the connection may have begun
-        within the line."""
+    def _parse_line(self, line: bytes, arrival_time: float, *, is_first_line: bool = False) -> Iterator[LiveFrame]:
+        """Yield the frame in a line, if the line is not a comment. `is_first_line`: whether the connection may have
+        begun within the line."""
         values = self.reading(line)
-        note = self.reading.note
-        if note and note != self._last_note and (values is not None or arrived - self._note_time > _MIN_NOTE_INTERVAL):
-            self._last_note, self._note_time = note, arrived
-            self.say(note if values is not None else f"The device sends: {note}")
+        parser_note = self.reading.note
+        if (
+            parser_note
+            and parser_note != self._last_note
+            and (values is not None or arrival_time - self._note_time > _MIN_NOTE_INTERVAL)
+        ):
+            self._last_note, self._note_time = parser_note, arrival_time
+            self.say(parser_note if values is not None else f"The device sends: {parser_note}")
         if values is None:
             return
-        if is_first and not isinstance(values, str) and not self.reading.begins_whole(values):
+        if is_first_line and not isinstance(values, str) and not self.reading.begins_whole(values):
             values = f"begun before connecting: {line[:200].decode('utf-8', 'replace')}"
         if self.rate is not None:
             due_time = self.begun + self._num_frames / self.rate
             if self.closing.wait(max(0.0, due_time - time.monotonic())):
                 return
-            arrived = time.monotonic()
-        yield self.frame(values, arrived)
+            arrival_time = time.monotonic()
+        yield self.frame(values, arrival_time)
 
 
 class ReadAhead(AbstractSource):

@@ -239,14 +239,14 @@ def _frames_of_usual_length(rows: list[np.ndarray], seconds: float) -> Float[np.
 class _ContinuedSource(AbstractSource):
     """A source whose first frames have already been read. `remaining`: iterator over the frames that follow."""
 
-    def __init__(self, source: AbstractSource, remaining: Iterator[LiveFrame]):
-        self._source, self._remaining = source, remaining
+    def __init__(self, source: AbstractSource, remaining_frames: Iterator[LiveFrame]):
+        self._source, self._remaining_frames = source, remaining_frames
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._source, name)
 
     def __iter__(self) -> Iterator[LiveFrame]:
-        return self._remaining
+        return self._remaining_frames
 
     def close(self) -> None:
         """End the iteration soon."""

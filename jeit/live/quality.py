@@ -71,24 +71,24 @@ class QualityWatch:
 
     def __init__(self, reference: Measurement | None):
         self.protocol = None if reference is None else reference.protocol
-        self.expected = self.touching = None
+        self.reference_voltages = self.touching = None
         self._lock = threading.Lock()
         self._frames: deque[np.ndarray] = deque(maxlen=_NUM_FRAMES)
         self._medians: deque[np.ndarray] = deque(maxlen=_NUM_MEDIANS)
         if reference is not None:
-            self.renew(np.where(reference.mask, np.real(np.asarray(reference.voltages)), np.nan))
+            self.replace_reference(np.where(reference.mask, np.real(np.asarray(reference.voltages)), np.nan))
             num_electrodes = reference.protocol.num_electrodes
             self.touching = np.array(
                 [reference.protocol.channels_touching(electrode) for electrode in range(num_electrodes)]
             )
 
-    def renew(self, frames: Float[np.ndarray, "N M"]) -> None:
+    def replace_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
         """Replace the reference by the mean of `frames` (frames, channels)."""
         is_finite = np.isfinite(frames)
         total = np.where(is_finite, frames, 0.0).sum(axis=0)
         mean = np.where(is_finite.any(axis=0), total / np.maximum(is_finite.sum(axis=0), 1), np.nan)
         with self._lock:
-            self.expected = mean
+            self.reference_voltages = mean
             self._medians.clear()
 
     def add(self, frame: LiveFrame) -> None:
@@ -96,7 +96,7 @@ class QualityWatch:
         values = frame.values
         if isinstance(values, str) or values.ndim != 1 or values.dtype.kind not in "iuf":
             return
-        if self.expected is not None and len(values) != len(self.expected):
+        if self.reference_voltages is not None and len(values) != len(self.reference_voltages):
             return
         with self._lock:
             if self._frames and len(self._frames[0]) != len(values):
@@ -110,10 +110,10 @@ class QualityWatch:
             if len(self._frames) < _MIN_FRAMES:
                 return Quality()
             frames = np.array(self._frames, float)
-            expected = self.expected
+            reference_voltages = self.reference_voltages
         frames[~np.isfinite(frames)] = np.nan
         noise = _relative_noise(frames)
-        if expected is None or self.protocol is None or self.touching is None:
+        if reference_voltages is None or self.protocol is None or self.touching is None:
             return Quality(noise)
         is_known = np.isfinite(frames).sum(axis=0) > len(frames) // 2
         medians = np.full(frames.shape[1], np.nan)
@@ -125,17 +125,17 @@ class QualityWatch:
         with self._lock:
             self._medians.append(medians)
             past_medians = np.array(self._medians)
-        is_readable = np.isfinite(expected) & (expected != 0)
-        change = np.abs(medians - expected) / np.abs(np.where(is_readable, expected, 1.0))
+        is_readable = np.isfinite(reference_voltages) & (reference_voltages != 0)
+        change = np.abs(medians - reference_voltages) / np.abs(np.where(is_readable, reference_voltages, 1.0))
         dead_electrodes = _find_dead_electrodes(~is_known | (change > _LOST_DIFFERENCE), is_readable, self.touching)
         if len(past_medians) < _NUM_MEDIANS // 2:
             return Quality(noise, reciprocity, dead_electrodes)
         has_drift_data = (
             np.isfinite(past_medians).all(axis=0) & is_readable & ~self.touching[dead_electrodes].any(axis=0)
         )
-        drift = np.zeros(len(expected))
+        drift = np.zeros(len(reference_voltages))
         drift[has_drift_data] = np.median(
-            np.abs(past_medians[:, has_drift_data] / expected[has_drift_data] - 1), axis=0
+            np.abs(past_medians[:, has_drift_data] / reference_voltages[has_drift_data] - 1), axis=0
         )
         return Quality(
             noise, reciprocity, dead_electrodes, _find_drifting_electrodes(drift, has_drift_data, self.touching)
@@ -209,12 +209,12 @@ def _find_drifting_electrodes(
         own_channels = [touching[mask] & is_remaining for mask in range(len(touching))]
         median_drifts = np.array([np.median(drift[mask]) if mask.any() else 0.0 for mask in own_channels])
         worst_electrode = int(median_drifts.argmax())
-        other_channels = is_remaining & ~touching[worst_electrode]
+        channels_of_others = is_remaining & ~touching[worst_electrode]
         if (
             median_drifts[worst_electrode] < _DRIFT_DIFFERENCE
-            or not other_channels.any()
-            or median_drifts[worst_electrode] < _DRIFT_RATIO * np.median(drift[other_channels])
+            or not channels_of_others.any()
+            or median_drifts[worst_electrode] < _DRIFT_RATIO * np.median(drift[channels_of_others])
         ):
             return sorted(drifting_electrodes)
         drifting_electrodes.append(worst_electrode)
-        is_remaining = other_channels
+        is_remaining = channels_of_others

@@ -70,7 +70,7 @@ class Recorder:
         self._problem = ""
         self._files: _RecordingFiles | None = None
         self._thread: threading.Thread | None = None
-        self._ending = False
+        self._is_stopping = False
         self._last_microsecond = -1
         self._num_channels = self._frame_length = None if reference is None else reference.num_channels
         self._num_other_lengths = self._file_number = self._file_size = 0
@@ -84,7 +84,7 @@ class Recorder:
         if self.reference is not None:
             _write_reference(self.reference, folder)
         with self._condition:
-            self._files, self._ending, self._problem = _RecordingFiles(folder), False, ""
+            self._files, self._is_stopping, self._problem = _RecordingFiles(folder), False, ""
             self._num_lost = 0
             self._last_microsecond, self._frame_length = -1, self._num_channels
             self._num_other_lengths, self._file_number, self._file_size = 0, 1, 0
@@ -100,7 +100,7 @@ class Recorder:
         """End the recording, and wait until all frames are written, for at most ten seconds. Returns a sentence for the
         user; an empty string if no recording was in progress."""
         with self._condition:
-            thread, files, self._ending = self._thread, self._files, True
+            thread, files, self._is_stopping = self._thread, self._files, True
             self._condition.notify_all()
         if thread is None or files is None:
             return ""
@@ -230,7 +230,7 @@ class Recorder:
             return self._lines[0]
 
     def _is_ending(self, files: _RecordingFiles) -> bool:
-        return self._ending or self._files is not files
+        return self._is_stopping or self._files is not files
 
 
 class _RecordingFiles:
@@ -256,7 +256,9 @@ class _RecordingFiles:
         """Create the file `name` with its header line, and close the previous file of frames."""
         heading = b"second,text\n"
         if name.startswith(_FRAMES_PREFIX):
-            heading = ("second," + ",".join(f"v{index + 1}" for index in range(line.count(b","))) + "\n").encode()
+            heading = (
+                "second," + ",".join(f"v{channel_index + 1}" for channel_index in range(line.count(b","))) + "\n"
+            ).encode()
         descriptor = os.open(self.folder / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _BINARY, 0o644)
         try:
             self._append_line(descriptor, 0, heading)
@@ -319,10 +321,10 @@ def _write_reference(reference: Measurement, folder: Path) -> None:
     (folder / DESCRIPTION).write_text(text, "utf-8")
 
 
-def _format_row(second: float, text: str) -> bytes:
+def _format_row(frame_time: float, text: str) -> bytes:
     """Format a line of a CSV table of times in seconds and texts."""
     buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerow([f"{second:.6f}", " ".join(text.split())])
+    csv.writer(buffer, lineterminator="\n").writerow([f"{frame_time:.6f}", " ".join(text.split())])
     return buffer.getvalue().encode("utf-8", "replace")
 
 

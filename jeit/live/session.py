@@ -108,7 +108,7 @@ class Session:
         self._waiting_frames: deque[LiveFrame] = deque()
         self._results: deque[Result] = deque()
         self._num_bytes = 0
-        self._ended = self._finished = False
+        self._has_source_ended = self._is_finished = False
         self._closed = threading.Event()
         self._num_read = self._num_imaged = self._num_dropped = self._num_refused = 0
         self._reasons: dict[str, list] = {}
@@ -151,7 +151,7 @@ class Session:
         """Close the source, and end the recording and the threads."""
         self.source.close()
         with self._condition:
-            self._ended = True
+            self._has_source_ended = True
             self._condition.notify_all()
         for thread in self._threads:
             thread.join(5.0)
@@ -160,7 +160,7 @@ class Session:
     def wait(self) -> None:
         """Wait until the source has ended and its last frame is imaged."""
         with self._condition:
-            while not self._finished:
+            while not self._is_finished:
                 self._condition.wait(0.5)
 
     def newest(self, after: int, timeout: float) -> Result | None:
@@ -170,7 +170,7 @@ class Session:
         with self._condition:
             while not (self._results and self._results[-1].frame.number > after):
                 remaining_time = end - time.monotonic()
-                if self._finished or remaining_time <= 0:
+                if self._is_finished or remaining_time <= 0:
                     return None
                 self._condition.wait(min(remaining_time, 0.5))
             return self._results[-1]
@@ -207,10 +207,10 @@ class Session:
     def mark(self, label: str) -> None:
         """Mark an event named `label` at the present time, also in the recording."""
         label = " ".join(label.split())[:_MAX_LABEL_LENGTH] or "event"
-        second = time.monotonic() - self.source.begun
+        event_time = time.monotonic() - self.source.begun
         self.say(f"Event: {label}")
         if self.recorder is not None:
-            self.recorder.mark(second, label)
+            self.recorder.mark(event_time, label)
 
     def record(self, on: bool) -> None:
         """Begin a recording in a new folder (`on`), or end the current recording. `state` reports failures."""
@@ -246,7 +246,7 @@ class Session:
                 "reasons": dict(self._reasons.values()),
                 "statuses": {str(status): count for status, count in self._statuses.items()},
             }
-            quality, ended = self._quality, self._ended
+            quality, has_ended = self._quality, self._has_source_ended
         median, latency_99 = np.quantile(latencies, (0.5, 0.99)).tolist() if latencies.size else (None, None)
         messages = sorted([*self.source.messages.copy(), *self._messages.copy()])[-MAX_MESSAGES:]
         return {
@@ -258,7 +258,7 @@ class Session:
             "reciprocity": quality.reciprocity,
             "dead": self._electrode_names(quality.dead),
             "drifting": self._electrode_names(quality.drifting),
-            "connection": ENDED if ended else self.source.connection,
+            "connection": ENDED if has_ended else self.source.connection,
             "recording": None if self.recorder is None else self.recorder.state(),
             "messages": [{"second": second, "text": text} for second, text in messages],
         }
@@ -266,15 +266,15 @@ class Session:
     @property
     def ended(self) -> bool:
         """Whether the source has ended and its last frame is imaged."""
-        return self._finished
+        return self._is_finished
 
     def _frame_rate(self) -> float:
         """Frames/s in the last two seconds."""
         now = time.monotonic()
         with self._condition:
-            recent = [arrival for arrival in self._arrivals if arrival > now - _RATE_SPAN]
-        time_span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
-        return (len(recent) - 1) / time_span if time_span > 0 else 0.0
+            recent_arrivals = [arrival for arrival in self._arrivals if arrival > now - _RATE_SPAN]
+        time_span = recent_arrivals[-1] - recent_arrivals[0] if len(recent_arrivals) > 1 else 0.0
+        return (len(recent_arrivals) - 1) / time_span if time_span > 0 else 0.0
 
     def _electrode_names(self, electrodes: Sequence[int]) -> list[str]:
         names = self.scene.names
@@ -300,7 +300,7 @@ class Session:
             self.say(f"The source failed: {error}")
         finally:
             with self._condition:
-                self._ended = True
+                self._has_source_ended = True
                 self._condition.notify_all()
 
     def _compare_length(self, frame: LiveFrame) -> None:
@@ -342,7 +342,7 @@ class Session:
         """Wait for the next frame to image, and return it; None at the end."""
         with self._condition:
             while not self._waiting_frames:
-                if self._ended:
+                if self._has_source_ended:
                     return None
                 self._condition.wait(0.5)
             oldest_arrival = time.monotonic() - _MAX_WAIT
@@ -365,7 +365,7 @@ class Session:
                 self._messages.append(
                     (time.monotonic() - self.source.begun, "The source ended before a new reference.")
                 )
-            self._finished = True
+            self._is_finished = True
             self._condition.notify_all()
 
     def _set_reference(self) -> None:
@@ -384,7 +384,7 @@ class Session:
         except ValueError as error:
             self.say(f"The old reference stays: {error}")
             return
-        self._quality_watch.renew(frames)
+        self._quality_watch.replace_reference(frames)
         if self.recorder is not None:
             self.recorder.renew(time.monotonic() - self.source.begun, frames)
         self.say(f"New reference: mean of {counted(len(frames), 'frame')}.")

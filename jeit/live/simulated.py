@@ -82,18 +82,18 @@ class SimulatedSensor(AbstractSource):
     ):
         super().__init__(name)
         self.reference, self.rate, self.limit, self.period = reference, float(rate), limit, period
-        self.states, self._places = rest + changes, places
+        self.states, self._positions = rest + changes, places
         self._noise = _noise_deviation(rest)
         self._random = np.random.default_rng(seed)
 
     def truth(self, second: float) -> tuple[float, float] | None:
         """True position (x, y) of the rod or finger at the time `second`, in metres; None if nothing touches the
         sensor."""
-        x, y = self._places[self._state_index(second)].tolist()
+        x, y = self._positions[self._state_index(second)].tolist()
         return None if np.isnan(x) else (x, y)
 
-    def _state_index(self, second: float) -> int:
-        return int(second / self.period * len(self.states)) % len(self.states)
+    def _state_index(self, time: float) -> int:
+        return int(time / self.period * len(self.states)) % len(self.states)
 
     def __iter__(self) -> Iterator[LiveFrame]:
         self.begun = time.monotonic()
@@ -101,9 +101,9 @@ class SimulatedSensor(AbstractSource):
         while self.limit is None or number < self.limit:
             if self.closing.wait(max(0.0, self.begun + number / self.rate - time.monotonic())):
                 break
-            arrived = time.monotonic()
-            values = self.states[self._state_index(arrived - self.begun)]
-            yield self.frame(values + self._noise * self._random.standard_normal(values.shape), arrived)
+            arrival_time = time.monotonic()
+            values = self.states[self._state_index(arrival_time - self.begun)]
+            yield self.frame(values + self._noise * self._random.standard_normal(values.shape), arrival_time)
             number += 1
         self.connection = ENDED
 
@@ -129,20 +129,28 @@ def simulated_tank(rate: float = 60.0, *, limit: int | None = None, seed: int = 
     tank = RoundSkin(radius=0.1, electrode_width=0.02, contact_impedance=1e-3, conductivity=0.01, num_points=_NUM_NODES)
     model = tank.model()
     cells = np.asarray(centroids(model.mesh))
-    rest = np.asarray(model.voltages(np.full(len(cells), tank.conductivity)))
+    reference_voltages = np.asarray(model.voltages(np.full(len(cells), tank.conductivity)))
     pitch = 2 * np.pi / tank.num_electrodes
     angles = pitch * np.arange(_STEPS_PER_ELECTRODE * tank.num_electrodes) / _STEPS_PER_ELECTRODE
-    places = _ORBIT_RADIUS * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    inside_masks = np.sum((cells - places[:_STEPS_PER_ELECTRODE, None]) ** 2, axis=2) < _ROD_RADIUS**2
+    positions = _ORBIT_RADIUS * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    inside_masks = np.sum((cells - positions[:_STEPS_PER_ELECTRODE, None]) ** 2, axis=2) < _ROD_RADIUS**2
     first_changes = [
         np.asarray(model.voltages(tank.conductivity * np.where(is_inside, _ROD_CONDUCTIVITY, 1.0)))
         for is_inside in inside_masks
-    ] - rest
+    ] - reference_voltages
     changes = np.concatenate([_rotate_changes(first_changes, k) for k in range(tank.num_electrodes)])
-    reference = _simulate_reference(tank, model, rest, seed, "simulated tank")
+    reference = _simulate_reference(tank, model, reference_voltages, seed, "simulated tank")
     name = "demo: a tank in which a rod goes round"
     return SimulatedSensor(
-        name, reference, rest, changes, places, period=_REVOLUTION_TIME, rate=rate, limit=limit, seed=seed
+        name,
+        reference,
+        reference_voltages,
+        changes,
+        positions,
+        period=_REVOLUTION_TIME,
+        rate=rate,
+        limit=limit,
+        seed=seed,
     )
 
 
@@ -166,7 +174,7 @@ def simulated_skin(rate: float = 60.0, *, limit: int | None = None, seed: int = 
     skin = RoundSkin(num_points=_NUM_NODES)
     model = skin.model()
     cells = centroids(model.mesh)
-    rest = np.asarray(model.voltages(np.full(model.mesh.num_cells, skin.conductivity)))
+    reference_voltages = np.asarray(model.voltages(np.full(model.mesh.num_cells, skin.conductivity)))
     path = np.stack(
         [np.linspace(-_HALF_STROKE, _HALF_STROKE, _NUM_STROKE_STATES), np.full(_NUM_STROKE_STATES, _STROKE_OFFSET)],
         axis=1,
@@ -179,16 +187,21 @@ def simulated_skin(rate: float = 60.0, *, limit: int | None = None, seed: int = 
         pressed_conductivity(cells, skin.conductivity, position, _FINGER_RADIUS, strength)
         for position, strength in zip(path, strengths, strict=True)
     ]
-    stroke = np.stack([np.asarray(model.voltages(np.asarray(conductivity))) for conductivity in conductivities]) - rest
+    stroke = (
+        np.stack([np.asarray(model.voltages(np.asarray(conductivity))) for conductivity in conductivities])
+        - reference_voltages
+    )
     pitches = [_STROKE_PITCHES * k for k in range(skin.num_electrodes)]
-    pause_states = np.zeros((_NUM_PAUSE_STATES, len(rest))), np.full((_NUM_PAUSE_STATES, 2), np.nan)
+    pause_states = np.zeros((_NUM_PAUSE_STATES, len(reference_voltages))), np.full((_NUM_PAUSE_STATES, 2), np.nan)
     changes = np.concatenate([block for k in pitches for block in (_rotate_changes(stroke, k), pause_states[0])])
     angles = 2 * np.pi / skin.num_electrodes * np.array(pitches)
     rotations = np.stack([np.cos(angles), np.sin(angles), -np.sin(angles), np.cos(angles)], axis=1).reshape(-1, 2, 2)
-    places = np.concatenate([block for rotation in rotations for block in (path @ rotation, pause_states[1])])
-    reference = _simulate_reference(skin, model, rest, seed, "simulated skin")
+    positions = np.concatenate([block for rotation in rotations for block in (path @ rotation, pause_states[1])])
+    reference = _simulate_reference(skin, model, reference_voltages, seed, "simulated skin")
     name, period = "demo: a skin that is stroked", _STROKE_TIME * skin.num_electrodes
-    return SimulatedSensor(name, reference, rest, changes, places, period=period, rate=rate, limit=limit, seed=seed)
+    return SimulatedSensor(
+        name, reference, reference_voltages, changes, positions, period=period, rate=rate, limit=limit, seed=seed
+    )
 
 
 _SIMULATED_SENSORS = {"tank": simulated_tank, "skin": simulated_skin}
@@ -209,18 +222,18 @@ def _rotate_changes(changes: Float[np.ndarray, "n M"], pitches: int) -> Float[np
     return np.roll(changes.reshape(len(changes), 16, -1), -pitches, axis=1).reshape(changes.shape)
 
 
-def _noise_deviation(rest: Float[np.ndarray, " M"]) -> float:
-    return _RELATIVE_NOISE * float(np.sqrt(np.mean(rest**2)))
+def _noise_deviation(reference_voltages: Float[np.ndarray, " M"]) -> float:
+    return _RELATIVE_NOISE * float(np.sqrt(np.mean(reference_voltages**2)))
 
 
 def _simulate_reference(
-    skin: RoundSkin, model: ForwardModel, rest: Float[np.ndarray, " M"], seed: int, name: str
+    skin: RoundSkin, model: ForwardModel, reference_voltages: Float[np.ndarray, " M"], seed: int, name: str
 ) -> Measurement:
-    noise = _noise_deviation(rest) * np.random.default_rng((seed, 1)).standard_normal(
-        (_NUM_REFERENCE_FRAMES, len(rest))
+    noise = _noise_deviation(reference_voltages) * np.random.default_rng((seed, 1)).standard_normal(
+        (_NUM_REFERENCE_FRAMES, len(reference_voltages))
     )
     return screen(
-        rest + noise,
+        reference_voltages + noise,
         model.protocol,
         electrodes=model.electrodes,
         domain=Disk(skin.radius),

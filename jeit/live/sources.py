@@ -252,9 +252,9 @@ def open_source(
     scheme = text.partition(":")[0]
     if text == "-" or scheme in ("serial", "tcp"):
         from jeit.data.formats.lines import LineParser
-        from jeit.live.frame_connection import LineSource, ReadAhead, connection_to
+        from jeit.live.frame_connection import LineSource, ReadAhead, open_connection
 
-        return ReadAhead(LineSource(text, connection_to(text), LineParser(description, reference), rate))
+        return ReadAhead(LineSource(text, open_connection(text), LineParser(description, reference), rate))
     path = Path(text)
     if text and path.is_dir():
         return WatchedFolder(path, description, reference, rate)

@@ -16,7 +16,7 @@ from jeit.inverse.calibration import Calibration
 from jeit.inverse.nonlinear import OneStep
 from jeit.layout import ring
 from jeit.live import ConductivityView, LiveFrame
-from jeit.live.views.conductivity import PixelGrid, channel_names, electrode_curves, scene_of
+from jeit.live.views.conductivity import PixelGrid, channel_names, create_scene, electrode_curves
 from jeit.live.views.contacts import ContactsView
 from jeit.mesh import Disk, centroids, cylinder, rectangle, sphere
 from jeit.protocol import adjacent, from_matrices, opposite, reference_electrode
@@ -232,7 +232,7 @@ def test_a_solid_is_shown_as_a_slice():
     place = np.column_stack([0.03 * ring(1.0, 4), np.full(4, 0.04)])
     electrodes = FaceDiscs(place, 0.008, 1e-3)
     grid = PixelGrid(mesh)
-    scene = scene_of(mesh, electrodes, adjacent(4), grid, title="", quantity="", unit="S/m", diverging=True)
+    scene = create_scene(mesh, electrodes, adjacent(4), grid, title="", quantity="", unit="S/m", diverging=True)
     (edge,) = scene.outline
     pixel = 0.1 / grid.inside.shape[1]
     assert np.abs(np.linalg.norm(edge, axis=1) - 0.05).max() < 0.003 + pixel  # a polygon of some nodes

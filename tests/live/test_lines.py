@@ -23,32 +23,32 @@ def pieces(content, longest):
 def test_lines_do_not_depend_on_chunk_boundaries(longest):
     content = b"1, 2, 3\r\n\n  \n4;5;6\rmagnitudes : 1,2\nx\xff\x00y\nlast"
     buffer = LineBuffer()
-    lines = [line for piece in pieces(content, longest) for line in buffer.feed(piece)]
+    lines = [line for piece in pieces(content, longest) for line in buffer.add_bytes(piece)]
     assert lines == [b"1, 2, 3", b"4;5;6", b"magnitudes : 1,2", b"x\xff\x00y"]
-    assert buffer.take_remainder() == b"last"
-    assert buffer.take_remainder() == b""
+    assert buffer.take_incomplete_line() == b"last"
+    assert buffer.take_incomplete_line() == b""
 
 
 @pytest.mark.parametrize("longest", [1, 5, 1000])
 def test_frames_of_openeit_are_separated_without_line_ends(longest):
     buffer = LineBuffer()
     content = b"boot magnitudes : 1, 2,magnitudes : 3, 4\nMagnitudes: 5, 6magnitudes : 7"
-    lines = [line for piece in pieces(content, longest) for line in buffer.feed(piece)]
+    lines = [line for piece in pieces(content, longest) for line in buffer.add_bytes(piece)]
     assert lines == [b"boot ", b"magnitudes : 1, 2,", b"magnitudes : 3, 4", b"Magnitudes: 5, 6"]
-    assert buffer.take_remainder() == b"magnitudes : 7"
+    assert buffer.take_incomplete_line() == b"magnitudes : 7"
 
 
 def test_a_line_without_end_uses_bounded_memory_and_the_next_one_is_complete():
     buffer, piece = LineBuffer(10_000), b"7" * 4096
     tracemalloc.start()
     for _ in range(500):
-        assert buffer.feed(piece) == []
+        assert buffer.add_bytes(piece) == []
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 200_000
-    (line,) = buffer.feed(b"\n")
+    (line,) = buffer.add_bytes(b"\n")
     assert line == b"7" * 10_000 + "…".encode()
-    assert buffer.feed(b"1, 2\n") == [b"1, 2"]
+    assert buffer.add_bytes(b"1, 2\n") == [b"1, 2"]
 
 
 def frame_in(reading, line):
@@ -158,7 +158,7 @@ def test_corrupted_lines_are_frames_or_text_and_leave_the_others_correct(word):
     for number, values in enumerate(frames):
         line = (word + ", ".join(map(repr, (abs(values) if word else values).tolist()))).encode()
         whole = number % 2 == 1
-        for one in buffer.feed((line if whole else corrupted(line, random)) + b"\n"):
+        for one in buffer.add_bytes((line if whole else corrupted(line, random)) + b"\n"):
             found = reading(one)
             assert found is None or (len(found) <= 400 if isinstance(found, str) else found.ndim == 1)
             if whole and number > 50:

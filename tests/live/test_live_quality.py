@@ -58,7 +58,7 @@ def test_an_electrode_drifts_if_its_channels_stay_changed():
     assert list(looked(frames, watch, times=5).drifting) == []
     assert list(looked(frames, watch, times=20).drifting) == [4]
     assert list(looked(frames, watch).dead) == []
-    watch.renew(frames)
+    watch.replace_reference(frames)
     assert list(looked(frames, watch, times=30).drifting) == []
 
 

@@ -327,12 +327,12 @@ def test_latency_is_of_displayed_pictures():
         viewer = Viewer()
         now = time.monotonic()
         for number, ago in ((1, 90.0), (2, 30.0)):
-            viewer.note_sent(number, now - ago)
+            viewer.record_sent(number, now - ago)
         assert not viewer.is_ready_for(3)
-        viewer.note_drawn(2, hidden=False)
-        viewer.note_sent(3, now - 600)
-        viewer.note_drawn(3, hidden=True)
-        viewer.note_drawn(77, hidden=False)
+        viewer.record_drawn(2, hidden=False)
+        viewer.record_sent(3, now - 600)
+        viewer.record_drawn(3, hidden=True)
+        viewer.record_drawn(77, hidden=False)
         return viewer.summary()
 
     assert asyncio.run(judged())["latency_99"] == pytest.approx(30, abs=5)

@@ -13,7 +13,7 @@ from small_sensor import CHANNELS, measured, noisy
 from jeit.data import write_table
 from jeit.data.formats.lines import LineParser
 from jeit.live import frame_connection, preparation
-from jeit.live.frame_connection import LineSource, ReadAhead, SerialPort, StandardInput, TcpServer, connection_to
+from jeit.live.frame_connection import LineSource, ReadAhead, SerialPort, StandardInput, TcpServer, open_connection
 from jeit.live.preparation import first_frames
 from jeit.live.sources import AbstractSource, PlayedRecording, WatchedFolder, open_source
 
@@ -368,14 +368,14 @@ def test_a_text_that_names_no_source_is_refused_with_advice(text):
 
 
 def test_addresses_are_parsed():
-    server = connection_to("tcp:[::1]:5000")
+    server = open_connection("tcp:[::1]:5000")
     assert isinstance(server, TcpServer)
     assert (server.host, server.port) == ("::1", 5000)
     with contextlib.suppress(ImportError):
-        device = connection_to("serial:/dev/serial/by-id/usb-A@B@57600")
+        device = open_connection("serial:/dev/serial/by-id/usb-A@B@57600")
         assert isinstance(device, SerialPort)
         assert (device.port, device.baud) == ("/dev/serial/by-id/usb-A@B", 57600)
-        other = connection_to("serial:COM3")
+        other = open_connection("serial:COM3")
         assert isinstance(other, SerialPort)
         assert other.baud == 115200
 

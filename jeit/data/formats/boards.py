@@ -20,9 +20,9 @@ from jaxtyping import Bool, Complex, Float
 
 from jeit.arguments import counted, names_text
 from jeit.data.description import Description, parse_description
-from jeit.data.formats.recording import Recording, content_of, description_of, measurement_of
+from jeit.data.formats.recording import Recording, create_measurement, find_or_load_description, read_file_bytes
 from jeit.data.formats.table import description_like, find_description
-from jeit.data.inferred_properties import with_signs
+from jeit.data.inferred_properties import correct_signs
 from jeit.data.measurement import Measurement
 from jeit.protocol import Protocol
 
@@ -79,16 +79,16 @@ class Cn0565:
         values, notes = cls.numbers(path)
         described_measurement = _measurement_with_description(path, description, like)
         sensor_description = (
-            description_of(path, description)
+            find_or_load_description(path, description)
             if described_measurement is None
             else description_like(described_measurement)
         )
         protocol, protocol_notes = cls._protocol(path, sensor_description, values.shape[1], described_measurement)
         sensor_description = replace(sensor_description, protocol_section=None)
-        measurement = measurement_of(
+        measurement = create_measurement(
             path, Recording(values, protocol, notes=(*cls._SCALE_NOTES, *protocol_notes, *notes)), sensor_description
         )
-        return with_signs(measurement, like)
+        return correct_signs(measurement, like)
 
     @classmethod
     def _protocol(
@@ -138,7 +138,7 @@ class Cn0565:
 
         Raises `ValueError` if there is no frame, or if most frames have an odd number of numbers.
         """
-        frames = list(cls._frames(content_of(path)))
+        frames = list(cls._frames(read_file_bytes(path)))
         if not frames:
             raise ValueError(f"{path.name}: no line begins with '!V', as those of a CN0565 do.")
         lengths = [len(frame) for frame in frames]
@@ -160,10 +160,10 @@ class Cn0565:
         return values[:, 0::2] + 1j * values[:, 1::2], tuple(notes)
 
     @classmethod
-    def _frames(cls, content: bytes) -> Iterator[list[float | None]]:
+    def _frames(cls, data: bytes) -> Iterator[list[float | None]]:
         """Yield the numbers of each line that is a frame; None for a cell that is not a number, and for text after the
         numbers."""
-        for line in cls._FRAME_LINE.finditer(content):
+        for line in cls._FRAME_LINE.finditer(data):
             cells = [cell.strip() for cell in line[1].split(b",")]
             while cells and not cells[-1]:
                 cells.pop()
@@ -218,7 +218,7 @@ class OpenEit:
             if first_word is None:
                 return False
             head += file.read(cls._HEAD_BYTES - len(head))
-        return _usual_length([len(frame) for frame in cls.frames_in(head)]) in cls._PROTOCOL_TABLES
+        return _usual_length([len(frame) for frame in cls.parse_frames(head)]) in cls._PROTOCOL_TABLES
 
     @classmethod
     def read(
@@ -234,7 +234,7 @@ class OpenEit:
         values, notes = cls.numbers(path)
         described_measurement = _measurement_with_description(path, description, like)
         sensor_description = (
-            description_of(path, description)
+            find_or_load_description(path, description)
             if described_measurement is None
             else description_like(described_measurement)
         )
@@ -251,15 +251,18 @@ class OpenEit:
             values = current * values
             notes = (f"the numbers are taken for ohms, as of a calibrated device, times {1e3 * current:g} mA.", *notes)
         recording = Recording(values, protocol, notes=notes)
-        return with_signs(measurement_of(path, recording, sensor_description), like)
+        return correct_signs(create_measurement(path, recording, sensor_description), like)
 
     @staticmethod
-    def _have_same_channels(first: Protocol, second: Protocol) -> bool:
+    def _have_same_channels(first_protocol: Protocol, second_protocol: Protocol) -> bool:
         """Whether two protocols have the same channels, apart from the current."""
-        if first.num_electrodes != second.num_electrodes or first.num_measurements != second.num_measurements:
+        if (
+            first_protocol.num_electrodes != second_protocol.num_electrodes
+            or first_protocol.num_measurements != second_protocol.num_measurements
+        ):
             return False
-        drives = (np.sign(np.asarray(protocol.channel_drive)) for protocol in (first, second))
-        measurements = (np.asarray(protocol.channel_measurement) for protocol in (first, second))
+        drives = (np.sign(np.asarray(protocol.channel_drive)) for protocol in (first_protocol, second_protocol))
+        measurements = (np.asarray(protocol.channel_measurement) for protocol in (first_protocol, second_protocol))
         return all((ours == theirs).all() for ours, theirs in (drives, measurements))
 
     @classmethod
@@ -270,8 +273,8 @@ class OpenEit:
 
         Raises `ValueError` if the frames belong to no protocol of the firmware, or to two protocols.
         """
-        content = content_of(path)
-        frames = list(cls.frames_in(content))
+        data = read_file_bytes(path)
+        frames = list(cls.parse_frames(data))
         lengths = [len(frame) for frame in frames]
         frame_length = _usual_length(lengths)
         if not frames:
@@ -284,23 +287,23 @@ class OpenEit:
                 f"{path.name}: most frames have {counted(frame_length, 'number')}; the firmware sends {known_counts}. "
                 "Read it as a table."
             )
-        if other_counts := [
+        if other_frame_lengths := [
             number for number in cls._PROTOCOL_TABLES if number != frame_length and lengths.count(number) > 1
         ]:
             raise ValueError(
                 f"{path.name}: {lengths.count(frame_length)} frames have {frame_length} numbers, and "
-                f"{lengths.count(other_counts[0])} have {other_counts[0]}: give the recordings of different devices in "
-                "a file each."
+                f"{lengths.count(other_frame_lengths[0])} have {other_frame_lengths[0]}: give the recordings of "
+                "different devices in a file each."
             )
         notes = []
-        first_word = cls._FRAME_WORD.search(content)
-        prefix = content[: first_word.start()].strip(b"\xef\xbb\xbf \r\n\t") if first_word is not None else b""
+        first_word = cls._FRAME_WORD.search(data)
+        prefix = data[: first_word.start()].strip(b"\xef\xbb\xbf \r\n\t") if first_word is not None else b""
         if prefix:
             notes.append(f"{counted(len(prefix), 'character')} before the first 'magnitudes:' are left out.")
         if len(frames) > 1 and lengths[-1] < frame_length:
             notes.append(_cut_off_note(lengths[-1]))
             del frames[-1], lengths[-1]
-        elif content[-1:].isdigit() and lengths[-1] == frame_length:
+        elif data[-1:].isdigit() and lengths[-1] == frame_length:
             frames[-1][-1] = np.nan
             notes.append("nothing follows the last number, which may be cut off: masked.")
         # Frames between which the word "magnitudes" is lost appear as one long frame; its length shows the number of
@@ -323,12 +326,12 @@ class OpenEit:
         return values, tuple(notes)
 
     @classmethod
-    def frames_in(cls, content: bytes) -> Iterator[array]:
+    def parse_frames(cls, data: bytes) -> Iterator[array]:
         """Yield the numbers of each frame; NaN for a cell that is not a number. Empty cells, and words after the last
         number of a frame, are left out."""
-        word_spans = [(match.start(), match.end()) for match in cls._FRAME_WORD.finditer(content)]
-        for (_, start), (stop, _) in itertools.pairwise([*word_spans, (len(content), 0)]):
-            cells = [cell.split() for cell in content[start:stop].split(b",")]
+        word_spans = [(match.start(), match.end()) for match in cls._FRAME_WORD.finditer(data)]
+        for (_, start), (stop, _) in itertools.pairwise([*word_spans, (len(data), 0)]):
+            cells = [cell.split() for cell in data[start:stop].split(b",")]
             cells = [cell for cell in cells if cell]
             while cells and not cells[-1][0][:1].isdigit():
                 cells.pop()

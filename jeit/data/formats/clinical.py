@@ -16,10 +16,10 @@ from jeit.data.formats.recording import (
     CHANNELS,
     Recording,
     adjacent_recording,
-    content_of,
     count_frames,
-    description_of,
-    measurement_of,
+    create_measurement,
+    find_or_load_description,
+    read_file_bytes,
     truncation_notes,
 )
 from jeit.data.measurement import Measurement
@@ -64,17 +64,17 @@ class Draeger:
     def read(cls, path: Path, description: str | Path | None = None) -> Measurement:
         """Read all frames of a Dräger recording. Raises `ValueError` for an unknown version, a file without a complete
         frame, and a header without a frame rate."""
-        content = content_of(path)
-        version, length = (int(number) for number in np.frombuffer(content[:8].ljust(8, b"\0"), "<i4"))
+        data = read_file_bytes(path)
+        version, length = (int(number) for number in np.frombuffer(data[:8].ljust(8, b"\0"), "<i4"))
         if version not in cls._FRAME_BYTES:
             known_versions = ", ".join(str(known_version) for known_version in cls._FRAME_BYTES)
             raise ValueError(
                 f"{path.name} is of Dräger's format {version}; only {known_versions} are known. Export it as a table."
             )
         frames_start, frame_size = length + cls._PREFIX_BYTES, cls._FRAME_BYTES[version]
-        num_frames, num_leftover_bytes = count_frames(content, frames_start, frame_size, path)
-        rate = cls._rate(content[:frames_start], path)
-        frames = np.frombuffer(content, np.uint8, num_frames * frame_size, frames_start).reshape(num_frames, frame_size)
+        num_frames, num_leftover_bytes = count_frames(data, frames_start, frame_size, path)
+        rate = cls._rate(data[:frames_start], path)
+        frames = np.frombuffer(data, np.uint8, num_frames * frame_size, frames_start).reshape(num_frames, frame_size)
         values = frames[:, : 8 * (cls._SECOND_PART + CHANNELS)].copy().view("<f8")
         first_part, second_part = values[:, :CHANNELS], values[:, cls._SECOND_PART :]
         with np.errstate(invalid="ignore", over="ignore"):
@@ -82,7 +82,7 @@ class Draeger:
         recording = adjacent_recording(
             voltages, np.arange(num_frames) / rate, (*cls._SCALE_NOTES, *truncation_notes(num_leftover_bytes))
         )
-        return measurement_of(path, recording, description_of(path, description))
+        return create_measurement(path, recording, find_or_load_description(path, description))
 
     @staticmethod
     def _rate(header: bytes, path: Path) -> float:
@@ -125,36 +125,36 @@ class Carefusion:
     def read(cls, path: Path, description: str | Path | None = None) -> Measurement:
         """Read all frames of a Carefusion recording. Raises `ValueError` if the header does not state its length, and
         if there is no complete frame."""
-        content = content_of(path)
-        match = re.search(r"<Header>\s{0,9}([0-9]{1,9}) bytes</Header>", cls._decode_head(content[: cls._HEAD_BYTES]))
-        if match is None or not cls._HEAD_BYTES // 8 < int(match[1]) < len(content):
+        data = read_file_bytes(path)
+        match = re.search(r"<Header>\s{0,9}([0-9]{1,9}) bytes</Header>", cls._decode_head(data[: cls._HEAD_BYTES]))
+        if match is None or not cls._HEAD_BYTES // 8 < int(match[1]) < len(data):
             raise ValueError(f"{path.name}: its header does not say where the frames begin; is it damaged?")
-        frames, num_leftover_bytes = cls._frames(content, int(match[1]))
+        frames, num_leftover_bytes = cls._frames(data, int(match[1]))
         if not frames:
             raise ValueError(f"{path.name} holds no whole frame; is it cut off?")
-        sensor_description = description_of(path, description)
+        sensor_description = find_or_load_description(path, description)
         rate_notes = (cls._NO_RATE_NOTE,) if sensor_description.layout.frame_rate is None else ()
         recording = adjacent_recording(
             np.stack(frames), None, (_SCALE_NOTE, *rate_notes, *truncation_notes(num_leftover_bytes))
         )
-        return measurement_of(path, recording, sensor_description)
+        return create_measurement(path, recording, sensor_description)
 
     @classmethod
-    def _decode_head(cls, content: bytes) -> str:
+    def _decode_head(cls, data: bytes) -> str:
         return (
-            content[len(cls._BYTE_ORDER_MARK) :].decode("utf-16-le", "ignore")
-            if content.startswith(cls._BYTE_ORDER_MARK)
+            data[len(cls._BYTE_ORDER_MARK) :].decode("utf-16-le", "ignore")
+            if data.startswith(cls._BYTE_ORDER_MARK)
             else ""
         )
 
     @classmethod
-    def _frames(cls, content: bytes, start: int) -> tuple[list[np.ndarray], int]:
+    def _frames(cls, data: bytes, start: int) -> tuple[list[np.ndarray], int]:
         """Voltages of every complete frame after byte `start`, and number of remaining bytes of a truncated last
         segment."""
         frames, offset = [], start
-        while offset + 4 * cls._NUM_HEADER_INTEGERS <= len(content):
+        while offset + 4 * cls._NUM_HEADER_INTEGERS <= len(data):
             kind, _, _, item_size, num_items, _ = (
-                int(value) for value in np.frombuffer(content, "<i4", cls._NUM_HEADER_INTEGERS, offset)
+                int(value) for value in np.frombuffer(data, "<i4", cls._NUM_HEADER_INTEGERS, offset)
             )
             length = (
                 4 * cls._SEGMENT_LENGTHS[kind]
@@ -162,12 +162,12 @@ class Carefusion:
                 else max(item_size, 0) * max(num_items, 0)
             )
             content_start = offset + 4 * cls._NUM_HEADER_INTEGERS
-            if content_start + length > len(content):
-                return frames, len(content) - offset
+            if content_start + length > len(data):
+                return frames, len(data) - offset
             if kind == cls._VOLTAGE_SEGMENT:
-                frames.append(np.frombuffer(content, "<f4", CHANNELS, content_start + 4 * cls._FIRST_VOLTAGE))
+                frames.append(np.frombuffer(data, "<f4", CHANNELS, content_start + 4 * cls._FIRST_VOLTAGE))
             offset = content_start + length
-        return frames, len(content) - offset
+        return frames, len(data) - offset
 
 
 class Goettingen:
@@ -211,22 +211,22 @@ class Goettingen:
     def read(cls, path: Path, description: str | Path | None = None) -> Measurement:
         """Read all frames of a .get recording. Raises `ValueError` for a file without a complete frame or without any
         voltage."""
-        content, frames_start = content_of(path), 0
-        if content.startswith(_DRAEGER_MARK):
-            header_end = content.find(cls._HEADER_END, 0, cls._MAX_TEXT_BYTES)
+        data, frames_start = read_file_bytes(path), 0
+        if data.startswith(_DRAEGER_MARK):
+            header_end = data.find(cls._HEADER_END, 0, cls._MAX_TEXT_BYTES)
             if header_end < 0:
                 raise ValueError(
                     f"{path.name}: its text does not end with two empty lines before the frames; is it whole?"
                 )
             frames_start = header_end + len(cls._HEADER_END)
-        num_frames, num_leftover_bytes = count_frames(content, frames_start, cls._FRAME_BYTES, path)
-        values = np.frombuffer(content, "<f4", num_frames * cls._FRAME_BYTES // 4, frames_start).reshape(
-            num_frames, -1
-        )[:, :CHANNELS]
-        sensor_description, rate = description_of(path, description), cls._recorded_rate(path)
+        num_frames, num_leftover_bytes = count_frames(data, frames_start, cls._FRAME_BYTES, path)
+        values = np.frombuffer(data, "<f4", num_frames * cls._FRAME_BYTES // 4, frames_start).reshape(num_frames, -1)[
+            :, :CHANNELS
+        ]
+        sensor_description, rate = find_or_load_description(path, description), cls._recorded_rate(path)
         rate_notes = (cls._NO_RATE_NOTE,) if rate is None and sensor_description.layout.frame_rate is None else ()
         times = None if rate is None else np.arange(num_frames) / rate
-        return measurement_of(
+        return create_measurement(
             path,
             adjacent_recording(values, times, (_SCALE_NOTE, *rate_notes, *truncation_notes(num_leftover_bytes))),
             sensor_description,
@@ -290,15 +290,15 @@ class Swisstom:
     def read(cls, path: Path, description: str | Path | None = None) -> Measurement:
         """Read all frames of a Swisstom recording. Raises `ValueError` for formats other than 4, for a file without a
         complete frame, and for damaged frames."""
-        content = content_of(path)
-        if content[:4] != bytes([cls._FORMAT, 0, 0, 0]):
+        data = read_file_bytes(path)
+        if data[:4] != bytes([cls._FORMAT, 0, 0, 0]):
             raise ValueError(
                 f"{path.name} is of a Swisstom format that is not known; format 4 is. Export it as a table."
             )
-        frames_start = int.from_bytes(content[4:8], "little", signed=True)
-        if not 8 <= frames_start <= len(content):
+        frames_start = int.from_bytes(data[4:8], "little", signed=True)
+        if not 8 <= frames_start <= len(data):
             raise ValueError(f"{path.name}: its header says that frames begin at byte {frames_start}, beyond its end.")
-        values, times, num_leftover_bytes = cls._frames(content, frames_start, path)
+        values, times, num_leftover_bytes = cls._frames(data, frames_start, path)
         if not values:
             raise ValueError(f"{path.name} holds no whole frame; is it cut off?")
         pairs = np.stack(values).astype(float) * cls._SCALE
@@ -310,26 +310,26 @@ class Swisstom:
             np.unwrap(times, period=cls._COUNTER_PERIOD) * 1e-6,
             notes=(*cls._SCALE_NOTES, *truncation_notes(num_leftover_bytes)),
         )
-        return measurement_of(path, recording, description_of(path, description))
+        return create_measurement(path, recording, find_or_load_description(path, description))
 
     @classmethod
-    def _frames(cls, content: bytes, frames_start: int, path: Path) -> tuple[list[np.ndarray], np.ndarray, int]:
+    def _frames(cls, data: bytes, frames_start: int, path: Path) -> tuple[list[np.ndarray], np.ndarray, int]:
         """Stored numbers and times (microseconds) of every complete frame, and number of remaining bytes of a truncated
         last frame."""
         values, times, offset = [], [], frames_start
-        while offset + cls._HEADER_BYTES <= len(content):
-            kind, length = (int(number) for number in np.frombuffer(content, "<i4", 2, offset + 8))
+        while offset + cls._HEADER_BYTES <= len(data):
+            kind, length = (int(number) for number in np.frombuffer(data, "<i4", 2, offset + 8))
             content_start = offset + cls._HEADER_BYTES
             if length < 0 or (kind == 0 and length < cls._VOLTAGE_OFFSET + 4 * cls._NUM_INTEGERS):
                 raise ValueError(f"{path.name}: the frame at byte {offset} says a length of {length}; it is damaged.")
-            if content_start + length > len(content):
+            if content_start + length > len(data):
                 break
             if kind == 0:
-                values.append(np.frombuffer(content, "<i4", cls._NUM_INTEGERS, content_start + cls._VOLTAGE_OFFSET))
+                values.append(np.frombuffer(data, "<i4", cls._NUM_INTEGERS, content_start + cls._VOLTAGE_OFFSET))
                 times.append(
                     int.from_bytes(
-                        content[content_start + cls._TIME_OFFSET : content_start + cls._TIME_OFFSET + 4], "little"
+                        data[content_start + cls._TIME_OFFSET : content_start + cls._TIME_OFFSET + 4], "little"
                     )
                 )
             offset = content_start + length
-        return values, np.array(times, float), len(content) - offset
+        return values, np.array(times, float), len(data) - offset

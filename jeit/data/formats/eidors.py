@@ -15,7 +15,7 @@ import numpy as np
 
 from jeit.arguments import names_text
 from jeit.data.description import Description, load_description, parse_description
-from jeit.data.formats.table import channel_counts, description_like, frames_of, measurement_in
+from jeit.data.formats.table import channel_counts, create_measurement_of_frames, description_like, frames_of
 from jeit.data.formats.text import frames_in_table
 from jeit.data.measurement import Measurement
 from jeit.files import matlab
@@ -76,8 +76,8 @@ def read(
     if not protocols and like is not None:
         protocols = [(like.protocol, "")]
     keys, frame_names, key_notes = _keys(matlab.shapes(path), sensor_description, channel_counts(protocols), path)
-    content = matlab.load(path, *keys)
-    vectors = [matlab.numbers(content, key, path) for key in keys]
+    variables = matlab.load(path, *keys)
+    vectors = [matlab.numbers(variables, key, path) for key in keys]
     if vectors[0].ndim == 3 or sensor_description.patterns_measured:
         if len(vectors) > 1:
             raise ValueError(f"{path.name}: [data] keys names {len(vectors)} arrays; give one, of all frames.")
@@ -95,7 +95,7 @@ def read(
     # A matrix contains one frame per column, as in EIDORS, unless the number of channels shows that rows are frames.
     frames = frames_in_table(table, channel_counts(protocols), sensor_description.layout, default_axis="columns")
     frames = frames._replace(notes=(*key_notes, *frames.notes))
-    measurement = measurement_in(path, sensor_description, frames, protocols, like=like)
+    measurement = create_measurement_of_frames(path, sensor_description, frames, protocols, like=like)
     return measurement if measurement.frame_names or not frame_names else replace(measurement, frame_names=frame_names)
 
 
@@ -136,15 +136,15 @@ def _shapes_text(shapes: dict[str, tuple[int, ...]]) -> str:
     )
 
 
-def _stored_protocol(content: dict, path: Path) -> Protocol:
-    missing_keys = [key for key in PATTERN if key not in content]
+def _stored_protocol(variables: dict, path: Path) -> Protocol:
+    missing_keys = [key for key in PATTERN if key not in variables]
     if missing_keys:
         raise ValueError(
             f"{path.name} does not say what was driven and measured: '{missing_keys[0]}' is missing, and no "
             "description gives a [protocol]. Save stim (L, S), meas (M, L) and meas_stim (M) with the data, "
             "or write a description."
         )
-    stim, meas, index = (matlab.numbers(content, key, path) for key in PATTERN)
+    stim, meas, index = (matlab.numbers(variables, key, path) for key in PATTERN)
     index = index.ravel()
     if np.any(index != np.round(index)):
         raise ValueError(f"{path.name}: meas_stim must hold whole numbers, the drive of each measurement, from 1.")

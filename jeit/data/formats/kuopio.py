@@ -60,8 +60,8 @@ class Kit4:
         Raises `ValueError` for a file whose arrays have other shapes.
         """
         keys = "Uel", "CurrentPattern", "MeasPattern"
-        content = matlab.load(path, *keys)
-        voltages, currents, differences = (matlab.numbers(content, key, path) for key in keys)
+        variables = matlab.load(path, *keys)
+        voltages, currents, differences = (matlab.numbers(variables, key, path) for key in keys)
         num_electrodes, num_drives = currents.shape
         if differences.shape[0] != num_electrodes or voltages.shape != (differences.shape[1], num_drives):
             raise ValueError(
@@ -111,8 +111,8 @@ class Ktc2023:
         """
         suffix = "" if "Inj" in matlab.variable_names(path) else "ref"
         keys = f"Inj{suffix}", f"Uel{suffix}", "Mpat"
-        content = matlab.load(path, *keys)
-        currents, voltages, differences = (matlab.numbers(content, key, path) for key in keys)
+        variables = matlab.load(path, *keys)
+        currents, voltages, differences = (matlab.numbers(variables, key, path) for key in keys)
         num_electrodes, num_drives = currents.shape
         num_channels = num_drives * differences.shape[1]
         if differences.shape[0] != num_electrodes or voltages.size != num_channels:

@@ -46,22 +46,22 @@ class LineBuffer:
         self._line = bytearray()
         self._is_truncated = False
 
-    def feed(self, data: bytes) -> list[bytes]:
+    def add_bytes(self, data: bytes) -> list[bytes]:
         """Append a chunk of bytes to the buffer, and return the lines that are now complete, without line ends and
         empty lines."""
         lines = []
-        *complete_parts, remainder = _LINE_ENDS.split(data)
+        *complete_parts, incomplete_line = _LINE_ENDS.split(data)
         for part in complete_parts:
             self._append_data(part)
-            lines += _split_at_words(self.take_remainder())
-        self._append_data(remainder)
+            lines += _split_at_words(self.take_incomplete_line())
+        self._append_data(incomplete_line)
         word_starts = [match.start() for match in _FRAME_WORD.finditer(self._line)]
         if word_starts and word_starts[-1] > 0:
             lines += _split_at_words(bytes(self._line[: word_starts[-1]]))
             del self._line[: word_starts[-1]]
         return lines
 
-    def take_remainder(self) -> bytes:
+    def take_incomplete_line(self) -> bytes:
         """Remove the incomplete line at the end of the buffer, and return it."""
         line = bytes(self._line) + ("…".encode() if self._is_truncated else b"")
         self._line.clear()
@@ -78,8 +78,8 @@ def _split_at_words(line: bytes) -> list[bytes]:
     """Split a line at each word "magnitudes" within it, because the word begins a new frame. Empty lines are left
     out."""
     starts = [0, *(match.start() for match in _FRAME_WORD.finditer(line) if match.start() > 0), len(line)]
-    pieces = (line[start:stop] for start, stop in itertools.pairwise(starts))
-    return [piece for piece in pieces if piece.strip()]
+    line_parts = (line[start:end] for start, end in itertools.pairwise(starts))
+    return [line_part for line_part in line_parts if line_part.strip()]
 
 
 class LineParser:
@@ -125,9 +125,9 @@ class LineParser:
         if text.startswith(_COMMENT_PREFIXES):
             self.note = text[:_MAX_TEXT_LENGTH]
             return None
-        word = _FRAME_WORD.match(line.strip())
-        numbers = next(OpenEit.frames_in(line), None) if word else self._parse_numbers(text)
-        if not word and self._join_lines is not None:
+        frame_word = _FRAME_WORD.match(line.strip())
+        numbers = next(OpenEit.parse_frames(line), None) if frame_word else self._parse_numbers(text)
+        if not frame_word and self._join_lines is not None:
             numbers = self._join_lines(list(numbers) if numbers else text)
             if numbers is None:
                 return None
@@ -136,13 +136,13 @@ class LineParser:
         row = np.array(numbers, float)
         if self.channels is not None and len(row) == self.channels + 1 and self.has_times:
             row = row[1:]
-        if word:
+        if frame_word:
             row[row == 0] = np.nan
         if self.channels is None or len(row) != self.channels:
             return row
-        return row * self._volts_per_number(row, "magnitudes: " if word else "")
+        return row * self._volts_per_number(row, "magnitudes: " if frame_word else "")
 
-    def _volts_per_number(self, row: np.ndarray, word: str) -> Float[np.ndarray, " M"]:
+    def _volts_per_number(self, row: np.ndarray, frame_word: str) -> Float[np.ndarray, " M"]:
         """Return the factor from number to volts of each channel. Each frame `row` determines the factors of the
         channels that the reader of files does not mask, until all factors are known."""
         if self._num_factor_frames >= _MAX_FACTOR_FRAMES:
@@ -152,7 +152,7 @@ class LineParser:
         if not is_nonzero.any():
             return self._channel_factors
         try:
-            volts = self._read_volts(row, word)
+            volts = self._read_volts(row, frame_word)
         except (ValueError, OSError) as error:  # for example a full disk
             self.note = f"The numbers of a line are taken for volts, for as a file they cannot be read: {error}"
             self._num_factor_frames = _MAX_FACTOR_FRAMES
@@ -180,14 +180,16 @@ class LineParser:
             sign = np.sign(np.nan_to_num(self._reference_frame() * row))
         return np.where(is_known, factor, sign * np.median(np.abs(factor[is_known])))
 
-    def _read_volts(self, row: np.ndarray, word: str) -> Float[np.ndarray, " M"]:
+    def _read_volts(self, row: np.ndarray, frame_word: str) -> Float[np.ndarray, " M"]:
         """Convert the numbers of a line to volts with the reader of files."""
         source = "" if self.reference is None else self.reference.source
         name = f"{Path(source).stem if source else 'line'}.txt"  # the file name may state the current
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / name
-            cells = ", ".join("0" if word and not np.isfinite(number) else repr(number) for number in row.tolist())
-            path.write_text(f"{word}{cells}\n", "utf-8")
+            cells = ", ".join(
+                "0" if frame_word and not np.isfinite(number) else repr(number) for number in row.tolist()
+            )
+            path.write_text(f"{frame_word}{cells}\n", "utf-8")
             measured = read(path, description=self.description, like=self.reference)
         volts = np.real(np.asarray(measured.voltages))[0]
         if volts.shape != row.shape:
@@ -216,9 +218,9 @@ class LineParser:
 def read_lines(lines: Iterable[str | bytes], reading: LineParser) -> Iterator[Float[np.ndarray, " M"] | str]:
     """Yield the frames of lines of text as they arrive, in volts, and the text of lines that are not frames."""
     for line in lines:
-        found = reading(line if isinstance(line, bytes) else line.encode()) if line.strip() else None
-        if found is not None:
-            yield found
+        frame = reading(line if isinstance(line, bytes) else line.encode()) if line.strip() else None
+        if frame is not None:
+            yield frame
 
 
 def _load_description(description: str | Path | None, reference: Measurement | None) -> Description | None:

@@ -24,9 +24,9 @@ from jaxtyping import Float, Inexact, Int
 
 from jeit.arguments import counted, names_text
 from jeit.data.description import Description, load_description, parse_description
-from jeit.data.formats.recording import Recording, content_of, measurement_of
+from jeit.data.formats.recording import Recording, create_measurement, read_file_bytes
 from jeit.data.formats.table import description_like, find_description
-from jeit.data.inferred_properties import with_signs
+from jeit.data.inferred_properties import correct_signs
 from jeit.data.measurement import Measurement
 from jeit.files import check_electrodes, read_toml
 from jeit.protocol import from_channels
@@ -125,7 +125,7 @@ def read(
         name=f"{len(drives)} drives, {len(channels)} channels, {num_electrodes} electrodes",
     )
     recording = Recording(frames, protocol, times=times, notes=(*table.notes, *notes, *current_notes, *channel_notes))
-    return with_signs(measurement_of(path, recording, replace(sensor_description, protocol_section=None)), like)
+    return correct_signs(create_measurement(path, recording, replace(sensor_description, protocol_section=None)), like)
 
 
 def electrode_positions(path: Path) -> Float[np.ndarray, "L d"] | None:
@@ -144,7 +144,7 @@ def _heading(lines: Sequence[str]) -> tuple[int, list[str], list[float]] | None:
         names, scales = zip(*map(_parse_column_name, cells), strict=True)
         if _electrode_columns(names) is None:
             continue
-        found_names = {name for name, spellings in _COLUMN_NAMES.items() if set(spellings) & set(names)}
+        found_names = {name for name, known_spellings in _COLUMN_NAMES.items() if set(known_spellings) & set(names)}
         if found_names & {"real", "u", "r"} or {"rhoa", "k"} <= found_names:
             return line_index, list(names), list(scales)
     return None
@@ -182,7 +182,7 @@ def _read_table(path: Path) -> _QuadrupoleTable:
     """Read the columns, electrode positions and notes of a file. Raises `ValueError`, with the line, for a line that
     does not match the heading."""
     try:
-        text = content_of(path).decode("utf-8-sig").splitlines()
+        text = read_file_bytes(path).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise ValueError(f"{path.name} is not text; is it damaged?") from None
     heading = _heading(text)
@@ -373,13 +373,13 @@ def _arrange_frames(
             [find(patterns, axis=1) for patterns in (drives, measurements) for find in (np.argmax, np.argmin)], axis=1
         )
         channel_numbers = {tuple(channel): k for k, channel in enumerate(channels.tolist())}
-        index = np.array([channel_numbers.get(tuple(channel), -1) for channel in like_channels.tolist()])
-        if 2 * (index >= 0).sum() > len(index):
-            num_left_out = len(channels) - int((index >= 0).sum())
+        channel_indices = np.array([channel_numbers.get(tuple(channel), -1) for channel in like_channels.tolist()])
+        if 2 * (channel_indices >= 0).sum() > len(channel_indices):
+            num_excluded = len(channels) - int((channel_indices >= 0).sum())
             notes = (
-                (f"{counted(num_left_out, 'channel')} that '{like.name}' lacks are left out.",) if num_left_out else ()
+                (f"{counted(num_excluded, 'channel')} that '{like.name}' lacks are left out.",) if num_excluded else ()
             )
-            channels, frames = like_channels, np.where(index >= 0, frames[:, index], np.nan)
+            channels, frames = like_channels, np.where(channel_indices >= 0, frames[:, channel_indices], np.nan)
     return channels, frames, times, (*frame_notes, *notes)
 
 

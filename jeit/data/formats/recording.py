@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Inexact
 
 from jeit.data.description import Description, load_description, parse_description
-from jeit.data.formats.table import component_notes, find_description, frames_from, measurement_from
+from jeit.data.formats.table import arrange_frames, component_notes, find_description, scale_to_volts
 from jeit.data.measurement import Measurement
 from jeit.files import check_memory
 from jeit.protocol import Protocol, adjacent
@@ -41,20 +41,20 @@ class Recording:
     notes: tuple[str, ...] = ()
 
 
-def content_of(path: Path) -> bytes:
+def read_file_bytes(path: Path) -> bytes:
     """Content of a file. Raises `TooLarge` if the file exceeds the memory limit."""
     check_memory(path.name, _MEMORY_FACTOR * path.stat().st_size)
     return path.read_bytes()
 
 
-def description_of(path: Path, description: str | Path | None) -> Description:
+def find_or_load_description(path: Path, description: str | Path | None) -> Description:
     """Return the specified description, else the description beside the file, else an empty description. Raises
     `ValueError` if the description is not valid."""
     description_source = find_description(path) if description is None else description
     return parse_description({}, path.name) if description_source is None else load_description(description_source)
 
 
-def measurement_of(path: Path, recording: Recording, sensor_description: Description) -> Measurement:
+def create_measurement(path: Path, recording: Recording, sensor_description: Description) -> Measurement:
     """Convert a recording to a measurement of the described body. Protocol, times and frame names of the description
     take precedence over the protocol, times and frame names of the recording.
 
@@ -69,9 +69,9 @@ def measurement_of(path: Path, recording: Recording, sensor_description: Descrip
     sensor_description = replace(sensor_description, layout=layout, notes=(*sensor_description.notes, *notes))
     # Current patterns in the file have already been read as part of the recording.
     uses_own_protocol = sensor_description.protocol_section is None or sensor_description.patterns_measured
-    frames = frames_from(recording.voltages, layout, path.name)
+    frames = arrange_frames(recording.voltages, layout, path.name)
     mask = None if recording.usable is None or not uses_own_protocol else recording.usable
-    measurement = measurement_from(
+    measurement = scale_to_volts(
         path, sensor_description, frames, recording.protocol if uses_own_protocol else None, mask
     )
     if recording.times is None or layout.averaged or layout.frame_rate is not None:
@@ -82,14 +82,14 @@ def measurement_of(path: Path, recording: Recording, sensor_description: Descrip
     return replace(measurement, times=recording.times)
 
 
-def count_frames(content: bytes, frames_start: int, frame_size: int, path: Path) -> tuple[int, int]:
+def count_frames(data: bytes, frames_start: int, frame_size: int, path: Path) -> tuple[int, int]:
     """Number of complete frames of `frame_size` bytes after byte `frames_start`, and number of remaining bytes.
 
     Raises `ValueError` if there is no complete frame.
     """
-    if not 0 <= frames_start <= len(content):
+    if not 0 <= frames_start <= len(data):
         raise ValueError(f"{path.name}: its header says that frames begin at byte {frames_start}, beyond its end.")
-    num_frames, num_leftover_bytes = divmod(len(content) - frames_start, frame_size)
+    num_frames, num_leftover_bytes = divmod(len(data) - frames_start, frame_size)
     if not num_frames:
         raise ValueError(f"{path.name} holds no whole frame; is it cut off?")
     return num_frames, num_leftover_bytes

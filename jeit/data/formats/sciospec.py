@@ -20,7 +20,7 @@ import numpy as np
 
 from jeit.arguments import describe
 from jeit.data.description import Description
-from jeit.data.formats.recording import Recording, content_of, description_of, measurement_of
+from jeit.data.formats.recording import Recording, create_measurement, find_or_load_description, read_file_bytes
 from jeit.data.gesture_set import join
 from jeit.data.measurement import Measurement
 from jeit.files import check_electrodes
@@ -62,16 +62,16 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
     Raises `ValueError`, with the faulty line, for an invalid file.
     """
     try:
-        lines = content_of(path).decode("utf-8-sig", "strict").splitlines()
+        lines = read_file_bytes(path).decode("utf-8-sig", "strict").splitlines()
     except UnicodeDecodeError:
         raise ValueError(f"{path.name} is not text, as Sciospec's files are; is it damaged?") from None
     header = _header(lines, path)
     pairs, potentials = _injections(lines, header, path)
     electrode_numbers, column_indices = _channels(header, potentials.shape[2], path)
     check_electrodes(path.name, len(electrode_numbers))
-    sensor_description = description_of(path, description)
+    sensor_description = find_or_load_description(path, description)
     recording = _recording(header, pairs, potentials[:, :, column_indices], electrode_numbers, sensor_description, path)
-    return measurement_of(path, recording, sensor_description)
+    return create_measurement(path, recording, sensor_description)
 
 
 def read_all(paths: Sequence[Path], description: str | Path | None = None) -> Measurement:
@@ -80,9 +80,13 @@ def read_all(paths: Sequence[Path], description: str | Path | None = None) -> Me
     If each file contains one frame, `[data] frame_rate` of a description determines the times; otherwise the times are
     the dates in the files. Raises `ValueError` as `read` and `jeit.data.gesture_set.join` do.
     """
-    joined = join([read(path, description) for path in paths])
-    rate = description_of(paths[0], description).layout.frame_rate
-    return joined if rate is None or joined.num_frames != len(paths) else joined.at_rate(rate)
+    joined_measurement = join([read(path, description) for path in paths])
+    rate = find_or_load_description(paths[0], description).layout.frame_rate
+    return (
+        joined_measurement
+        if rate is None or joined_measurement.num_frames != len(paths)
+        else joined_measurement.at_rate(rate)
+    )
 
 
 def _header(lines: list[str], path: Path) -> _Header:
@@ -198,11 +202,16 @@ def _recording(
         raise ValueError(
             f"{path.name}: current flows at electrode {missing_electrodes[0]}, which is not among those measured."
         )
-    index = np.array([[electrode_numbers.index(electrode) for electrode in pair] for pair in pairs.tolist()])
+    electrode_indices = np.array(
+        [[electrode_numbers.index(electrode) for electrode in pair] for pair in pairs.tolist()]
+    )
     if not 0 < header.current <= 1:
         raise ValueError(f"{path.name}: its current is {header.current:g} A; it must be positive, and at most 1.")
-    drive, drive_indices = np.zeros((len(index), len(electrode_numbers))), np.arange(len(index))
-    drive[drive_indices, index[:, 0]], drive[drive_indices, index[:, 1]] = header.current, -header.current
+    drive, drive_indices = np.zeros((len(electrode_indices), len(electrode_numbers))), np.arange(len(electrode_indices))
+    drive[drive_indices, electrode_indices[:, 0]], drive[drive_indices, electrode_indices[:, 1]] = (
+        header.current,
+        -header.current,
+    )
     # The power that the body dissipates is positive; its sign shows at which electrode of a pair the current enters.
     notes: list[str] = [*_CURRENT_NOTES]
     if np.median(np.einsum("sl,sfl->sf", drive, np.nan_to_num(np.real(potentials)))) < 0:
@@ -212,7 +221,7 @@ def _recording(
     rows = measurement_patterns(len(electrode_numbers), reading, reference)
     with np.errstate(invalid="ignore", over="ignore"):
         voltages = np.einsum("kl,sfl->fsk", rows, potentials).reshape(len(header.frequencies), -1)
-    name = f"{len(index)} injections, {reading}, {len(electrode_numbers)} electrodes"
+    name = f"{len(electrode_indices)} injections, {reading}, {len(electrode_numbers)} electrodes"
     is_single = len(header.frequencies) == 1
     return Recording(
         voltages,

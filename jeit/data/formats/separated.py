@@ -33,11 +33,11 @@ def line_pattern(line: str) -> str:
 def separator_patterns(lines: Sequence[str], holds_numbers: Callable[[str], bool]) -> set[str]:
     """Patterns of the lines without numbers that begin with a letter and occur about as often as the most frequent of
     them; none if no line holds numbers."""
-    words = [line_pattern(line) for line in lines if not holds_numbers(line)]
-    counts = Counter(pattern for pattern in words if pattern[:1].isalpha())
-    least_count = max(_MIN_REPEATED, 0.5 * max(counts.values(), default=0))
-    repeated = {pattern for pattern, count in counts.items() if count >= least_count}
-    return repeated if len(words) < len(lines) else set()
+    text_patterns = [line_pattern(line) for line in lines if not holds_numbers(line)]
+    counts = Counter(pattern for pattern in text_patterns if pattern[:1].isalpha())
+    min_count = max(_MIN_REPEATED, 0.5 * max(counts.values(), default=0))
+    repeated = {pattern for pattern, count in counts.items() if count >= min_count}
+    return repeated if len(text_patterns) < len(lines) else set()
 
 
 class Parts(NamedTuple):
@@ -103,7 +103,7 @@ class Separators:
         """
         number_ends = np.concatenate([[0], np.cumsum(lengths)])
         partitions = [
-            _Partition.create(self._parts(kind), number_ends)
+            _Partition.create(self._find_part_separators(kind), number_ends)
             for kind in (None, *dict.fromkeys(line_pattern(separator.text) for separator in self.found))
         ]
         parts, starts, sizes, size = next((part for part in partitions if part.size in counts), partitions[0])
@@ -112,26 +112,26 @@ class Separators:
         is_unreadable[np.searchsorted(starts, self.unreadable, side="right") - 1] = True
         is_damaged = (sizes % size != 0) | (sizes == 0) | is_unreadable
         is_damaged[-1] &= sizes[-1] > size or is_unreadable[-1]
-        damaged = np.flatnonzero(is_damaged)
-        if not damaged.size:
+        damaged_parts = np.flatnonzero(is_damaged)
+        if not damaged_parts.size:
             return Parts(numbers, lengths, size)
-        complete = np.flatnonzero((sizes == size) & ~is_damaged)
-        note = (
-            f"{len(damaged)} of {counted(len(sizes), 'part')} between lines such as {self.examples[0]!r} lack numbers "
-            f"or contain something else, the first from line {parts[damaged[0]].position} on"
+        complete_parts = np.flatnonzero((sizes == size) & ~is_damaged)
+        damage_note = (
+            f"{len(damaged_parts)} of {counted(len(sizes), 'part')} between lines such as {self.examples[0]!r} lack "
+            f"numbers or contain something else, the first from line {parts[damaged_parts[0]].position} on"
         )
-        if len(complete) < _MIN_COMPLETE or len(damaged) > max(1, _MAX_DAMAGED * len(sizes)):
-            hint = f" {self.fault}" if self.fault else ""
-            raise ValueError(f"{name}: {note}: too many to be left out.{hint}")
-        complete_lengths = lengths[starts[complete[0]] : line_ends[complete[0]]]
+        if len(complete_parts) < _MIN_COMPLETE or len(damaged_parts) > max(1, _MAX_DAMAGED * len(sizes)):
+            fault_hint = f" {self.fault}" if self.fault else ""
+            raise ValueError(f"{name}: {damage_note}: too many to be left out.{fault_hint}")
+        complete_lengths = lengths[starts[complete_parts[0]] : line_ends[complete_parts[0]]]
         number_parts, length_parts = [], []
         for start, end, damage in zip(starts, line_ends, is_damaged, strict=True):
             number_parts.append(np.full(size, np.nan) if damage else numbers[number_ends[start] : number_ends[end]])
             length_parts.append(complete_lengths if damage else lengths[start:end])
-        note = f"{note}: they are left empty (NaN)."
-        return Parts(np.concatenate(number_parts), np.concatenate(length_parts), size, note)
+        damage_note = f"{damage_note}: they are left empty (NaN)."
+        return Parts(np.concatenate(number_parts), np.concatenate(length_parts), size, damage_note)
 
-    def _parts(self, kind: str | None) -> list[Separator]:
+    def _find_part_separators(self, kind: str | None) -> list[Separator]:
         """The separators that begin a part: those of one kind, or all. Different separators without numbers between
         them count as one; between equal ones, a part is empty."""
         parts, last_kind = [Separator(0, 1, "")], ""
@@ -168,8 +168,8 @@ class WrappedLines:
             return self._add_text(line)
         if self._is_damaged and len(line) < self.channels:
             return None
-        is_first = self._numbers == []
-        if self._numbers is None or len(line) >= self.channels or (is_first and self.channels % len(line)):
+        is_first_line = self._numbers == []
+        if self._numbers is None or len(line) >= self.channels or (is_first_line and self.channels % len(line)):
             self._numbers = None
             return line
         self._numbers += line

@@ -20,9 +20,9 @@ from jeit.data.formats.text import (
     frames_in_text,
     read_text,
     rectangle,
-    without_cut_line,
+    remove_cut_line,
 )
-from jeit.data.inferred_properties import fitting_protocol, unmeasured_driven_channels, with_signs
+from jeit.data.inferred_properties import correct_signs, fitting_protocol, unmeasured_driven_channels
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
 from jeit.files import npy_array, npz_arrays, npz_shapes
@@ -104,7 +104,7 @@ def read(
         layout = sensor_description.layout
         text = read_text(path, layout.delimiter, layout.skip_rows)
         file_frames = frames_in_text(text, channel_counts(protocols), layout, path.name)
-    measurement = measurement_in(path, sensor_description, file_frames, protocols, mask, like)
+    measurement = create_measurement_of_frames(path, sensor_description, file_frames, protocols, mask, like)
     if times is None or sensor_description.layout.averaged or sensor_description.layout.frame_rate is not None:
         return measurement
     return replace(measurement, times=times)
@@ -120,7 +120,7 @@ def channel_counts(protocols: Protocols) -> list[int]:
     return [*dict.fromkeys(protocol.num_measurements for protocol, _ in protocols)]
 
 
-def measurement_in(
+def create_measurement_of_frames(
     path: Path,
     sensor_description: Description,
     file_frames: Frames,
@@ -128,10 +128,10 @@ def measurement_in(
     mask: np.ndarray | None = None,
     like: Measurement | None = None,
 ) -> Measurement:
-    """Create a measurement from the frames of a file, with notes on detected properties; see `measurement_from` and
+    """Create a measurement from the frames of a file, with notes on detected properties; see `scale_to_volts` and
     `read` for the arguments."""
     layout = replace(sensor_description.layout, frames_in="rows")
-    frames = frames_from(file_frames.table, layout, path.name)
+    frames = arrange_frames(file_frames.table, layout, path.name)
     notes = (*sensor_description.notes, *file_frames.notes, *component_notes(file_frames.table, layout))
     protocol, protocol_notes = fitting_protocol(frames, protocols, like)
     sensor_description = replace(sensor_description, layout=layout, notes=(*notes, *protocol_notes))
@@ -141,18 +141,18 @@ def measurement_in(
         if unread_channels.any():
             mask = ~unread_channels if mask is None else np.asarray(mask) & ~unread_channels
             reason = "they read driven electrodes, and are zero in every frame."
-    measurement = measurement_from(path, sensor_description, frames, protocol, mask)
+    measurement = scale_to_volts(path, sensor_description, frames, protocol, mask)
     if reason:
         notes = [note.replace("excluded by the mask given.", reason) for note in measurement.notes]
         measurement = replace(measurement, notes=tuple(notes))
     if layout.polarity is None:
-        measurement = with_signs(measurement, like)
+        measurement = correct_signs(measurement, like)
     if file_frames.times is None or layout.averaged or layout.frame_rate is not None:
         return measurement
     return replace(measurement, times=file_frames.times[:: 2 if layout.complex_pairs else 1])
 
 
-def _without_gains(frames: np.ndarray, protocol: Protocol, sensor_description: Description) -> np.ndarray:
+def _divide_by_gains(frames: np.ndarray, protocol: Protocol, sensor_description: Description) -> np.ndarray:
     """Frames divided by the described gains of their measurement patterns. Raises `ValueError` unless there is one gain
     for each measurement pattern."""
     gains, num_patterns = np.array(sensor_description.layout.gains), len(protocol.measurement)
@@ -190,7 +190,7 @@ def description_like(like: Measurement) -> Description:
     )
 
 
-def measurement_from(
+def scale_to_volts(
     path: Path, sensor_description: Description, frames: np.ndarray, protocol: Protocol | None, mask: np.ndarray | None
 ) -> Measurement:
     """Scale frames (frames, channels) in the unit of the file to volts as the description states, and mask unusable
@@ -204,7 +204,7 @@ def measurement_from(
         raise ValueError(
             f'{sensor_description.origin}: no protocol: add a [protocol] section with kind = "adjacent" or another.'
         )
-    notes, frames = sensor_description.notes, _without_gains(frames, protocol, sensor_description)
+    notes, frames = sensor_description.notes, _divide_by_gains(frames, protocol, sensor_description)
     if sensor_description.mean_removed and frames.shape[-1] == protocol.num_measurements:
         frames, mean = subtract_mean(np.atleast_2d(frames), protocol.num_electrodes)
         mean_note = (
@@ -245,11 +245,11 @@ def numbers(path: Path, layout: TableLayout) -> tuple[np.ndarray, tuple[str, ...
     """
     if path.suffix.lower() == ".npy":
         return _voltages(_from_numpy(path, ()), layout, path), ()
-    text = without_cut_line(read_text(path, layout.delimiter, layout.skip_rows))
+    text = remove_cut_line(read_text(path, layout.delimiter, layout.skip_rows))
     return rectangle(text, path.name), text.heading
 
 
-def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray:
+def arrange_frames(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray:
     """Frames (frames, channels), in the unit of the file, of a table with the arrangement `layout`. Raises `ValueError`
     if rows are pairs of real and imaginary parts and the number of rows is odd."""
     frames = table.T if table.ndim == 2 and layout.frames_in == "columns" else np.atleast_2d(table)
@@ -362,9 +362,9 @@ def subtract_mean(frames: Inexact[np.ndarray, "F M"], num_electrodes: int) -> tu
     exceeds noise, i.e. if potentials were measured against ground or against an electrode. Returns the frames and the
     largest mean, or 0 if nothing is subtracted. Patterns with NaN are not changed."""
     potentials = frames.reshape(len(frames), -1, num_electrodes)
-    means = potentials.mean(axis=2, keepdims=True)
-    means = np.where(np.isfinite(means), means, 0)
-    centred_potentials = potentials - means
-    if not (np.abs(means) > _MAX_RESIDUAL_MEAN * np.abs(centred_potentials).max(axis=2, keepdims=True)).any():
+    mean_potentials = potentials.mean(axis=2, keepdims=True)
+    mean_potentials = np.where(np.isfinite(mean_potentials), mean_potentials, 0)
+    centred_potentials = potentials - mean_potentials
+    if not (np.abs(mean_potentials) > _MAX_RESIDUAL_MEAN * np.abs(centred_potentials).max(axis=2, keepdims=True)).any():
         return frames, 0.0
-    return centred_potentials.reshape(frames.shape), float(np.abs(means).max())
+    return centred_potentials.reshape(frames.shape), float(np.abs(mean_potentials).max())

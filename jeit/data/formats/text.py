@@ -67,7 +67,7 @@ class _NumberFormat(NamedTuple):
 
     def cells(self, line: str) -> list[str]:
         """Cells of a line, without a word before the first cell and without a separator after the last cell."""
-        line = _without_label(line)
+        line = _remove_label(line)
         if self.decimal_comma:
             line = line.replace(",", ".")
         line = line.strip(" \r\n").lstrip("[ ")
@@ -149,7 +149,7 @@ def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = 
         cells = number_format.cells(line)
         row = _numbers_until_a_fault(cells)
         if len(row) < len(cells):
-            message = _not_a_number_message(cells, number_format, is_first=not lengths)
+            message = _not_a_number_message(cells, number_format, is_first_line=not lengths)
             separators.fault = separators.fault or f"{path.name}, line {line_number}{message}"
             separators.unreadable.append(len(lengths))
         if not lengths and (label_match := _LABEL.match(line)):
@@ -212,7 +212,7 @@ def rectangle(text: Text, name: str) -> Inexact[np.ndarray, "R C"]:
     return text.values.reshape(-1, length)
 
 
-def _without_label(line: str) -> str:
+def _remove_label(line: str) -> str:
     """A line without the word before its numbers."""
     match = _LABEL.match(line)
     return line if match is None else line[match.end() :]
@@ -240,7 +240,7 @@ def _detect_format(lines: Sequence[str]) -> _NumberFormat:
 
 def _has_decimal_commas(number_format: _NumberFormat, lines: Sequence[str]) -> bool:
     """Whether commas are decimal points: in most cells that contain a comma, the comma is between two digits."""
-    cells = [cell for line in lines for cell in _without_label(line).split(number_format.delimiter) if "," in cell]
+    cells = [cell for line in lines for cell in _remove_label(line).split(number_format.delimiter) if "," in cell]
     decimal_cells = [cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell.strip(' \t\r\n"'))]
     return len(decimal_cells) > 0.9 * len(cells)
 
@@ -283,18 +283,18 @@ def _content_lines(path: Path, num_skipped: int) -> Iterator[tuple[int, str]]:
         raise ValueError(f"{path.name} is not a text file. If it is a spreadsheet, export it as CSV.") from None
 
 
-def _not_a_number_message(cells: list[str], number_format: _NumberFormat, *, is_first: bool) -> str:
-    """Error message for a line whose cells are not all numbers. `is_first`: whether no line of numbers precedes it."""
+def _not_a_number_message(cells: list[str], number_format: _NumberFormat, *, is_first_line: bool) -> str:
+    """Error message for a line whose cells are not all numbers; `is_first_line`: no line of numbers precedes it."""
     wrong_columns = [k for k, cell in enumerate(cells) if not _is_number(cell)]
     cell = cells[wrong_columns[0]]
-    if is_first and cells[0].startswith("{"):
+    if is_first_line and cells[0].startswith("{"):
         return ": this is JSON; write its numbers as CSV, a frame in each line."
     problem = f"{cell[:40]!r} is no number" if cell else "nothing stands there"
     if len(cells) == 1:
         return f": {problem}, nor numbers separated by {number_format}. {_DELIMITER_HINT}"
     # A heading consists mostly of words.
-    hint = f" {_DELIMITER_HINT}" if is_first and 2 * len(wrong_columns) > len(cells) else ""
-    return f", column {wrong_columns[0] + 1}: {problem}; where a value is missing write nan.{hint}"
+    delimiter_hint = f" {_DELIMITER_HINT}" if is_first_line and 2 * len(wrong_columns) > len(cells) else ""
+    return f", column {wrong_columns[0] + 1}: {problem}; where a value is missing write nan.{delimiter_hint}"
 
 
 def _number(cell: str) -> complex:
@@ -344,21 +344,21 @@ def frames_in_text(text: Text, counts: Sequence[int], layout: TableLayout, name:
     if layout.frames_in is None:
         text = complete_parts(text, counts, name)
     if layout.frames_in is None and (wrapped_counts := _wrapped_frames(text, counts)) is not None:
-        num_channels, num_left_over = wrapped_counts
-        num_frames = len(text.values) // num_channels
+        frame_length, num_excess_numbers = wrapped_counts
+        num_frames = len(text.values) // frame_length
         notes = (
-            f"each frame is wrapped over lines: {counted(num_channels, 'number')} are a frame.",
-            *_truncation_notes(num_left_over),
+            f"each frame is wrapped over lines: {counted(frame_length, 'number')} are a frame.",
+            *_truncation_notes(num_excess_numbers),
         )
         return Frames(
-            text.values[: num_frames * num_channels].reshape(num_frames, num_channels), None, (*text.notes, *notes)
+            text.values[: num_frames * frame_length].reshape(num_frames, frame_length), None, (*text.notes, *notes)
         )
-    text = without_cut_line(text)
+    text = remove_cut_line(text)
     frames = frames_in_table(rectangle(text, name), counts, layout, text.heading)
     return frames._replace(notes=(*text.notes, *frames.notes))
 
 
-def without_cut_line(text: Text) -> Text:
+def remove_cut_line(text: Text) -> Text:
     """Return the text without its last line, and with a note, if the last line is shorter than the first line, i.e. cut
     off."""
     if len(text.lengths) < 2 or text.lengths[-1] >= text.lengths[0]:
@@ -377,14 +377,14 @@ def _wrapped_frames(text: Text, counts: Sequence[int]) -> tuple[int, int] | None
         if any(count in shape or count + 1 in shape for count in counts):
             return None
     candidates = []
-    for index, count in enumerate(counts):
-        num_frames, num_left_over = divmod(int(line_ends[-1]), count)
+    for count_index, count in enumerate(counts):
+        num_frames, num_excess_numbers = divmod(int(line_ends[-1]), count)
         # For a number of channels other than the described number, values after the last complete frame mean that a
         # line is missing.
-        if index and num_left_over:
+        if count_index and num_excess_numbers:
             continue
         if num_frames and text.lengths[0] < count and np.isin(count * np.arange(1, num_frames + 1), line_ends).all():
-            candidates.append((count, num_left_over))
+            candidates.append((count, num_excess_numbers))
     # Prefer a number of channels for which all frames are complete.
     return min(candidates, key=lambda candidate: candidate[1] > 0, default=None)
 
@@ -405,8 +405,8 @@ def frames_in_table(
     stated_axis = layout.frames_in
     axes_fit = any(count <= length <= count + 1 for count in counts for length in table.shape)
     if stated_axis is None and min(table.shape) > 1 and table.size in counts and not axes_fit:
-        drives_first = table if len(table) >= table.shape[1] else table.T
-        return Frames(drives_first.reshape(1, -1), None, ("its longer side is taken for the drives of one frame.",))
+        drive_rows = table if len(table) >= table.shape[1] else table.T
+        return Frames(drive_rows.reshape(1, -1), None, ("its longer side is taken for the drives of one frame.",))
     is_transposed = stated_axis == "columns" if stated_axis else _are_columns(table.shape, counts, default_axis)
     rows = table.T if is_transposed else table
     notes: tuple[str, ...] = ()
@@ -424,9 +424,9 @@ def frames_in_table(
 def _are_columns(shape: tuple[int, int], counts: Sequence[int], default_axis: str) -> bool:
     """Whether columns, not rows, are frames: the first of the `counts` that equals the length of a column or row
     decides."""
-    for num_extra in (0, 1):
+    for num_extra_columns in (0, 1):
         for count in counts:
-            axis_fits = [shape[1] == count + num_extra, shape[0] == count + num_extra]
+            axis_fits = [shape[1] == count + num_extra_columns, shape[0] == count + num_extra_columns]
             if any(axis_fits):
                 return axis_fits[1] and (default_axis == "columns" or not axis_fits[0])
     return default_axis == "columns"

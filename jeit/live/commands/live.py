@@ -177,8 +177,8 @@ def live(
     if not quiet:
         _print_counters(console, state)
     if until_end and not state["imaged"]:
-        first = next(iter(state["reasons"]), "the source ended before the first")
-        raise ValueError(f"{counted(state['read'], 'frame')}, and none could be imaged: {first}")
+        first_reason = next(iter(state["reasons"]), "the source ended before the first")
+        raise ValueError(f"{counted(state['read'], 'frame')}, and none could be imaged: {first_reason}")
     if received_signals:
         raise typer.Exit(128 + signal.SIGTERM)
 
@@ -188,14 +188,14 @@ def _handle_sigterm() -> Iterator[list[int]]:
     """Context in which the signal SIGTERM is treated like Ctrl-C; yields the list of received signals."""
     received_signals: list[int] = []
 
-    def stop(signal_number: int, _) -> None:
+    def raise_stop(signal_number: int, _) -> None:
         received_signals.append(signal_number)
         raise KeyboardInterrupt
 
     if threading.current_thread() is not threading.main_thread():
         yield received_signals
         return
-    previous_handler = signal.signal(signal.SIGTERM, stop)
+    previous_handler = signal.signal(signal.SIGTERM, raise_stop)
     try:
         yield received_signals
     finally:

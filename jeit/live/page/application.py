@@ -130,8 +130,8 @@ class Guard:
         if (origin is not None or scope["type"] == "websocket") and origin not in (f"http://{host}", f"https://{host}"):
             return "Another site's page may not use this server."
         if self._token is not None and scope["path"] in _TOKEN_PATHS:
-            given_token = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
-            if not secrets.compare_digest(given_token.encode(), self._token.encode()):
+            request_token = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+            if not secrets.compare_digest(request_token.encode(), self._token.encode()):
                 return "The token is missing or wrong: open the address that `jeit live` prints, with its ?token=…"
         return None
 
@@ -214,10 +214,10 @@ async def _send_pictures(hub: Hub, viewer: Viewer, websocket: WebSocket) -> None
         viewer.wake_event.clear()
         if viewer.is_state_due():
             await websocket.send_text(hub.state_message(viewer))
-        newest = hub.newest()
-        if newest is not None and viewer.is_ready_for(newest[0].frame.number):
-            viewer.note_sent(newest[0].frame.number, newest[0].frame.arrived)
-            await websocket.send_bytes(newest[1])
+        newest_picture = hub.newest_picture()
+        if newest_picture is not None and viewer.is_ready_for(newest_picture[0].frame.number):
+            viewer.record_sent(newest_picture[0].frame.number, newest_picture[0].frame.arrived)
+            await websocket.send_bytes(newest_picture[1])
 
 
 async def _receive_commands(hub: Hub, viewer: Viewer, websocket: WebSocket) -> None:
@@ -241,7 +241,7 @@ async def _receive_commands(hub: Hub, viewer: Viewer, websocket: WebSocket) -> N
 async def _execute_command(command: Command, hub: Hub, viewer: Viewer, websocket: WebSocket) -> None:
     match command:
         case Drawn(number=number, hidden=hidden):
-            viewer.note_drawn(number, hidden=hidden)
+            viewer.record_drawn(number, hidden=hidden)
             return
         case Seen():
             viewer.read_state()
@@ -255,10 +255,10 @@ async def _execute_command(command: Command, hub: Hub, viewer: Viewer, websocket
             if past_message is not None:
                 await websocket.send_bytes(past_message)
                 return
-            answer = ("show", "that picture is no longer kept: the last minute is")
+            reply = ("show", "that picture is no longer kept: the last minute is")
         case _:
-            answer = await _execute_session_command(command, hub)
-    await websocket.send_text(to_json("answer", {"to": answer[0], "problem": answer[1]}))
+            reply = await _execute_session_command(command, hub)
+    await websocket.send_text(to_json("answer", {"to": reply[0], "problem": reply[1]}))
 
 
 async def _execute_session_command(command: Command, hub: Hub) -> tuple[str, str | None]:

@@ -35,27 +35,27 @@ class Viewer:
         self.state_due = True
         self._state_read = True
         self._last_sent = -1
-        self._in_flight: deque[tuple[int, float]] = deque()
+        self._undrawn_pictures: deque[tuple[int, float]] = deque()
         self._drawn_latencies: deque[tuple[float, float]] = deque(maxlen=2000)
 
     def is_ready_for(self, number: int) -> bool:
         """Whether the picture with the frame number `number` may be sent to the page now."""
-        return self.following and number > self._last_sent and len(self._in_flight) < _MAX_IN_FLIGHT
+        return self.following and number > self._last_sent and len(self._undrawn_pictures) < _MAX_IN_FLIGHT
 
-    def note_sent(self, number: int, arrived: float) -> None:
-        """Record that the picture with the frame number `number`, whose frame arrived at the time `arrived`, was sent
-        to the page."""
+    def record_sent(self, number: int, arrival_time: float) -> None:
+        """Record that the picture with the frame number `number`, whose frame arrived at the time `arrival_time`, was
+        sent to the page."""
         self._last_sent = number
-        self._in_flight.append((number, arrived))
+        self._undrawn_pictures.append((number, arrival_time))
 
-    def note_drawn(self, number: int, *, hidden: bool) -> None:
+    def record_drawn(self, number: int, *, hidden: bool) -> None:
         """Record that the page has drawn the picture with the frame number `number`; earlier pictures that were sent
         and not reported as drawn were skipped."""
         now = time.monotonic()
-        while self._in_flight and self._in_flight[0][0] <= number:
-            sent_number, arrived = self._in_flight.popleft()
+        while self._undrawn_pictures and self._undrawn_pictures[0][0] <= number:
+            sent_number, arrival_time = self._undrawn_pictures.popleft()
             if sent_number == number and not hidden:
-                self._drawn_latencies.append((now, now - arrived))
+                self._drawn_latencies.append((now, now - arrival_time))
         self.wake_event.set()
 
     def is_state_due(self) -> bool:
@@ -78,11 +78,11 @@ class Viewer:
         """
         now = time.monotonic()
         latencies = [latency for draw_time, latency in self._drawn_latencies if now - draw_time <= _LATENCY_SPAN]
-        num_recent = sum(now - draw_time <= 2.0 for draw_time, _ in self._drawn_latencies)
+        num_recent_pictures = sum(now - draw_time <= 2.0 for draw_time, _ in self._drawn_latencies)
         if not latencies:
             return {"rate": 0.0, "latency_median": None, "latency_99": None}
         median, latency_99 = np.percentile(latencies, [50, 99])
-        return {"rate": num_recent / 2.0, "latency_median": float(median), "latency_99": float(latency_99)}
+        return {"rate": num_recent_pictures / 2.0, "latency_median": float(median), "latency_99": float(latency_99)}
 
 
 class Hub:
@@ -112,7 +112,7 @@ class Hub:
         self._closing.set()
         self._thread.join(5.0)
 
-    def newest(self) -> tuple[Result, bytes] | None:
+    def newest_picture(self) -> tuple[Result, bytes] | None:
         """Return the newest picture and the bytes of its message to pages; the message is computed once for all
         pages."""
         result = self._newest_result
@@ -133,7 +133,7 @@ class Hub:
         for candidate in range(number, max(-1, number + 600 * direction), direction):
             result = self.session.result(candidate)
             if result is not None and (result.frame.number - number) * direction >= 0:
-                return picture_message(result.frame, result.picture, latency=result.latency, past=True)
+                return picture_message(result.frame, result.picture, latency=result.latency, is_past=True)
         return None
 
     def _watch_session(self) -> None:

@@ -67,7 +67,7 @@ class Reference(Command):
     count: Annotated[int, Field(ge=1, le=10_000)]
 
 
-def _to_one_line(text: str) -> str:
+def _join_to_one_line(text: str) -> str:
     line = " ".join("".join(character if character.isprintable() else " " for character in text).split())
     if not line:
         raise ValueError("a label needs a letter")
@@ -78,7 +78,7 @@ class Mark(Command):
     """Command to mark an event with the text `label` at the present time."""
 
     do: Literal["mark"]
-    label: Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_to_one_line)]
+    label: Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_join_to_one_line)]
 
 
 class Record(Command):
@@ -100,9 +100,9 @@ def read_command(text: str | bytes) -> Command:
     try:
         return _COMMANDS.validate_json(text)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False, include_context=False)[0]
-        location = ".".join(str(part) for part in first["loc"])
-        raise ValueError(f"{location or 'message'}: {first['msg']}") from None
+        first_error = error.errors(include_url=False, include_input=False, include_context=False)[0]
+        location = ".".join(str(location_part) for location_part in first_error["loc"])
+        raise ValueError(f"{location or 'message'}: {first_error['msg']}") from None
 
 
 def to_json_types(value: Any) -> Any:
@@ -118,9 +118,9 @@ def to_json_types(value: Any) -> Any:
     return value if value is None or isinstance(value, bool | int | str) else str(value)
 
 
-def to_json(kind: str, content: Mapping[str, Any]) -> str:
+def to_json(kind: str, fields: Mapping[str, Any]) -> str:
     """Return a message of the given `kind`, such as "state", as JSON text."""
-    return json.dumps({"kind": kind, **to_json_types(content)}, allow_nan=False, separators=(",", ":"))
+    return json.dumps({"kind": kind, **to_json_types(fields)}, allow_nan=False, separators=(",", ":"))
 
 
 def _curve_lists(curves: Sequence[np.ndarray]) -> list[list[list[float]]]:
@@ -131,7 +131,7 @@ def _curve_lists(curves: Sequence[np.ndarray]) -> list[list[list[float]]]:
 
 def scene_message(scene: Scene) -> str:
     """Return the scene of a view (outline, electrodes, names), which is sent to a page once, as JSON text."""
-    content = {
+    fields = {
         "title": scene.title,
         "quantity": scene.quantity,
         "unit": scene.unit,
@@ -143,7 +143,7 @@ def scene_message(scene: Scene) -> str:
         "channels": list(scene.channels),
         "notes": list(scene.notes),
     }
-    return to_json("scene", content)
+    return to_json("scene", fields)
 
 
 @dataclass(frozen=True)
@@ -175,22 +175,22 @@ def _encode_pixels(picture: Picture) -> _EncodedArray:
     return _EncodedArray({"shape": list(pixels.shape), "scale": scale}, integers.tobytes())
 
 
-def picture_message(frame: LiveFrame, picture: Picture, *, latency: float, past: bool = False) -> bytes:
-    """Return the message with one picture for the page as bytes. `past`: whether the page requested a past picture.
+def picture_message(frame: LiveFrame, picture: Picture, *, latency: float, is_past: bool = False) -> bytes:
+    """Return the message with one picture for the page as bytes. `is_past`: whether the page requested a past picture.
 
     The message consists of the length of the header (4 bytes, little endian); the header, JSON padded with spaces to a
     multiple of four bytes; the channels, float32; and the pixels, row of the largest y first, int16, to be multiplied
     by `scale` of the header.
     """
     values, pixels = _encode_values(frame), _encode_pixels(picture)
-    markers = [[mark.x, mark.y, mark.label, mark.radius, mark.track] for mark in picture.markers]
+    markers = [[marker.x, marker.y, marker.label, marker.radius, marker.track] for marker in picture.markers]
     header = {
         "number": int(frame.number),
         "second": float(frame.second),
         "status": str(picture.status.value),
         "reason": picture.reason,
         "latency": float(latency),
-        "past": past,
+        "past": is_past,
         "markers": markers,
         **values.header,
         **pixels.header,

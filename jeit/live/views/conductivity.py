@@ -61,7 +61,7 @@ class PixelGrid:
         return pixels
 
 
-def scene_of(
+def create_scene(
     mesh: Mesh,
     electrodes: AbstractElectrodes,
     protocol: Protocol,
@@ -129,12 +129,12 @@ def _slice_outline(grid: PixelGrid) -> list[np.ndarray]:
     """Outline of a slice through a solid, from the mask of the pixels inside the solid."""
     from contourpy import contour_generator
 
-    inside = np.pad(grid.inside.astype(float), 1)
+    inside_values = np.pad(grid.inside.astype(float), 1)
     rows, columns = grid.inside.shape
     x_min, x_max, y_min, y_max = grid.extent
     x = x_min + (np.arange(-1, columns + 1) + 0.5) * (x_max - x_min) / columns
     y = y_max - (np.arange(-1, rows + 1) + 0.5) * (y_max - y_min) / rows
-    return [np.asarray(line) for line in contour_generator(x, y, inside).lines(0.5)]
+    return [np.asarray(line) for line in contour_generator(x, y, inside_values).lines(0.5)]
 
 
 class _CurveDrawing:
@@ -204,7 +204,7 @@ class ConductivityView(AbstractView):
         self._strongest = StrongestRegion(model.mesh)
         self._state, self._electrode_changes = StreamState(imager), ElectrodeChangeFilter(imager, calibration)
         is_plane = model.mesh.dimension == 2
-        self.scene = scene_of(
+        self.scene = create_scene(
             model.mesh,
             model.electrodes,
             model.protocol,

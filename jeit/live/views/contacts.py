@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jeit.data.description import Description
 from jeit.inverse.streaming.stream import FrameStatus, StreamState
 from jeit.live.pictures import AbstractView, LiveFrame, Marker, Picture
-from jeit.live.views.conductivity import ConductivityView, PixelGrid, mean_frame, scene_of
+from jeit.live.views.conductivity import ConductivityView, PixelGrid, create_scene, mean_frame
 from jeit.touch import (
     CellFinder,
     Contact,
@@ -110,8 +110,8 @@ class ContactsView(AbstractView):
 
     def contacts(self, change: Float[np.ndarray, " m"]) -> list[Contact]:
         """Find the contacts in a conductivity change (cells,) in S, the strongest contact first."""
-        strongest = 1 if change.max() >= -change.min() else -1
-        finder = self._finders.get(strongest) or next(iter(self._finders.values()))
+        dominant_sign = 1 if change.max() >= -change.min() else -1
+        finder = self._finders.get(dominant_sign) or next(iter(self._finders.values()))
         return find_contacts(finder, change, self._noise)
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
@@ -121,18 +121,18 @@ class ContactsView(AbstractView):
         self._noise = _estimate_noise(self.images, np.asarray(frames, float))
         self._tracker = ContactTracker()
 
-    def _track_contacts(self, second: float, contacts: list[Contact]) -> None:
-        tracker = self._tracker.follow(max(second, self._tracker.time + _MIN_TIME_STEP), contacts)
+    def _track_contacts(self, time: float, contacts: list[Contact]) -> None:
+        tracker = self._tracker.follow(max(time, self._tracker.time + _MIN_TIME_STEP), contacts)
         # Only the last observation of a touch is needed here. Keeping all observations would use ever more memory.
         open_touches = tuple(replace(touch, observations=touch.observations[-1:]) for touch in tracker.open)
         self._tracker = replace(tracker, open=open_touches, closed=())
 
 
-def _estimate_noise(images: ConductivityView, still: Float[np.ndarray, "N M"]) -> ImageNoise | None:
+def _estimate_noise(images: ConductivityView, untouched_frames: Float[np.ndarray, "N M"]) -> ImageNoise | None:
     """Estimate the noise of images from frames (frames, channels) of the untouched sheet; None for fewer than ten
     frames."""
     state = StreamState(images.imager)
-    images_or_none = [state.image(number, frame).conductivity for number, frame in enumerate(still)]
+    images_or_none = [state.image(number, frame).conductivity for number, frame in enumerate(untouched_frames)]
     conductivities = np.array([image for image in images_or_none if image is not None])
     if len(conductivities) < _MIN_FRAMES or not conductivities.std(axis=0).any():
         return None
@@ -179,7 +179,7 @@ class GestureView(AbstractView):
         forward_model = images.calibration.model
         self.grid = PixelGrid(forward_model.mesh)
         self._start_watch(images, still)
-        self.scene = scene_of(
+        self.scene = create_scene(
             forward_model.mesh,
             forward_model.electrodes,
             forward_model.protocol,
@@ -201,7 +201,7 @@ class GestureView(AbstractView):
             sentence
             for sentence in (
                 self._classified_sentence(observation.named),
-                *map(_held_sentence, observation.ended),
+                *map(_held_touch_sentence, observation.ended),
                 observation.note,
             )
             if sentence
@@ -212,8 +212,8 @@ class GestureView(AbstractView):
         change = image.conductivity - self.watch.images.background
         markers = () if observation.second > self._gesture_label[1] else (self._gesture_label[0],)
         if observation.touched:
-            course = self.watch.level.course(np.array([observation.second]), self._sign * change[None])
-            x, y = course.centroid[0].tolist()
+            time_course = self.watch.level.course(np.array([observation.second]), self._sign * change[None])
+            x, y = time_course.centroid[0].tolist()
             markers = (Marker(x, y, track=self._touch_number + 1),)
         return Picture(self.grid(change), markers, image.status, image.reason, events)
 
@@ -226,8 +226,8 @@ class GestureView(AbstractView):
         )
         self._start_watch(images, reference_frames)
 
-    def _start_watch(self, images: TouchImages, still: Float[np.ndarray, "N M"]) -> None:
-        self.watch = TouchWatch.create(images, self._model, still, rate=self._rate, patience=self._patience)
+    def _start_watch(self, images: TouchImages, untouched_frames: Float[np.ndarray, "N M"]) -> None:
+        self.watch = TouchWatch.create(images, self._model, untouched_frames, rate=self._rate, patience=self._patience)
         self._watch_frame = StepwiseGenerator(self.watch.follow)
         self._second, self._touch_number = -np.inf, 0
         self._gesture_label = Marker(0.0, 0.0), -np.inf
@@ -238,13 +238,13 @@ class GestureView(AbstractView):
         if touch is None:
             return ""
         self._touch_number = touch.number
-        course = touch.touch.course
-        x, y = course.centroid[int(course.peak.argmax())].tolist()
+        time_course = touch.touch.course
+        x, y = time_course.centroid[int(time_course.peak.argmax())].tolist()
         name = "unlike any gesture" if touch.unlike else f"{touch.gesture} {100 * touch.probability:.0f} %"
         self._gesture_label = Marker(x, y, name), self._second + _LABEL_TIME
         return f"{name} at ({1e3 * x:+.0f}, {1e3 * y:+.0f}) mm, {touch.touch.offset - touch.touch.onset:.2f} s long"
 
 
-def _held_sentence(touch: NamedTouch) -> str:
+def _held_touch_sentence(touch: NamedTouch) -> str:
     """Return a sentence about a touch that became part of the reference; an empty string for other touches."""
     return f"a touch is held since {touch.touch.onset:.1f} s and counts as the skin at rest" if touch.held else ""

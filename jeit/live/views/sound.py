@@ -85,8 +85,8 @@ class SoundView(AbstractView):
         """Compute the loss map of a frame with the position of the touch; see `AbstractView.picture`."""
         values = frame.values
         if isinstance(values, str) or values.shape != self._silent_power.shape:
-            content = "text" if isinstance(values, str) else f"of {len(values)} numbers"
-            reason = f"The frame is {content}, not {len(self._silent_power)} intensities."
+            content_text = "text" if isinstance(values, str) else f"of {len(values)} numbers"
+            reason = f"The frame is {content_text}, not {len(self._silent_power)} intensities."
             return Picture(None, status=FrameStatus.REFUSED, reason=reason)
         try:
             intensities = self._to_intensities(values - self._silent_power, frame.second)
@@ -116,10 +116,10 @@ class SoundView(AbstractView):
             raise ValueError(f"reference: give intensities of all {len(self._silent_power)} microphones.")
         self._silent_power = np.where(np.isfinite(mean), mean, 0.0)
 
-    def _to_intensities(self, power: Float[np.ndarray, " M"], second: float) -> Intensities:
+    def _to_intensities(self, power: Float[np.ndarray, " M"], time: float) -> Intensities:
         usable = np.isfinite(power)[None]
         return Intensities(
-            [second],
+            [time],
             power[None],
             floor=self.floor,
             freedom=self.freedom,
