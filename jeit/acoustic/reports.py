@@ -14,7 +14,7 @@ from jeit.acoustic.localisation.locate import microphones_in_use
 from jeit.acoustic.localisation.locations import Locations, LocationStatus
 from jeit.acoustic.localisation.pixels import last_overlay_image, map_brightness
 from jeit.acoustic.touch_tracks import Track
-from jeit.report.folder import as_plain_values, results, version_of, write_json, write_rows
+from jeit.report.folder import package_version, results, to_plain_values, write_json, write_rows
 
 
 def write_calibration(fit: CalibrationFit, path: str | Path) -> None:
@@ -123,7 +123,7 @@ def report_track(located_touches: LocatedTouches) -> dict[str, Any]:
     for number, (fault, is_used) in enumerate(zip(locations.faults, locations.used.T, strict=True)):
         used_fraction = float(is_used.mean())
         microphones.append({"microphone": number, "used_share": used_fraction, "fault": fault or None})
-    return as_plain_values(
+    return to_plain_values(
         {
             "recording": locations.name,
             "calibration": calibration.name,
@@ -150,7 +150,7 @@ def report_track(located_touches: LocatedTouches) -> dict[str, Any]:
                 "time": "s",
                 "strength": "intensity of a typical microphone right under the source",
             },
-            "versions": {name: version_of(name) for name in _PACKAGES},
+            "versions": {name: package_version(name) for name in _PACKAGES},
         }
     )
 

@@ -29,18 +29,18 @@ def hide_axes(ax: Axes, extent: tuple[float, float, float, float], *, numbered: 
     a scale bar and, if electrodes are `numbered`, for the longest number beside the body."""
     x_min, x_max, y_min, y_max = extent
     size = max(x_max - x_min, y_max - y_min)
-    margin = (0.12 if numbered else 0.06) * size
+    margin_width = (0.12 if numbered else 0.06) * size
     outer_texts = [
         text
         for text in ax.texts
         if text.get_horizontalalignment() != "center" and not x_min <= text.get_position()[0] <= x_max
     ]
     horizontal_margin = max(
-        [margin, *((_TEXT_DISTANCE + _LETTER_WIDTH * len(text.get_text())) * size for text in outer_texts)]
+        [margin_width, *((_TEXT_DISTANCE + _LETTER_WIDTH * len(text.get_text())) * size for text in outer_texts)]
     )
     ax.set_aspect("equal")
     ax.set_xlim(x_min - horizontal_margin, x_max + horizontal_margin)
-    ax.set_ylim(y_min - 0.18 * size, y_max + (margin if numbered else 0.03 * size))
+    ax.set_ylim(y_min - 0.18 * size, y_max + (margin_width if numbered else 0.03 * size))
     ax.set_axis_off()
 
 
@@ -75,7 +75,7 @@ def draw_scale_bar(ax: Axes, extent: tuple[float, float, float, float]) -> None:
     """Draw a scale bar of a round length, about a quarter of the width of the picture, below its lower left corner."""
     x_min, x_max, y_min, y_max = extent
     size = max(x_max - x_min, y_max - y_min)
-    length = _round_down(0.27 * (x_max - x_min))
+    length = _round_to_scale_length(0.27 * (x_max - x_min))
     x, y = x_min - 0.06 * size, y_min - 0.125 * size
     ax.plot([x, x + length], [y, y], color=DARK_GREY, linewidth=2.5, solid_capstyle="butt")
     millimetres = 1e3 * length
@@ -83,6 +83,6 @@ def draw_scale_bar(ax: Axes, extent: tuple[float, float, float, float]) -> None:
     ax.text(x, y, f"{millimetres:g} mm", transform=text_transform, ha="left", va="top", color=DARK_GREY, fontsize=9)
 
 
-def _round_down(length: float) -> float:
+def _round_to_scale_length(length: float) -> float:
     decade = 10 ** math.floor(math.log10(length))
     return max(step * decade for step in (1, 2, 5) if step * decade <= length * (1 + 1e-9))

@@ -60,17 +60,17 @@ def _factor_ticks(limit: float) -> dict[float, str]:
     ticks, spacing = {0.0: "1"}, _MIN_TICK_SPACING * limit
     for factor in sorted(factors, reverse=True):
         tick = math.log10(factor)
-        if spacing <= tick <= limit * (1 + 1e-9) and all(abs(tick - other) >= spacing for other in ticks):
+        if spacing <= tick <= limit * (1 + 1e-9) and all(abs(tick - other_tick) >= spacing for other_tick in ticks):
             ticks |= {tick: f"×{factor:g}", -tick: f"÷{factor:g}"}
     return ticks
 
 
-def with_si_prefix(largest: float, unit: str) -> tuple[float, str]:
-    """Choose the SI prefix for values up to `largest`; return the factor to multiply values with, and the unit with its
-    prefix, such as (1e3, "mS")."""
-    if not unit or unit == "%" or not (math.isfinite(largest) and largest > 0):
+def choose_si_prefix(max_value: float, unit: str) -> tuple[float, str]:
+    """Choose the SI prefix for values up to `max_value`; return the factor to multiply values with, and the unit with
+    its prefix, such as (1e3, "mS")."""
+    if not unit or unit == "%" or not (math.isfinite(max_value) and max_value > 0):
         return 1.0, unit
-    exponent = 3 * math.floor(math.log10(largest) / 3 + 1e-9)
+    exponent = 3 * math.floor(math.log10(max_value) / 3 + 1e-9)
     exponent = min(max(exponent, -12), 9)
     return 10.0**-exponent, _PREFIXES[exponent] + unit
 
@@ -117,11 +117,11 @@ class ColourScale(Module):
         Raises `ValueError` for values that are not finite.
         """
         unit = unit if self.unit is None else self.unit
-        largest = float(np.abs(values).max()) if self.limit is None else float(self.limit)
-        if not np.isfinite(largest):
+        max_value = float(np.abs(values).max()) if self.limit is None else float(self.limit)
+        if not np.isfinite(max_value):
             raise ValueError("values must be finite to be drawn.")
-        factor, with_prefix = with_si_prefix(largest, unit)
-        upper_limit = factor * largest or 1.0
+        factor, prefixed_unit = choose_si_prefix(max_value, unit)
+        upper_limit = factor * max_value or 1.0
         if self.difference:
             lower_limit = -upper_limit
         else:
@@ -135,7 +135,7 @@ class ColourScale(Module):
         quantity = self.quantity or (
             f"Change of {conductivity_name}" if self.difference else conductivity_name.capitalize()
         )
-        label = f"{quantity} ({with_prefix})" if with_prefix else quantity
+        label = f"{quantity} ({prefixed_unit})" if prefixed_unit else quantity
         colour_map = self.colour_map or (DIVERGING if self.difference else SEQUENTIAL)
         return FittedScale(factor, label, {"cmap": colour_map, "vmin": lower_limit, "vmax": upper_limit}, self)
 

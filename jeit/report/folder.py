@@ -87,10 +87,10 @@ def describe_electrodes(electrodes: AbstractElectrodes | None) -> dict[str, Any]
     """Describe electrodes by their kind, number, places and sizes in metres."""
     if electrodes is None:
         return {"kind": "at places not known"}
-    return as_plain_values(electrodes.describe())
+    return to_plain_values(electrodes.describe())
 
 
-def version_of(package: str) -> str | None:
+def package_version(package: str) -> str | None:
     """Version of an installed package; None if the package is not installed."""
     try:
         return metadata.version(package)
@@ -98,17 +98,17 @@ def version_of(package: str) -> str | None:
         return None
 
 
-def as_plain_values(value: Any) -> Any:
+def to_plain_values(value: Any) -> Any:
     """Convert a value for JSON: arrays to lists, complex numbers to their real and imaginary part, and numbers that are
     not finite to None."""
     if isinstance(value, dict):
-        return {key: as_plain_values(entry) for key, entry in value.items()}
+        return {key: to_plain_values(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [as_plain_values(entry) for entry in value]
+        return [to_plain_values(entry) for entry in value]
     if hasattr(value, "tolist"):
-        return as_plain_values(np.asarray(value).tolist())
+        return to_plain_values(np.asarray(value).tolist())
     if isinstance(value, complex):
-        return {"real": as_plain_values(value.real), "imaginary": as_plain_values(value.imag)}
+        return {"real": to_plain_values(value.real), "imaginary": to_plain_values(value.imag)}
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

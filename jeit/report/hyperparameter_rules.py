@@ -18,11 +18,11 @@ from jeit.imaging.hyperparameter_rules import ComparedRules, RuleOutcome
 from jeit.imaging.wiring import MOST_MISFIT, find_wiring
 from jeit.mesh import Mesh
 from jeit.report.folder import (
-    as_plain_values,
     describe_domain,
     describe_electrodes,
     describe_measurement,
     results,
+    to_plain_values,
     write_json,
 )
 
@@ -62,7 +62,7 @@ def report_measurement(measurement: Measurement) -> dict[str, Any]:
         "impossible_signs": None if signs is None else float(signs.max()),
         "wiring": _describe_wiring(measurement),
     }
-    return as_plain_values(content)
+    return to_plain_values(content)
 
 
 def _report_noise(measurement: Measurement) -> dict[str, Any] | None:
@@ -70,9 +70,9 @@ def _report_noise(measurement: Measurement) -> dict[str, Any] | None:
     reciprocal voltages are rounded in the same way."""
     noise = estimate_noise(measurement)
     voltages, mask = np.asarray(measurement.voltages)[0], np.asarray(measurement.mask)[0]
-    rounding = float(np.median(rounding_deviation(voltages, mask)[mask])) if mask.any() else 0.0
-    if rounding > (0 if noise is None else noise.standard_deviation):
-        return {"standard_deviation": rounding, "method": "rounding"}
+    rounding_error = float(np.median(rounding_deviation(voltages, mask)[mask])) if mask.any() else 0.0
+    if rounding_error > (0 if noise is None else noise.standard_deviation):
+        return {"standard_deviation": rounding_error, "method": "rounding"}
     return None if noise is None else {"standard_deviation": noise.standard_deviation, "method": noise.method}
 
 
@@ -169,15 +169,15 @@ def _draw_outcome(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
     )
 
 
-def _draw_scale(ax, largest: float, unit: str) -> None:
+def _draw_scale(ax, max_value: float, unit: str) -> None:
     """Draw a small colour bar below an image, with labels at its ends and at zero."""
-    from jeit.plot.colours import DARK_GREY, LIGHT_GREY, with_si_prefix
+    from jeit.plot.colours import DARK_GREY, LIGHT_GREY, choose_si_prefix
 
-    factor, unit = with_si_prefix(largest, unit)
-    limit = factor * largest
+    factor, unit = choose_si_prefix(max_value, unit)
+    scale_limit = factor * max_value
     mappable = next(artist for artist in (*ax.images, *ax.collections) if artist.get_array() is not None)
     bar = ax.figure.colorbar(mappable, ax=ax, orientation="horizontal", shrink=0.62, aspect=18, pad=0.01)
-    bar.set_ticks([-limit, 0, limit], labels=[f"−{limit:.3g}", "0", f"+{limit:.3g} {unit}"])
+    bar.set_ticks([-scale_limit, 0, scale_limit], labels=[f"−{scale_limit:.3g}", "0", f"+{scale_limit:.3g} {unit}"])
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
     bar.ax.tick_params(length=2, color=LIGHT_GREY, labelcolor=DARK_GREY, labelsize=8)
 
@@ -237,4 +237,4 @@ def report_choice(result: ComparedRules) -> dict[str, Any]:
         "refused": result.refused,
         "doubts": list(prepared.doubts),
     }
-    return as_plain_values(content)
+    return to_plain_values(content)

@@ -20,12 +20,12 @@ from jeit.inverse.shapes import Ellipsoid, Star
 from jeit.mesh import Mesh
 from jeit.protocol import Protocol
 from jeit.report.folder import (
-    as_plain_values,
     describe_domain,
     describe_electrodes,
     describe_measurement,
+    package_version,
     results,
-    version_of,
+    to_plain_values,
     write_json,
 )
 from jeit.report.saved_image import saved_extras
@@ -166,13 +166,13 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     return figure
 
 
-def _write_doubts(figure, doubts: Sequence[str]) -> None:
+def _write_doubts(figure, warning_texts: Sequence[str]) -> None:
     """Write the first doubt about an image below it, and the number of further doubts."""
-    if not doubts:
+    if not warning_texts:
         return
-    further = f" {len(doubts) - 1} more in report.json." if len(doubts) > 1 else ""
+    further_text = f" {len(warning_texts) - 1} more in report.json." if len(warning_texts) > 1 else ""
     width = int(_LETTERS_PER_INCH * figure.get_size_inches()[0])
-    figure.supxlabel(fill(f"Doubt: {doubts[0]}{further}", width), fontsize=8, color=_DOUBT_COLOUR)
+    figure.supxlabel(fill(f"Doubt: {warning_texts[0]}{further_text}", width), fontsize=8, color=_DOUBT_COLOUR)
 
 
 def report_image(result: ImagedDifference) -> dict[str, Any]:
@@ -240,9 +240,9 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
         "shapes": _shapes_report(result),
         "inclusion_settings": {"level": result.level, "least_peak": settings.least_peak},
         "timings": {**result.timings, "unit": "s"},
-        "versions": {name: version_of(name) for name in _PACKAGES},
+        "versions": {name: package_version(name) for name in _PACKAGES},
     }
-    return as_plain_values(content)
+    return to_plain_values(content)
 
 
 def _uncertainty_report(uncertainty: Uncertainty, mesh: Mesh) -> dict[str, Any]:
@@ -365,11 +365,11 @@ def _shapes_report(result: ImagedDifference) -> dict[str, Any] | None:
         for bodies in (result.shapes.bodies, result.shapes.doubtful)
     )
     alternatives = zip(result.shapes.alternatives, result.shapes.alternative_deviations, strict=True)
-    for body_report, (alternative, deviation) in zip(body_reports, alternatives, strict=True):
-        if alternative is not None:
-            ratio = math.exp(alternative.sign * alternative.contrast)
+    for body_report, (alternative_shape, deviation) in zip(body_reports, alternatives, strict=True):
+        if alternative_shape is not None:
+            ratio = math.exp(alternative_shape.sign * alternative_shape.contrast)
             evidence = {"conductivity_over_background": ratio, "deviation_of_logarithm": deviation}
-            body_report["or"] = {"centroid": alternative.centroid, **_form_report(alternative), **evidence}
+            body_report["or"] = {"centroid": alternative_shape.centroid, **_form_report(alternative_shape), **evidence}
     return {
         "bodies": body_reports,
         "left_out": left_out_reports,

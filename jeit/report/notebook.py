@@ -22,11 +22,11 @@ _DPI, _MAX_FRAMES = 90, 12
 def picture(value: Any) -> bytes | None:
     """Picture of an object as PNG; None for objects of a kind that has no picture, and inside `jax.jit` or a
     derivative."""
-    draw = _DRAW_FUNCTIONS.get(type(value).__name__)
-    if draw is None or not has_values(value):
+    draw_function = _DRAW_FUNCTIONS.get(type(value).__name__)
+    if draw_function is None or not has_values(value):
         return None
     file = io.BytesIO()
-    draw(value).savefig(file, dpi=_DPI, format="png")
+    draw_function(value).savefig(file, dpi=_DPI, format="png")
     return file.getvalue()
 
 
@@ -78,13 +78,13 @@ def _draw_layout(layout: Any) -> Figure:
 
 
 def _draw_measurement(measurement: Any) -> Figure:
-    from jeit.plot.colours import with_si_prefix
+    from jeit.plot.colours import choose_si_prefix
 
     figure = Figure(figsize=(7.0, 3.2), layout="constrained")
     ax = figure.subplots()
     frame_indices = np.unique(np.linspace(0, measurement.num_frames - 1, _MAX_FRAMES).round().astype(int))
     values = np.where(measurement.mask, np.real(np.asarray(measurement.voltages)), np.nan)[frame_indices]
-    factor, unit = with_si_prefix(float(np.abs(values[np.isfinite(values)]).max(initial=0)) or 1.0, "V")
+    factor, unit = choose_si_prefix(float(np.abs(values[np.isfinite(values)]).max(initial=0)) or 1.0, "V")
     ax.plot(factor * values.T, linewidth=0.8)
     ax.set(xlabel="Channel", ylabel=f"Voltage ({unit})")
     count_text = "" if len(frame_indices) == measurement.num_frames else f"{len(frame_indices)} of "

@@ -150,7 +150,7 @@ def read_image(path: str | Path) -> SavedImage:
             raise ValueError(f"'points' is {describe(arrays['points'])}; real numbers are wanted, metres.")
         with size_checked():  # the command that wrote the file checked the size of the mesh
             mesh = Mesh.create(arrays["points"], arrays["cells"])
-        return _to_saved_image(mesh, arrays)
+        return _create_saved_image(mesh, arrays)
     except ValueError as error:
         raise ValueError(f"{name}: {error}"[:400]) from None
 
@@ -166,11 +166,11 @@ def _check_kind(arrays: dict[str, np.ndarray]) -> None:
 
 
 def _other_file_hint(path: Path) -> str:
-    kind = next((kind for kind, ends in _OTHER_FILES.items() if path.suffix.lower() in ends), None)
+    kind = next((kind for kind, suffixes in _OTHER_FILES.items() if path.suffix.lower() in suffixes), None)
     return "" if kind is None else f", but {kind}"
 
 
-def _to_saved_image(mesh: Mesh, arrays: dict[str, np.ndarray]) -> SavedImage:
+def _create_saved_image(mesh: Mesh, arrays: dict[str, np.ndarray]) -> SavedImage:
     def per_cell(name: str, dtype_kinds: str) -> np.ndarray | None:
         if name not in arrays:
             return None
@@ -333,11 +333,11 @@ def _draw_figures(image: SavedImage, camera, levels, planes, axis: str, slices: 
         "from above": Camera(-90, 90),
     }
 
-    def draw_panels(draw, names, width: float, height: float):
+    def draw_panels(draw_function, names, width: float, height: float):
         figure = _new_figure(width, height)
         panels = figure.subplots(math.ceil(len(names) / 2), min(2, len(names)), squeeze=False).ravel()
         for name, panel in zip(names, panels, strict=False):
-            draw(name, panel)
+            draw_function(name, panel)
         for panel in panels[len(names) :]:
             panel.set_axis_off()
         return figure

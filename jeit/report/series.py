@@ -13,7 +13,7 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.image import Oscillation, oscillation
 from jeit.imaging.sequence import ImagedSequence
 from jeit.mesh import Mesh
-from jeit.report.folder import as_plain_values, describe_measurement, results, write_json, write_rows
+from jeit.report.folder import describe_measurement, results, to_plain_values, write_json, write_rows
 
 FILMS = (".gif", ".mp4")
 FILM_FRAMES = 120
@@ -189,7 +189,7 @@ def _report(sequence: ImagedSequence, curves: Mapping[str, np.ndarray], oscillat
                 "regions": region_reports,
             }
         )
-    return as_plain_values(
+    return to_plain_values(
         {
             "measurement": describe_measurement(sequence.prepared.measurement),
             "frames": len(series.times),

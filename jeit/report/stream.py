@@ -111,7 +111,7 @@ def write_stream(
     with GrowingRows(folder, (mesh.num_cells,)) as rows:
         with GrowingTable(folder / "frames.csv", _COLUMNS) as table:
             for frame_image in images:
-                row, image = summary.take(frame_image)
+                row, image = summary.add_frame(frame_image)
                 with reporting_partial_results(rows):
                     table.write(row)
                     rows.append(image)
@@ -127,7 +127,7 @@ def write_stream(
             )
         latency = summary.latency.values()
         if latency.size:
-            _StreamPictures(folder, film, rate, report).draw(rows, summary)
+            _StreamPictures(folder, film, rate, report).draw_pictures(rows, summary)
         return WrittenStream(rows.number, summary.counts, latency, summary.first_reason)
 
 
@@ -137,30 +137,30 @@ class _StreamSummary:
     def __init__(self, calibration: Calibration):
         self.calibration = calibration
         mesh, self.background = calibration.model.mesh, float(calibration.conductivity)
-        self._strongest = StrongestRegion(mesh)
+        self._strongest_region = StrongestRegion(mesh)
         self._empty_image = np.full(mesh.num_cells, np.nan, np.float32)
         self.latency, self.counts, self.first_reason = Sample(), {}, ""
-        self.refused, self.first_imaged, self.largest = [], -1, 0.0
+        self.refused_frames, self.first_imaged, self.max_change = [], -1, 0.0
 
-    def take(self, frame_image: FrameImage) -> tuple[list[object], Float[np.ndarray, " m"]]:
+    def add_frame(self, frame_image: FrameImage) -> tuple[list[object], Float[np.ndarray, " m"]]:
         """Add a frame to the statistics; return its line of the table, and its image."""
         self.counts[str(frame_image.status)] = self.counts.get(str(frame_image.status), 0) + 1
         if frame_image.conductivity is None:
             self.first_reason = self.first_reason or frame_image.reason
-            self.refused += [frame_image.number] if len(self.refused) < _MAX_NAMED else []
-            return _table_row(frame_image, self._strongest, self.background), self._empty_image
+            self.refused_frames += [frame_image.number] if len(self.refused_frames) < _MAX_NAMED else []
+            return _table_row(frame_image, self._strongest_region, self.background), self._empty_image
         self.first_imaged = frame_image.number if self.first_imaged < 0 else self.first_imaged
         self.latency.append(frame_image.latency)
         image = frame_image.conductivity.astype(np.float32)
-        self.largest = max(self.largest, float(np.abs(image - np.float32(self.background)).max()))
-        return _table_row(frame_image, self._strongest, self.background), image
+        self.max_change = max(self.max_change, float(np.abs(image - np.float32(self.background)).max()))
+        return _table_row(frame_image, self._strongest_region, self.background), image
 
     @property
-    def limit(self) -> float:
+    def colour_limit(self) -> float:
         """End of the colour scale: the maximum change, or, for streams without changes, `_MIN_SCALE_SHARE` times the
         background, so that noise does not fill the scale."""
         changed = sum(self.counts.values()) > sum(self.counts.get(status, 0) for status in _WITHOUT_IMAGE)
-        return self.largest if changed else _MIN_SCALE_SHARE * self.background
+        return self.max_change if changed else _MIN_SCALE_SHARE * self.background
 
 
 @dataclass(frozen=True)
@@ -173,16 +173,16 @@ class _StreamPictures:
     rate: float | None
     report: Callable[[str], None]
 
-    def draw(self, rows: GrowingRows, summary: _StreamSummary) -> None:
+    def draw_pictures(self, rows: GrowingRows, summary: _StreamSummary) -> None:
         """Draw the contact sheet and the film from evenly spaced rows."""
         from jeit.plot import ColourScale, plot_frames
         from jeit.plot.imaging.series import SHEET_FRAMES, FrameCount
 
-        model, limit = summary.calibration.model, summary.limit
+        model, colour_limit = summary.calibration.model, summary.colour_limit
         self.report(PICTURES[0])
         changes, titles = self._selected_changes(rows, summary, SHEET_FRAMES)
-        count = FrameCount(rows.number, summary.counts.get("refused", 0), self._titles(summary.refused))
-        scale = ColourScale(limit=limit)
+        count = FrameCount(rows.number, summary.counts.get("refused", 0), self._titles(summary.refused_frames))
+        scale = ColourScale(limit=colour_limit)
         sheet = plot_frames(model.mesh, changes, model.electrodes, titles=titles, scale=scale, count=count)
         with written_whole(self.folder / "frames.png") as file:
             sheet.savefig(file, dpi=120)
@@ -198,7 +198,7 @@ class _StreamPictures:
                 model.electrodes,
                 titles=titles,
                 rate=film_rate,
-                limit=limit,
+                limit=colour_limit,
                 progress=lambda progress_text: self.report(f"{PICTURES[1]}: {progress_text}"),
             )
 
@@ -301,10 +301,15 @@ class GrowingRows:
         return np.stack(rows)
 
     def write_npz(
-        self, path: Path, name: str, others: Mapping[str, ArrayLike], progress: Callable[[str], None] | None = None
+        self,
+        path: Path,
+        name: str,
+        other_arrays: Mapping[str, ArrayLike],
+        progress: Callable[[str], None] | None = None,
     ) -> None:
-        """Write an NPZ file, completely or not at all, with all rows as the array `name`, and with the arrays `others`.
-        The rows are copied block by block; for large files, `progress` is called with the percentage written."""
+        """Write an NPZ file, completely or not at all, with all rows as the array `name`, and with the arrays
+        `other_arrays`. The rows are copied block by block; for large files, `progress` is called with the percentage
+        written."""
         header = {"descr": "<f4", "fortran_order": False, "shape": (self.number, *self.shape)}
         with written_whole(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
@@ -313,7 +318,7 @@ class GrowingRows:
                     if progress is not None and self._file.tell() > _BLOCK_BYTES:
                         progress(f"{100 * share_done:.0f} %")
                     member.write(block)
-            for other_name, values in others.items():
+            for other_name, values in other_arrays.items():
                 with archive.open(f"{other_name}.npy", "w", force_zip64=True) as member:
                     np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
 

@@ -98,7 +98,7 @@ def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: 
         raise ValueError(f"path: {path.name[:80]} must end in .pvd.")
     seconds, values = _checked_frames(mesh, times, cell_data)
     names = [f"{path.stem}_{k:04d}.vtu" for k in range(len(seconds))]
-    entries = [
+    file_entries = [
         f'    <DataSet timestep="{time:.17g}" part="0" file={quoteattr(name)}/>'
         for time, name in zip(seconds, names, strict=True)
     ]
@@ -106,7 +106,7 @@ def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: 
         '<?xml version="1.0"?>',
         '<VTKFile type="Collection" version="0.1">',
         "  <Collection>",
-        *entries,
+        *file_entries,
         "  </Collection>",
         "</VTKFile>",
     ]

@@ -99,11 +99,11 @@ def test_the_colour_scale_does_not_amplify_noise(calibrated):
     noise = 1 + np.full(calibrated.model.mesh.num_cells, 1e-6)
     unchanged = FrameImage(0, noise, FrameStatus.UNCHANGED, "no change", np.ones(40, bool), 0.5, 0, 1e-3)
     seen = _StreamSummary(calibrated)
-    seen.take(unchanged)
-    assert seen.limit == pytest.approx(0.01)
+    seen.add_frame(unchanged)
+    assert seen.colour_limit == pytest.approx(0.01)
     for one in images(calibrated, 1):
-        seen.take(one)
-    assert seen.limit == pytest.approx(1e-3, rel=1e-3)
+        seen.add_frame(one)
+    assert seen.colour_limit == pytest.approx(1e-3, rel=1e-3)
 
 
 def test_the_only_imaged_frame_is_drawn(calibrated, tmp_path, monkeypatch):

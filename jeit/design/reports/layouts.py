@@ -10,7 +10,7 @@ from jeit.design.improvement import ImprovedLayout
 from jeit.design.scores import Scores
 from jeit.layout import write_layout
 from jeit.mesh import Disk, Domain, Rectangle
-from jeit.report.folder import as_plain_values, describe_domain, results, write_json
+from jeit.report.folder import describe_domain, results, to_plain_values, write_json
 
 # Maximum number of characters of a layout's name in a plot.
 _MAX_NAME_LENGTH = 32
@@ -53,7 +53,7 @@ def report_layout_comparison(result: LayoutComparison) -> dict[str, Any]:
         "cell_mm": None if skin.cell_size is None else 1e3 * skin.cell_size,
         "seed": result.seed,
     }
-    return as_plain_values({"layouts": result.figures, "options": options})
+    return to_plain_values({"layouts": result.figures, "options": options})
 
 
 def draw_layout_comparison(result: LayoutComparison):
@@ -183,7 +183,7 @@ def report_improved_layout(result: ImprovedLayout) -> dict[str, Any]:
             "num_points": result.num_points,
         },
     }
-    return as_plain_values(content)
+    return to_plain_values(content)
 
 
 def _score_figures(scores: Scores) -> dict[str, Any]:

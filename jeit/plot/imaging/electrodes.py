@@ -60,14 +60,14 @@ def draw_outlines(stars: Sequence[Star], *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def _label_intervals(ax: Axes, stars: Sequence[Star]) -> None:
+def _label_intervals(ax: Axes, bodies: Sequence[Star]) -> None:
     """Write the 68 % interval of each body's change of conductivity on the side of the outline that faces the middle of
     the axes, where no electrodes are; or on the opposite side if the first side already has a label."""
     (x_min, y_min), (x_max, y_max) = ax.dataLim.get_points()
     min_distances, used_positions = 0.3 * np.array([x_max - x_min, 0.2 * (y_max - y_min)]), []
-    for star in stars:
-        sides = (1, -1) if star.centroid[1] < (y_min + y_max) / 2 else (-1, 1)
-        positions = [(star.centroid[0], side * (side * star.outline[:, 1]).max()) for side in sides]
+    for body in bodies:
+        sides = (1, -1) if body.centroid[1] < (y_min + y_max) / 2 else (-1, 1)
+        positions = [(body.centroid[0], side * (side * body.outline[:, 1]).max()) for side in sides]
         is_free = [
             all(
                 (np.abs(np.subtract(position, used_position)) > min_distances).any() for used_position in used_positions
@@ -76,9 +76,9 @@ def _label_intervals(ax: Axes, stars: Sequence[Star]) -> None:
         ]
         position_index = is_free.index(True) if any(is_free) else 0
         used_positions.append(positions[position_index])
-        assert star.quantities is not None
+        assert body.quantities is not None
         ax.annotate(
-            interval_text(star.quantities.change_interval, signed_percent),
+            interval_text(body.quantities.change_interval, signed_percent),
             positions[position_index],
             xytext=(0, 3 * sides[position_index]),
             textcoords="offset points",
@@ -129,8 +129,8 @@ def draw_electrodes(
     ax = axes_or_new(ax)
     pen = _MatplotlibPen()
     electrodes.draw(mesh, pen)
-    if pen.arcs:
-        ax.add_collection(LineCollection(pen.arcs, colors=METAL, linewidths=5, capstyle="butt", zorder=3))
+    if pen.boundary_segments:
+        ax.add_collection(LineCollection(pen.boundary_segments, colors=METAL, linewidths=5, capstyle="butt", zorder=3))
     if pen.shapes:
         shapes = PatchCollection(pen.shapes, facecolor="none", edgecolor=METAL, linewidth=1.6, zorder=3)
         ax.add_collection(shapes)
@@ -138,7 +138,7 @@ def draw_electrodes(
         x, y = np.array(pen.dots).T
         ax.scatter(x, y, s=28, color=METAL, zorder=3)
     if numbers:
-        draw_numbers(ax, mesh, np.array(pen.places), np.array(pen.beside), first)
+        draw_numbers(ax, mesh, np.array(pen.number_positions), np.array(pen.is_beside), first)
     return ax
 
 
@@ -152,8 +152,8 @@ def draw_shapes(mesh: Mesh, shapes: ElectrodeShapes, *, ax: Axes) -> None:
             ax.scatter(*corners[0], s=28, color=METAL, zorder=3)
         else:
             ax.add_patch(Polygon(corners, facecolor="none", edgecolor=METAL, linewidth=1.6, zorder=3))
-    first = np.unique(shapes.electrode, return_index=True)[1]
-    draw_numbers(ax, mesh, shapes.middles(), shapes.sizes[first] < 3, 1)
+    first_indices = np.unique(shapes.electrode, return_index=True)[1]
+    draw_numbers(ax, mesh, shapes.middles(), shapes.sizes[first_indices] < 3, 1)
 
 
 class _MatplotlibPen:
@@ -161,31 +161,31 @@ class _MatplotlibPen:
     beside it."""
 
     def __init__(self):
-        self.arcs: list[np.ndarray] = []
+        self.boundary_segments: list[np.ndarray] = []
         self.shapes: list[Patch] = []
         self.dots: list[np.ndarray] = []
-        self.places: list[np.ndarray] = []
-        self.beside: list[bool] = []
+        self.number_positions: list[np.ndarray] = []
+        self.is_beside: list[bool] = []
 
-    def _number(self, middle: np.ndarray, *, beside: bool) -> None:
-        self.places.append(middle[:2])
-        self.beside.append(beside)
+    def _add_number(self, middle: np.ndarray, *, is_beside: bool) -> None:
+        self.number_positions.append(middle[:2])
+        self.is_beside.append(is_beside)
 
     def lines(self, pieces: list[np.ndarray], middle: np.ndarray) -> None:
-        self.arcs += pieces
-        self._number(middle, beside=True)
+        self.boundary_segments += pieces
+        self._add_number(middle, is_beside=True)
 
     def disc(self, middle: np.ndarray, radius: float) -> None:
         self.shapes.append(Circle((middle[0], middle[1]), radius))
-        self._number(middle, beside=False)
+        self._add_number(middle, is_beside=False)
 
     def rectangle(self, middle: np.ndarray, width: float, height: float) -> None:
         self.shapes.append(Rectangle((middle[0] - width / 2, middle[1] - height / 2), width, height))
-        self._number(middle, beside=True)
+        self._add_number(middle, is_beside=True)
 
     def dot(self, middle: np.ndarray) -> None:
         self.dots.append(middle[:2])
-        self._number(middle, beside=True)
+        self._add_number(middle, is_beside=True)
 
 
 # Distance of a number from its electrode, and maximum distance from the edge of an electrode that counts as lying on
@@ -199,9 +199,10 @@ _MIN_FREE_DISTANCE = 1.6
 
 
 def draw_numbers(
-    ax: Axes, mesh: Mesh, positions: Float[np.ndarray, "L 2"], beside: Bool[np.ndarray, " L"], first: int
+    ax: Axes, mesh: Mesh, positions: Float[np.ndarray, "L 2"], is_beside: Bool[np.ndarray, " L"], first_number: int
 ) -> None:
-    """Draw the numbers of electrodes at `positions`, beginning with `first`: on the electrode, or `beside` it.
+    """Draw the numbers of electrodes at `positions`, beginning with `first_number`: on the electrode, or `is_beside`
+    it.
 
     The number beside an electrode on the edge of a sheet is outside along the normal, or inside if a notch is too
     narrow. Beside an electrode within a sheet it is above the electrode, and on a solid seen from above it is away from
@@ -213,14 +214,14 @@ def draw_numbers(
         shifts, is_inside = _shifts_from_edge(mesh, positions, number_distance)
     else:
         shifts, is_inside = _shifts_from_centre(corners, positions, number_distance), np.zeros(len(positions), bool)
-    shifts[~beside] = 0
+    shifts[~is_beside] = 0
     fontsize = 9 if len(positions) <= 20 else 7
     white_rim = [withStroke(linewidth=2, foreground="white")]
     for group in group_coincident(positions, 0.1 * number_distance):
         k = group[0]
-        effects = white_rim if is_inside[k] or not beside[k] else None  # a white rim where the text is on the image
+        effects = white_rim if is_inside[k] or not is_beside[k] else None  # a white rim where the text is on the image
         style = {"ha": "center", "va": "center", "fontsize": fontsize, "color": DARK_GREY, "zorder": 4}
-        text = ", ".join(str(k + first) for k in group)
+        text = ", ".join(str(k + first_number) for k in group)
         if len(group) > 1:
             style["ha"] = _alignment(shifts[k])
         x, y = positions[k] + (1.0 if style["ha"] == "center" else _ALIGNED_FACTOR) * shifts[k]
@@ -260,8 +261,8 @@ def _shifts_from_edge(
         if distance.min() > _EDGE_TOLERANCE / _NUMBER_DISTANCE * number_distance:
             continue
         # At a corner two edges are nearest, and the number is placed along the bisector.
-        nearest = distance <= distance.min() + 1e-6 * number_distance
-        outward_normal = _normals(start[nearest], end[nearest]).sum(axis=0)
+        is_nearest = distance <= distance.min() + 1e-6 * number_distance
+        outward_normal = _normals(start[is_nearest], end[is_nearest]).sum(axis=0)
         outward_normal /= max(np.linalg.norm(outward_normal), 1e-12)
         is_inside[k] = (
             _free_distance(position, outward_normal, start, end, 0.01 * number_distance)

@@ -87,13 +87,13 @@ def draw_slice_outline(
     ax.contour(is_inside, [0.5], extent=padded_extent, origin="upper", colors=DARK_GREY, linewidths=0.9, zorder=2)
 
 
-def slice_text(mesh: Mesh, height: float | None = None, subject: str = "slice") -> str:
+def slice_text(mesh: Mesh, height: float | None = None, subject_text: str = "slice") -> str:
     """Text for a slice at z = `height` metres (default: half the height), such as "slice at z = 20.0 mm"; empty for a
     plane mesh."""
     if mesh.dimension == 2:
         return ""
     z = np.asarray(mesh.points)[:, 2]
-    return f"{subject} at z = {1e3 * ((z.min() + z.max()) / 2 if height is None else height):.1f} mm"
+    return f"{subject_text} at z = {1e3 * ((z.min() + z.max()) / 2 if height is None else height):.1f} mm"
 
 
 def plot_image(
@@ -248,23 +248,23 @@ def plot_admittivity(
         raise ValueError("values are real; draw them with plot_image.")
     if figure is None:
         figure = Figure(figsize=(11.5, 5), layout="constrained")
-    beginning = "Change of " if difference else ""
-    names = [f"{beginning}{name}" for name in ("conductivity σ", "susceptivity ωε")]
-    first, second = (
+    title_prefix = "Change of " if difference else ""
+    names = [f"{title_prefix}{name}" for name in ("conductivity σ", "susceptivity ωε")]
+    first_component, second_component = (
         plot_image(
             mesh,
             component,
             electrodes,
-            scale=ColourScale(difference=difference, quantity=name[0].upper() + name[1:], limit=limit),
+            scale=ColourScale(difference=difference, quantity=name[0].upper() + name[1:], limit=colour_limit),
             title=title,
             ax=ax,
             **options,
         )
-        for ax, component, name, limit, title in zip(
+        for ax, component, name, colour_limit, title in zip(
             figure.subplots(1, 2), (image.real, image.imag), names, limits, titles, strict=True
         )
     )
-    return first, second
+    return first_component, second_component
 
 
 def plot_sensitivity(

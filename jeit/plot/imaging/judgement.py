@@ -15,7 +15,7 @@ from jeit.arguments import check_kind
 from jeit.image.rasters import FiguresOfMerit
 from jeit.inverse.hyperparameter.choice import Choice
 from jeit.plot.axes import axes_or_new, draw_horizontal_grid, soften_axes
-from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SERIES_COLOURS, SERIES_MARKERS, with_si_prefix
+from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SERIES_COLOURS, SERIES_MARKERS, choose_si_prefix
 from jeit.protocol import Protocol
 
 # Colour of each rule for λ; other rules, and values of λ specified as numbers, are drawn in the colour `DARK_GREY`.
@@ -86,12 +86,12 @@ def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = N
     ax = axes_or_new(ax, (9.6, 5.4))
     ax.set_axis_off()
     ax.set_title(title or "", loc="left")
-    with_data = [choice for choice in rules if choice.residual.size]
+    rules_with_data = [choice for choice in rules if choice.residual.size]
     left_edge = 0.0
-    if with_data:
+    if rules_with_data:
         left_edge = 0.54
         # Every choice contains the whole L-curve; the choice with the most candidates has the finest L-curve.
-        most_detailed = max(with_data, key=lambda choice: choice.candidates.size)
+        most_detailed = max(rules_with_data, key=lambda choice: choice.candidates.size)
         _draw_l_curve(ax.inset_axes((0, 0, 0.46, 1)), most_detailed, all_choices)
     height = 1 / len(rules)
     panel = None
@@ -118,11 +118,11 @@ def _draw_l_curve(ax: Axes, curve: Choice, choices: list[Choice]) -> None:
     values, residual, penalty = (np.asarray(array) for array in (curve.candidates, curve.residual, curve.penalty))
     ax.loglog(residual, penalty, color=LIGHT_GREY, linewidth=1.8, zorder=1)
     exponents = np.arange(np.ceil(np.log10(values[0])), np.floor(np.log10(values[-1])) + 1, dtype=int)
-    extent = np.log10([residual.max() / residual.min(), penalty.max() / penalty.min()])
+    log_ranges = np.log10([residual.max() / residual.min(), penalty.max() / penalty.min()])
     labelled_positions = np.full((1, 2), np.inf)
     for exponent in exponents[::-1]:
         point = curve.read(residual, 10.0**exponent), curve.read(penalty, 10.0**exponent)
-        relative_position = np.log10(point) / extent
+        relative_position = np.log10(point) / log_ranges
         if np.linalg.norm(labelled_positions - relative_position, axis=1).min() < _MIN_LABEL_DISTANCE:
             continue
         labelled_positions = np.vstack([labelled_positions, relative_position])
@@ -316,7 +316,7 @@ def plot_voltages(
         raise ValueError("there must be channels to draw, and their voltages finite; mask those that are not.")
     channel = np.flatnonzero(is_drawn)
     rms_voltage = np.sqrt(np.mean(measured[is_drawn] ** 2))
-    factor, unit = with_si_prefix(float(np.abs(measured[is_drawn]).max()), "V")
+    factor, unit = choose_si_prefix(float(np.abs(measured[is_drawn]).max()), "V")
     misfit = np.linalg.norm((modelled - measured)[is_drawn]) / np.linalg.norm(measured[is_drawn])
     ax = axes_or_new(ax, (8.4, 5.0))
     ax.set_axis_off()

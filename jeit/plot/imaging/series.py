@@ -19,7 +19,15 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.image import ImageSeries, Oscillation, Raster, amplitude_spectrum
 from jeit.mesh import Mesh
 from jeit.plot.axes import draw_scale_bar, hide_axes
-from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, LIGHT_GREY, ColourScale, FittedScale, check_scale, with_si_prefix
+from jeit.plot.colours import (
+    CHANGE_SCALE,
+    DARK_GREY,
+    LIGHT_GREY,
+    ColourScale,
+    FittedScale,
+    check_scale,
+    choose_si_prefix,
+)
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import check_body, draw_outline, draw_slice_outline, slice_text
 from jeit_solvers.engines import as_array
@@ -89,7 +97,7 @@ class FramePicture:
             draw_scale_bar(ax, extent)
         centre = (extent[0] + extent[1]) / 2, (extent[2] + extent[3]) / 2
         style = {"ha": "center", "va": "center", "color": DARK_GREY, "fontsize": 10, "zorder": 5}
-        self.refused = ax.text(*centre, "refused", **style)  # pyright: ignore[reportArgumentType]
+        self.refusal_text = ax.text(*centre, "refused", **style)  # pyright: ignore[reportArgumentType]
 
     def show(self, change: Float[np.ndarray, " m"], title: str) -> None:
         """Show a frame. `change`: change of conductivity per cell (m,), NaN for a refused frame."""
@@ -97,7 +105,7 @@ class FramePicture:
         if has_image:
             self.mappable.set_data(self.fitted.factor * np.asarray(self.raster.sample(as_array(change))))
         self.mappable.set_visible(has_image)
-        self.refused.set_visible(not has_image)
+        self.refusal_text.set_visible(not has_image)
         self.ax.set_title(title, fontsize=10)
 
 
@@ -164,8 +172,8 @@ def plot_frames(
         colour_bar_axes = figure.add_subplot(grid[:, -1])
         fitted_scale.draw_bar(colour_bar_axes, pictures[0].mappable, colour_bar_axes)
     if count is None:
-        refused = [title for title, row in zip(frame_titles, values, strict=True) if not np.isfinite(row).all()]
-        count = FrameCount(len(values), len(refused), refused)
+        refused_titles = [title for title, row in zip(frame_titles, values, strict=True) if not np.isfinite(row).all()]
+        count = FrameCount(len(values), len(refused_titles), refused_titles)
     text = _count_text(count, len(selected), mesh)
     if text:
         figure.supxlabel(text, fontsize=9, color=LIGHT_GREY)
@@ -178,7 +186,7 @@ def _count_text(count: FrameCount, num_drawn: int, mesh: Mesh) -> str:
     if count.refused:
         names = ", ".join(count.names[:_MAX_NAMED]) + (" …" if count.refused > _MAX_NAMED else "")
         sentences.append(f"{count.refused} of {count.number} refused: {names}")
-    return "; ".join([*sentences, *filter(None, [slice_text(mesh, subject="slices")])])
+    return "; ".join([*sentences, *filter(None, [slice_text(mesh, subject_text="slices")])])
 
 
 # Minimum amplitude at which the phase is drawn: as a share of the maximum amplitude, and as a multiple of the noise of
@@ -216,26 +224,28 @@ def plot_series(
     maps = _RegionMaps(series, electrodes, raster)
     functional_title = ", ".join(filter(None, ["functional image", slice_text(series.mesh, height)]))
     deviation_scale = ColourScale(difference=False, quantity="Standard deviation over time")
-    maps.draw(maps_figure.add_subplot(grid[0, 0]), series.functional(), deviation_scale, functional_title)
+    maps.draw_map(maps_figure.add_subplot(grid[0, 0]), series.functional(), deviation_scale, functional_title)
     for row, oscillation in enumerate(oscillations):
         amplitude_scale = ColourScale(difference=False, quantity=f"Amplitude at {oscillation.frequency:.3g} Hz")
         title = f"{oscillation.frequency:.4g} Hz (resolution {oscillation.resolution:.2g} Hz)"
-        maps.draw(maps_figure.add_subplot(grid[row, 1]), oscillation.amplitude, amplitude_scale, title)
+        maps.draw_map(maps_figure.add_subplot(grid[row, 1]), oscillation.amplitude, amplitude_scale, title)
         has_phase = (oscillation.amplitude > _MIN_PHASE_SHARE * oscillation.amplitude.max()) & (
             oscillation.amplitude > _MIN_PHASE_SNR * oscillation.noise
         )
         maps.draw_phase(
             maps_figure.add_subplot(grid[row, 2]), np.where(has_phase, np.degrees(oscillation.phase), np.nan)
         )
-    means = {name: series.mean_change(region) for name, region in regions.items()}
-    largest = max((float(np.nanmax(np.abs(mean))) for mean in means.values()), default=0.0)
-    factor, unit = with_si_prefix(largest or 1.0, series.unit)
-    spectra = {name: _spectrum(factor * mean, series.times) for name, mean in means.items()} if series.timed else {}
+    mean_changes = {name: series.mean_change(region) for name, region in regions.items()}
+    max_change = max((float(np.nanmax(np.abs(mean))) for mean in mean_changes.values()), default=0.0)
+    factor, unit = choose_si_prefix(max_change or 1.0, series.unit)
+    spectra = (
+        {name: _spectrum(factor * mean, series.times) for name, mean in mean_changes.items()} if series.timed else {}
+    )
     drawn_spectra = {name: spectrum for name, spectrum in spectra.items() if spectrum is not None}
     # Without oscillations, curves are drawn beside the functional image.
     curves_grid = (grid[num_rows, :] if num_rows else grid[0, 1:]).subgridspec(1, 2, width_ratios=[1.6, 1.0])
     curves_position = curves_grid[0] if drawn_spectra else curves_grid[:]
-    _draw_curves(maps_figure.add_subplot(curves_position), means, series, factor, unit)
+    _draw_curves(maps_figure.add_subplot(curves_position), mean_changes, series, factor, unit)
     if drawn_spectra:
         _draw_spectra(maps_figure.add_subplot(curves_grid[1]), drawn_spectra, oscillations, unit)
     return figure
@@ -270,17 +280,17 @@ class _RegionMaps:
     def __init__(self, series: ImageSeries, electrodes: AbstractElectrodes | None, raster: Raster):
         self.mesh, self.unit, self.electrodes, self.raster = series.mesh, series.unit, electrodes, raster
 
-    def draw(self, ax: Axes, values: np.ndarray, scale: ColourScale, title: str) -> None:
+    def draw_map(self, ax: Axes, values: np.ndarray, scale: ColourScale, title: str) -> None:
         pixels = np.asarray(self.raster.sample(as_array(values)))
         fitted_scale: FittedScale = scale.of(pixels[np.isfinite(pixels)], self.unit)
-        fitted_scale.draw_bar(ax, self._show(ax, fitted_scale.factor * pixels, title, **fitted_scale.keywords))
+        fitted_scale.draw_bar(ax, self._show_pixels(ax, fitted_scale.factor * pixels, title, **fitted_scale.keywords))
 
     def draw_phase(self, ax: Axes, degrees: np.ndarray) -> None:
         pixels = np.asarray(self.raster.sample(as_array(degrees)))
-        mappable = self._show(ax, pixels, "phase", cmap="hsv", vmin=-180, vmax=180)
+        mappable = self._show_pixels(ax, pixels, "phase", cmap="hsv", vmin=-180, vmax=180)
         ax.figure.colorbar(mappable, ax=ax, ticks=[-180, -90, 0, 90, 180], label="Phase (degrees)")
 
-    def _show(self, ax: Axes, pixels: np.ndarray, title: str, **keywords):
+    def _show_pixels(self, ax: Axes, pixels: np.ndarray, title: str, **keywords):
         extent = self.raster.extent
         mappable = ax.imshow(pixels, extent=extent, interpolation="nearest", **keywords)
         if self.mesh.dimension == 2:
@@ -303,12 +313,14 @@ def _spectrum(mean: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return (frequencies, amplitude) if len(frequencies) > 1 else None
 
 
-def _draw_curves(ax: Axes, means: Mapping[str, np.ndarray], series: ImageSeries, factor: float, unit: str) -> None:
+def _draw_curves(
+    ax: Axes, mean_changes: Mapping[str, np.ndarray], series: ImageSeries, factor: float, unit: str
+) -> None:
     """Draw the mean change of each region over time."""
-    for name, mean in means.items():
+    for name, mean in mean_changes.items():
         ax.plot(series.times, factor * mean, linewidth=1.2, label=name)
     ax.set(xlabel="Time (s)" if series.timed else "Frame", ylabel=f"Mean change ({unit})", title="regions over time")
-    if means:
+    if mean_changes:
         ax.legend(fontsize=8, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.25), ncols=3)
     _style_graph(ax)
 

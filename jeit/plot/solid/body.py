@@ -28,7 +28,7 @@ _MIN_NUMBER_DISTANCE = 0.03
 _MAX_COVERED_SHARE, _TRANSLUCENT_OPACITY = 0.4, 0.16
 
 
-def size_of(mesh: Mesh) -> float:
+def longest_side(mesh: Mesh) -> float:
     """Longest side of the bounding box of a mesh, metres."""
     return float(np.ptp(np.asarray(mesh.points), axis=0).max())
 
@@ -40,24 +40,24 @@ def add_hull(scene: Scene, mesh: Mesh) -> None:
     scene.add_lines(points[visible_edges(points, triangles, scene.camera.toward)], LIGHT_GREY, 0.9)
 
 
-def visible_edges(points, triangles, toward: Float[np.ndarray, "3"]) -> np.ndarray:
-    """Edges (s, 2) of a surface to draw as lines, as seen from the direction `toward`: sharp edges, edges of an open
-    boundary, and the outline, at which the surface turns away from the viewer."""
+def visible_edges(points, triangles, view_direction: Float[np.ndarray, "3"]) -> np.ndarray:
+    """Edges (s, 2) of a surface to draw as lines, as seen from the direction `view_direction`: sharp edges, edges of an
+    open boundary, and the outline, at which the surface turns away from the viewer."""
     normal = np.cross(
         points[triangles[:, 1]] - points[triangles[:, 0]], points[triangles[:, 2]] - points[triangles[:, 0]]
     )
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     triangle_index = np.repeat(np.arange(len(triangles)), 3)
-    order = np.lexsort(edges.T)
-    edges, triangle_index = edges[order], triangle_index[order]
+    edge_order = np.lexsort(edges.T)
+    edges, triangle_index = edges[edge_order], triangle_index[edge_order]
     shared_rows = np.flatnonzero((edges[1:] == edges[:-1]).all(axis=1))
     first_normals, second_normals = normal[triangle_index[shared_rows]], normal[triangle_index[shared_rows + 1]]
     # Facets parallel to the line of sight, within rounding errors, face neither to the viewer nor away.
-    facing = np.stack([first_normals @ toward, second_normals @ toward])
-    facing = np.where(np.abs(facing) < 1e-9, 0, facing)
+    facing_cosines = np.stack([first_normals @ view_direction, second_normals @ view_direction])
+    facing_cosines = np.where(np.abs(facing_cosines) < 1e-9, 0, facing_cosines)
     is_drawn = (np.sum(first_normals * second_normals, axis=1) < _EDGE_COSINE) | (
-        (facing > 0).any(axis=0) & (facing <= 0).any(axis=0)
+        (facing_cosines > 0).any(axis=0) & (facing_cosines <= 0).any(axis=0)
     )
     is_boundary = np.ones(len(edges), bool)
     is_boundary[shared_rows] = is_boundary[shared_rows + 1] = False
@@ -124,9 +124,9 @@ def number_electrodes(
 
     Electrodes seen close to each other share one text.
     """
-    middles = shapes.middles()
-    normals = ProjectionSurface(points, triangles).normals(middles)
-    positions = scene.camera.on_page(middles + _NUMBER_DISTANCE * float(np.ptp(points, axis=0).max()) * normals)
+    centres = shapes.middles()
+    normals = ProjectionSurface(points, triangles).normals(centres)
+    positions = scene.camera.on_page(centres + _NUMBER_DISTANCE * float(np.ptp(points, axis=0).max()) * normals)
     fontsize = 8 if len(positions) <= 20 else 6.5
     is_faint = normals @ scene.camera.toward < -0.05
     front_positions, min_distance = positions[~is_faint], _MIN_NUMBER_DISTANCE * float(np.ptp(points, axis=0).max())
@@ -153,7 +153,7 @@ def number_electrodes(
                 _number_text((electrode_indices[group] + 1).tolist()),
                 fontsize=fontsize,
                 is_faint=draws_faint,
-                align=alignment,
+                alignment=alignment,
             )
 
 

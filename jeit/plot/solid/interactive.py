@@ -71,9 +71,9 @@ def view_solid(
         # Depth peeling sorts translucent surfaces; without a graphics card, depth peeling would make these surfaces
         # disappear.
         plotter.enable_depth_peeling()
-    hull = pv.PolyData.from_regular_faces(points, np.asarray(mesh.facets))
-    plotter.add_mesh(hull, color=BODY, opacity=0.12, name="hull")
-    plotter.add_mesh(hull.extract_feature_edges(30), color=DARK_GREY, line_width=1.5, name="edges")
+    surface_mesh = pv.PolyData.from_regular_faces(points, np.asarray(mesh.facets))
+    plotter.add_mesh(surface_mesh, color=BODY, opacity=0.12, name="hull")
+    plotter.add_mesh(surface_mesh.extract_feature_edges(30), color=DARK_GREY, line_width=1.5, name="edges")
     for k, (value, level, surface) in enumerate(surfaces):
         if not len(surface.triangles):
             continue

@@ -21,7 +21,7 @@ from jeit.plot.axes import axes_or_new
 from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, ColourScale, FittedScale, check_scale
 from jeit.plot.solid.body import add_electrodes, add_hull, number_electrodes
 from jeit.plot.solid.scene import CORNER_VIEW, Camera, Scene, hide_axes_in_space, mark_sign
-from jeit.plot.solid.surfaces import colours_of, mappable
+from jeit.plot.solid.surfaces import map_to_colours, mappable
 
 _DASH_PATTERN = {"fill": False, "edgecolor": DARK_GREY, "linewidth": 1, "linestyle": (0, (4, 3)), "zorder": 3}
 
@@ -138,9 +138,9 @@ def draw_in_space(
     scene = Scene(camera)
     add_hull(scene, mesh)
     surfaces = level_surfaces(mesh, values, levels, is_signed=fitted.scale.difference)
-    for value, share, surface in surfaces:
-        colour = np.array(colours_of(fitted, np.array([value]))[0])
-        colour[3] = 1.0 if share == max(levels) else OUTER_OPACITY
+    for value, fraction, surface in surfaces:
+        colour = np.array(map_to_colours(fitted, np.array([value]))[0])
+        colour[3] = 1.0 if fraction == max(levels) else OUTER_OPACITY
         scene.add_triangles(surface.points, surface.triangles, colour, smooth=True)
     for plane in planes:
         outline = cut_by_plane(mesh, plane).outline
@@ -169,7 +169,7 @@ def level_surfaces(
     `levels`: shares of the maximum change of each sign if `is_signed`, otherwise fractions of the range from minimum to
     maximum. Raises `ValueError` for levels that are not between 0 and 1.
     """
-    shares = check_levels(levels)
+    fractions = check_levels(levels)
     image = node_values(mesh, np.asarray(values))
     reference = 0.0 if is_signed else float(image.min())
     min_peak = _MIN_PEAK * float(np.abs(image - reference).max())
@@ -177,9 +177,9 @@ def level_surfaces(
     for sign in (1.0, -1.0) if is_signed else (1.0,):
         peak_change = float((sign * (image - reference)).max())
         if peak_change > 0 and peak_change >= min_peak:
-            for share in shares:
-                level = sign * share * peak_change
-                surfaces.append((reference + level, share, isosurface_of(mesh, image - reference, level)))
+            for fraction in fractions:
+                level = sign * fraction * peak_change
+                surfaces.append((reference + level, fraction, isosurface_of(mesh, image - reference, level)))
     return surfaces
 
 

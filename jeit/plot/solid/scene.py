@@ -214,13 +214,13 @@ def hide_axes_in_space(ax: Axes, camera: Camera, points: Float[np.ndarray, "n 3"
     page_points = camera.on_page(points)
     (left, low), (right, high) = page_points.min(axis=0), page_points.max(axis=0)
     size = max(right - left, high - low)
-    margin = (0.09 if numbered else 0.03) * size
+    margin_width = (0.09 if numbered else 0.03) * size
     ax.set_aspect("equal")
-    ax.set_xlim(left - max(margin, 0.07 * size), right + max(margin, 0.07 * size))
-    ax.set_ylim(low - 0.24 * size - 0.4 * margin, high + margin)
+    ax.set_xlim(left - max(margin_width, 0.07 * size), right + max(margin_width, 0.07 * size))
+    ax.set_ylim(low - 0.24 * size - 0.4 * margin_width, high + margin_width)
     ax.set_axis_off()
-    draw_scale_bar(ax, (left, right, low - 0.4 * margin, high))
-    cross_position = (right - 0.05 * size, low - 0.4 * margin - 0.14 * size)
+    draw_scale_bar(ax, (left, right, low - 0.4 * margin_width, high))
+    cross_position = (right - 0.05 * size, low - 0.4 * margin_width - 0.14 * size)
     draw_axes_cross(ax, camera.on_page(np.eye(3)), cross_position, 0.09 * size)
 
 
@@ -248,12 +248,12 @@ def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], origin: tupl
 
 
 def draw_number(
-    ax: Axes, position: Float[np.ndarray, "2"], text: str, *, fontsize: float, is_faint: bool, align: str = "center"
+    ax: Axes, position: Float[np.ndarray, "2"], text: str, *, fontsize: float, is_faint: bool, alignment: str = "center"
 ) -> None:
-    """Draw a number on the page with a white rim; `align`: horizontal alignment relative to `position`."""
+    """Draw a number on the page with a white rim; `alignment`: horizontal alignment relative to `position`."""
     x, y = position
     ax.text(
-        x, y, text, ha=align, va="center", fontsize=fontsize, color=DARK_GREY, alpha=0.45 if is_faint else 1.0,
+        x, y, text, ha=alignment, va="center", fontsize=fontsize, color=DARK_GREY, alpha=0.45 if is_faint else 1.0,
         path_effects=_RIM, zorder=4,
     )  # fmt: skip
 

@@ -21,7 +21,7 @@ from jeit.mesh import Mesh, centroids
 from jeit.plot.axes import axes_or_new, draw_scale_bar
 from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, ColourScale, FittedScale
 from jeit.plot.imaging.electrodes import METAL
-from jeit.plot.solid.body import size_of
+from jeit.plot.solid.body import longest_side
 from jeit.plot.solid.isosurfaces import DEFAULT_LEVELS, check_drawn, draw_body_in_plane, draw_in_space
 from jeit.plot.solid.scene import CORNER_VIEW, Camera, draw_axes_cross, draw_number
 from jeit.plot.solid.surfaces import mappable
@@ -68,7 +68,7 @@ def plot_slice(
     fitted_scale = scale.of(image, "S/m")
     ax = axes_or_new(ax)
     mappable = draw_slice(ax, mesh, image, plane, electrodes, inclusions=inclusions, fitted=fitted_scale)
-    finish_slice(ax, plane, window_of(ax), draw_cross=True)
+    finish_slice(ax, plane, data_extent(ax), draw_cross=True)
     fitted_scale.draw_bar(ax, mappable)
     return ax
 
@@ -102,7 +102,7 @@ def plot_slices(
     ```
     """
     check_drawn(mesh, electrodes, scale)
-    planes = planes_along(mesh, axis, at)
+    planes = create_planes(mesh, axis, at)
     image = cell_values(mesh, values)
     fitted_scale = scale.of(image, "S/m")
     shapes = _electrode_shapes(mesh, electrodes)
@@ -128,19 +128,23 @@ def plot_slices(
     return figure
 
 
-def planes_along(mesh: Mesh, axis: str, at: Sequence[float] | int) -> list[Plane]:
-    """Planes perpendicular to an axis. `at`: coordinates of the planes in metres, or their number; a number of planes
-    are evenly spaced, with half a spacing at both ends. Raises `ValueError` for an unknown axis, and for too many or no
-    planes."""
+def create_planes(mesh: Mesh, axis: str, coordinates_or_number: Sequence[float] | int) -> list[Plane]:
+    """Planes perpendicular to an axis. `coordinates_or_number`: coordinates of the planes in metres, or their number; a
+    number of planes are evenly spaced, with half a spacing at both ends. Raises `ValueError` for an unknown axis, and
+    for too many or no planes."""
     if axis not in AXES:
         raise ValueError(f"axis must be 'x', 'y' or 'z'; it is {describe(axis)}.")
     coordinates = np.asarray(mesh.points)[:, AXES.index(axis)]
-    if isinstance(at, int | np.integer) and not isinstance(at, bool):
-        if not 1 <= at <= MAX_SLICES:
-            raise ValueError(f"at must be a number of slices from 1 to {MAX_SLICES}, or their places; it is {at}.")
-        plane_positions = coordinates.min() + (np.arange(at) + 0.5) / at * np.ptp(coordinates)
+    if isinstance(coordinates_or_number, int | np.integer) and not isinstance(coordinates_or_number, bool):
+        if not 1 <= coordinates_or_number <= MAX_SLICES:
+            raise ValueError(
+                f"at must be a number of slices from 1 to {MAX_SLICES}, or their places; it is {coordinates_or_number}."
+            )
+        plane_positions = coordinates.min() + (np.arange(coordinates_or_number) + 0.5) / coordinates_or_number * np.ptp(
+            coordinates
+        )
     else:
-        plane_positions = np.atleast_1d(np.asarray(at, dtype=object))
+        plane_positions = np.atleast_1d(np.asarray(coordinates_or_number, dtype=object))
         if not 1 <= len(plane_positions) <= MAX_SLICES:
             raise ValueError(
                 f"at must be the places of 1 to {MAX_SLICES} slices, in metres; they are {len(plane_positions)}."
@@ -171,7 +175,7 @@ def draw_slice(
     )
     shapes = _electrode_shapes(mesh, electrodes)
     if shapes is not None:
-        _draw_cut_electrodes(ax, plane, shapes, 0.05 * size_of(mesh), section.polygons.reshape(-1, 2).mean(axis=0))
+        _draw_cut_electrodes(ax, plane, shapes, 0.05 * longest_side(mesh), section.polygons.reshape(-1, 2).mean(axis=0))
     for inclusion in inclusions:
         draw_body_in_plane(ax, plane, inclusion)
     return cells
@@ -182,10 +186,10 @@ def finish_slice(ax: Axes, plane: Plane, window: tuple[float, float, float, floa
     scale bar and arrows of the axes."""
     left, right, low, high = window
     size = max(right - left, high - low)
-    margin = 0.08 * size
+    margin_width = 0.08 * size
     ax.set_aspect("equal")
-    ax.set_xlim(left - margin, right + margin)
-    ax.set_ylim(low - 0.2 * size, high + margin)
+    ax.set_xlim(left - margin_width, right + margin_width)
+    ax.set_ylim(low - 0.2 * size, high + margin_width)
     ax.set_axis_off()
     if draw_cross:
         draw_scale_bar(ax, (left, right, low, high))
@@ -194,7 +198,7 @@ def finish_slice(ax: Axes, plane: Plane, window: tuple[float, float, float, floa
     ax.set_title(plane.name, fontsize=10)
 
 
-def window_of(ax: Axes) -> tuple[float, float, float, float]:
+def data_extent(ax: Axes) -> tuple[float, float, float, float]:
     """Extent (left, right, low, high) of the data drawn on axes."""
     box = ax.dataLim
     return box.x0, box.x1, box.y0, box.y1
@@ -235,12 +239,12 @@ def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, distan
             lines_by_electrode.setdefault(int(electrode_index), []).extend(lines)
     for electrode_index, lines in lines_by_electrode.items():
         ax.add_collection(LineCollection(lines, colors=METAL, linewidths=4, capstyle="butt", zorder=3))
-        ends = np.concatenate(lines)
-        position = ends.mean(axis=0)
-        if np.ptp(ends, axis=0).max() < 0.1 * distance:
+        segment_ends = np.concatenate(lines)
+        position = segment_ends.mean(axis=0)
+        if np.ptp(segment_ends, axis=0).max() < 0.1 * distance:
             continue  # only a corner of the electrode is cut
         # The number is placed perpendicular to the line, away from the middle of the section.
-        normal = np.linalg.svd(ends - position)[2][1]
+        normal = np.linalg.svd(segment_ends - position)[2][1]
         position = position + distance * normal * np.sign(normal @ (position - section_centre))
         draw_number(ax, position, str(electrode_index + 1), fontsize=7, is_faint=False)
 
@@ -248,10 +252,12 @@ def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, distan
 def _num_columns(num_panels: int, aspect_ratio: float) -> int:
     """Number of columns of a grid of `num_panels` panels on a landscape page; `aspect_ratio`: ratio of height to width
     of a panel."""
-    preferred = max(1, round(float(np.sqrt(1.6 * num_panels * aspect_ratio))))
+    preferred_number = max(1, round(float(np.sqrt(1.6 * num_panels * aspect_ratio))))
     # Of several similar numbers of columns, the number that leaves the fewest panels empty is chosen.
-    candidates = range(max(1, preferred - 1), preferred + 2)
-    return min(num_panels, min(candidates, key=lambda columns: (-num_panels % columns, abs(columns - preferred))))
+    candidates = range(max(1, preferred_number - 1), preferred_number + 2)
+    return min(
+        num_panels, min(candidates, key=lambda columns: (-num_panels % columns, abs(columns - preferred_number)))
+    )
 
 
 def plot_solid(
@@ -302,7 +308,7 @@ def plot_solid(
         fitted=fitted_scale,
         planes=planes,
     )
-    half_size = size_of(mesh) / 2
+    half_size = longest_side(mesh) / 2
     for plane, grid_cell in zip(planes, (grid[0, 1], grid[0, 2], grid[1, 1]), strict=True):
         panel = figure.add_subplot(grid_cell)
         draw_slice(panel, mesh, image, plane, shapes, inclusions=inclusions, fitted=fitted_scale)
@@ -328,9 +334,9 @@ def strongest_place(mesh: Mesh, image: np.ndarray, inclusions: Sequence[Inclusio
 def _caption(ax: Axes, common_point, levels, inclusions: Sequence[Inclusion], *, difference: bool) -> None:
     """Draw a caption that describes the slices, the isosurfaces and the inclusions."""
     ax.set_axis_off()
-    shares = ", ".join(f"{100 * share:g}" for share in sorted(levels))
+    level_texts = ", ".join(f"{100 * level:g}" for level in sorted(levels))
     scale_text = "of the strongest change" if difference else "of the way from least to greatest"
-    lines = [f"slices through ({_position_text(common_point)}) mm", f"surfaces at {shares} % {scale_text}"]
+    lines = [f"slices through ({_position_text(common_point)}) mm", f"surfaces at {level_texts} % {scale_text}"]
     if inclusions:
         ball_text = "" if all(inclusion.form for inclusion in inclusions) else ", drawn as balls of their volume"
         lines += ["", f"found, dashed{ball_text}:"]
@@ -338,8 +344,8 @@ def _caption(ax: Axes, common_point, levels, inclusions: Sequence[Inclusion], *,
         sign = "+" if inclusion.sign > 0 else "−"
         column = "column of " if inclusion.is_column else ""
         radius = "" if inclusion.centroid_radius is None else f" ±{1e3 * inclusion.centroid_radius:.2g}"
-        place = f"({_position_text(inclusion.centroid)}){radius} mm"
-        lines.append(f"{sign}  {column}{1e6 * inclusion.area:.3g} cm³ at {place}")
+        place_text = f"({_position_text(inclusion.centroid)}){radius} mm"
+        lines.append(f"{sign}  {column}{1e6 * inclusion.area:.3g} cm³ at {place_text}")
         if inclusion.contrast_interval is not None:
             lines.append(f"    {interval_text(inclusion.contrast_interval, signed_percent)}")
     if len(inclusions) > _MAX_LISTED:

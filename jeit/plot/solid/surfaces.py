@@ -21,7 +21,7 @@ from jeit.mesh.geodesic import Triangles
 from jeit.plot.axes import axes_or_new
 from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, SERIES_COLOURS, ColourScale, FittedScale, check_scale
 from jeit.plot.imaging.electrodes import METAL
-from jeit.plot.solid.body import add_electrodes, number_electrodes, size_of
+from jeit.plot.solid.body import add_electrodes, longest_side, number_electrodes
 from jeit.plot.solid.scene import BODY, CORNER_VIEW, Camera, Scene, hide_axes_in_space
 
 # Distance, divided by the size of the skin, by which a surface must be in front of a mark to hide it.
@@ -74,7 +74,7 @@ def plot_surface(
     else:
         image = checked_values(values, len(point_array), len(triangle_array))
         fitted_scale = scale.of(image, "S")
-        colours = colours_of(
+        colours = map_to_colours(
             fitted_scale, image if len(image) == len(triangle_array) else image[triangle_array].mean(axis=1)
         )
     scene.add_triangles(point_array, triangle_array, colours, smooth=True)
@@ -130,7 +130,7 @@ def checked_values(values: ArrayLike, num_points: int, num_triangles: int) -> Fl
     return image
 
 
-def colours_of(fitted: FittedScale, values: Float[np.ndarray, " m"]) -> Float[np.ndarray, "m 4"]:
+def map_to_colours(fitted: FittedScale, values: Float[np.ndarray, " m"]) -> Float[np.ndarray, "m 4"]:
     """Colours (m, 4) of values in a fitted colour scale."""
     return colormaps[fitted.keywords["cmap"]](_normalise(fitted)(fitted.factor * np.asarray(values)))
 
@@ -186,7 +186,7 @@ def plot_curved_skin(
     if values is not None:
         image = checked_values(values, len(points), len(cells))
         fitted_scale = scale.of(image, "S")
-        colours = colours_of(fitted_scale, image if len(image) == len(cells) else image[cells].mean(axis=1))
+        colours = map_to_colours(fitted_scale, image if len(image) == len(cells) else image[cells].mean(axis=1))
     scene.add_triangles(points, cells, colours, smooth=True)
     surface = ProjectionSurface(points, cells)
     # Pieces are sorted by the depth of their centres, so discs are moved in front of the triangles on which they lie.
@@ -233,7 +233,7 @@ def _visible_points(mesh, points, camera: Camera):
     ray."""
     corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
     page_corners, depths = camera.on_page(corners), camera.nearness(corners)
-    visible = []
+    visible_masks = []
     for point in points:
         page_position, depth = camera.on_page(point[None])[0], float(camera.nearness(point[None])[0])
         a, b, c = (page_corners[:, k] - page_position for k in range(3))
@@ -243,6 +243,6 @@ def _visible_points(mesh, points, camera: Camera):
         weights = areas / np.where(doubled_area == 0, 1.0, doubled_area)[:, None]
         is_covering = (weights >= 0).all(axis=1) & (doubled_area != 0)
         covering_depths = (weights * depths).sum(axis=1)[is_covering]
-        if not (covering_depths > depth + _MARK_OFFSET * size_of(mesh)).any():
-            visible.append(point)
-    return np.array(visible).reshape(-1, 3)
+        if not (covering_depths > depth + _MARK_OFFSET * longest_side(mesh)).any():
+            visible_masks.append(point)
+    return np.array(visible_masks).reshape(-1, 3)

@@ -14,7 +14,7 @@ from jeit.arguments import check_kind
 from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Mesh
 from jeit.plot.axes import axes_or_new, draw_scale_bar, hide_axes
-from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, ColourScale, draw_colour_bar, with_si_prefix
+from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, ColourScale, choose_si_prefix, draw_colour_bar
 from jeit.plot.imaging.image import plot_image
 from jeit.touch.contacts import Contact, RasterStages
 
@@ -123,7 +123,7 @@ def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarr
     if axes.size != len(_TITLES):
         raise ValueError(f"axes: give six, one for each stage; there are {axes.size}.")
     is_inside = np.isfinite(stages.region)
-    factor, with_prefix = with_si_prefix(largest_magnitude(stages.region), unit)
+    factor, with_prefix = choose_si_prefix(largest_magnitude(stages.region), unit)
     colour_limit = factor * largest_magnitude(stages.region) or 1.0
     colour_options = {"cmap": "RdBu_r", "vmin": -colour_limit, "vmax": colour_limit}
     region_image = _draw_pixels(axes[0], factor * stages.region, stages, colour_options)

@@ -13,7 +13,7 @@ from jeit.arguments import check_kind
 from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Mesh
 from jeit.plot.axes import axes_or_new, draw_scale_bar, extent_of, hide_axes, soften_axes
-from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SERIES_COLOURS, draw_colour_bar, with_si_prefix
+from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SERIES_COLOURS, choose_si_prefix, draw_colour_bar
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import draw_outline
 from jeit.touch.gestures.touch_watch import NamedTouch
@@ -51,7 +51,7 @@ def plot_changes(
             f"peaks have shape {values.shape} and seconds {times.shape}; give one of each for every frame."
         )
     ax = axes_or_new(ax, (9.0, 2.6))
-    factor, prefixed_unit = with_si_prefix(float(np.nanmax(values, initial=level)), unit)
+    factor, prefixed_unit = choose_si_prefix(float(np.nanmax(values, initial=level)), unit)
     ax.plot(*_reduce_points(*_interrupt_at_gaps(times, factor * values)), color=DARK_GREY, linewidth=0.8)
     ax.axhline(factor * level, color=LIGHT_GREY, linewidth=1, linestyle=(0, (4, 3)))
     ax.text(1, factor * level, " level", color=LIGHT_GREY, fontsize=8, va="center", transform=ax.get_yaxis_transform())

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from jeit.arguments import counted
 from jeit.files import clear_unfinished, written_whole
-from jeit.report.folder import as_plain_values, results, results_folder, version_of, write_json
+from jeit.report.folder import package_version, results, results_folder, to_plain_values, write_json
 from jeit.report.stream import PICTURES, GrowingRows, GrowingTable, Sample, reporting_partial_results
 from jeit.touch.networks import ImageNetwork, LearntImages
 from jeit.touch.networks.depth_maps import FrameDepth
@@ -53,7 +53,7 @@ def report_learnt_images(learnt: LearntImages) -> dict[str, Any]:
         }
         for name, training in learnt.courses.items()
     }
-    return as_plain_values(
+    return to_plain_values(
         {
             "design": network.design,
             "made_for": network.made_for,
@@ -64,7 +64,7 @@ def report_learnt_images(learnt: LearntImages) -> dict[str, Any]:
             "estimated_depth_of_a_ball": learnt.standing.deepest,
             "trainings": trainings,
             "seconds": learnt.seconds,
-            "versions": {package: version_of(package) for package in _PACKAGES},
+            "versions": {package: package_version(package) for package in _PACKAGES},
         }
     )
 
@@ -222,7 +222,7 @@ class _FrameStatistics:
     def report(self, name: str, num_frames: int) -> dict[str, Any]:
         """Report the statistics of the imaged frames as plain numbers, strings, lists and dictionaries."""
         network = self.network
-        return as_plain_values(
+        return to_plain_values(
             {
                 "frames": name,
                 "number": num_frames,
@@ -233,7 +233,7 @@ class _FrameStatistics:
                 "deepest_m": self.deepest_frame.depth,
                 "depth_by_noise_alone_m": network.floor,
                 "units": {"length": "m"},
-                "versions": {package: version_of(package) for package in _PACKAGES},
+                "versions": {package: package_version(package) for package in _PACKAGES},
             }
         )
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jeit.report.folder import as_plain_values, results, version_of, write_json, write_rows
+from jeit.report.folder import package_version, results, to_plain_values, write_json, write_rows
 from jeit.touch import LearntSkin, Standing, Touches, write_skin
 
 SKIN_FILES = ("skin.skops", "report.json", "learning.png")
@@ -45,20 +45,20 @@ def write_touches(touches: Touches, folder: str | Path, *, skin: str, name: str)
         "channels_not_used": dead_channels,
         "notes": list(touches.notes),
         "units": {"length": "m", "force": "N"},
-        "versions": {package: version_of(package) for package in _PACKAGES},
+        "versions": {package: package_version(package) for package in _PACKAGES},
     }
     if touches.label is not None:
         labels, counts = np.unique(touches.label[~touches.unlike], return_counts=True)
         report["labels"] = dict(zip(labels.tolist(), counts.tolist(), strict=True))
     with results(folder, TOUCH_FILES) as result_folder:
         write_rows(result_folder / "touches.csv", list(columns), zip(*columns.values(), strict=True))
-        write_json(as_plain_values(report), result_folder / "report.json")
+        write_json(to_plain_values(report), result_folder / "report.json")
         draw_touches(touches).savefig(result_folder / "touches.png", dpi=150)
 
 
 def report_learnt_skin(skin: LearntSkin) -> dict[str, Any]:
     """Report a learnt skin's errors on held-out presses as plain numbers, strings, lists and dictionaries."""
-    return as_plain_values(
+    return to_plain_values(
         {
             "presses": skin.name,
             "channels": len(skin.channels.used),
@@ -67,7 +67,7 @@ def report_learnt_skin(skin: LearntSkin) -> dict[str, Any]:
             "held_out": {name: _error_statistics(name, standing) for name, standing in skin.standing.items()},
             "notes": skin.notes,
             "units": {"length": "m", "force": "N"},
-            "versions": {package: version_of(package) for package in _PACKAGES},
+            "versions": {package: package_version(package) for package in _PACKAGES},
         }
     )
 

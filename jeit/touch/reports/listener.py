@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jeit.report.folder import as_plain_values, results, version_of, write_json, write_rows
+from jeit.report.folder import package_version, results, to_plain_values, write_json, write_rows
 from jeit.touch.listening import Listener, SoundLabels
 from jeit.touch.listening.feature_images import WINDOW_DURATION, WINDOW_INTERVAL
 
@@ -83,7 +83,7 @@ def report_listener(listener: Listener) -> dict[str, Any]:
             "right_of_each": {name: is_right[standing.right == name].mean() for name in np.unique(standing.right)},
             "tried": [{"method": name, "right": 1 - error} for name, error in standing.tried],
         }
-    return as_plain_values(
+    return to_plain_values(
         {
             "clips": listener.name,
             "classes": list(listener.names),
@@ -93,7 +93,7 @@ def report_listener(listener: Listener) -> dict[str, Any]:
             "loudness_counts": listener.loudness,
             "held_out": held_out,
             "notes": list(listener.notes),
-            "versions": {package: version_of(package) for package in _PACKAGES},
+            "versions": {package: package_version(package) for package in _PACKAGES},
         }
     )
 
@@ -112,7 +112,7 @@ def report_sound_labels(labels: SoundLabels, *, model: str) -> dict[str, Any]:
         }
         for event in labels.events
     ]
-    return as_plain_values(
+    return to_plain_values(
         {
             "recording": labels.name,
             "model": model,
@@ -124,7 +124,7 @@ def report_sound_labels(labels: SoundLabels, *, model: str) -> dict[str, Any]:
             "events": events,
             "notes": list(labels.notes),
             "units": {"length": "m", "time": "s"},
-            "versions": {package: version_of(package) for package in _PACKAGES},
+            "versions": {package: package_version(package) for package in _PACKAGES},
         }
     )
 

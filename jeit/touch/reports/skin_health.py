@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jeit.report.folder import as_plain_values, results, version_of, write_json, write_rows
+from jeit.report.folder import package_version, results, to_plain_values, write_json, write_rows
 from jeit.touch.health import HealthEvent, SkinHealth
 
 HEALTH_FILES = ("events.csv", "report.json", "health.png")
@@ -46,7 +46,7 @@ def write_health(
 def report_health(health: SkinHealth, name: str, timed: bool) -> dict[str, Any]:
     """Report detected damage and repairs as plain numbers, strings, lists and dictionaries; unknown values are None."""
     held_event = health.held
-    return as_plain_values(
+    return to_plain_values(
         {
             "recording": name,
             "frames": health.frames,
@@ -77,7 +77,7 @@ def report_health(health: SkinHealth, name: str, timed: bool) -> dict[str, Any]:
             "patience": health.patience,
             "with_a_model": health.skin is not None,
             "units": {"length": "m", "time": "s" if timed else "frames"},
-            "versions": {package: version_of(package) for package in _PACKAGES},
+            "versions": {package: package_version(package) for package in _PACKAGES},
         }
     )
 

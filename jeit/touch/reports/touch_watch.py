@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.arguments import counted
-from jeit.report.folder import as_plain_values, results, results_folder, version_of, write_json, write_rows
+from jeit.report.folder import package_version, results, results_folder, to_plain_values, write_json, write_rows
 from jeit.report.stream import GrowingTable
 from jeit.touch import LearntGestures, NamedTouch, RecordedContacts, TouchImages, TouchWatch, WatchedFrame
 from jeit.touch.gestures.gesture_model import GESTURE_FILE
@@ -43,7 +43,7 @@ def report_gestures(learnt: LearntGestures, name: str) -> dict[str, Any]:
         "recordings_without_a_touch": list(learnt.without_touch),
         "notes": list(model.notes),
         "units": {"level": "S", "rate": "1/s"},
-        "versions": {package: version_of(package) for package in _LEARNING_PACKAGES},
+        "versions": {package: package_version(package) for package in _LEARNING_PACKAGES},
     }
     if standing is not None:
         is_right = standing.held_out == standing.right
@@ -53,7 +53,7 @@ def report_gestures(learnt: LearntGestures, name: str) -> dict[str, Any]:
             "right_by_gesture": {name: is_right[standing.right == name].mean() for name in model.names},
             "tried": [{"classifier": name, "right": 1 - error} for name, error in standing.tried],
         }
-    return as_plain_values(report)
+    return to_plain_values(report)
 
 
 def draw_gestures(learnt: LearntGestures):
@@ -167,7 +167,7 @@ def report_watch(written_watch: WrittenWatch, watch: TouchWatch, name: str) -> d
         [touch.gesture for touch in written_watch.touches if not touch.unlike], return_counts=True
     )
     latencies = written_watch.latency
-    return as_plain_values(
+    return to_plain_values(
         {
             "stream": name,
             "frames": len(written_watch.seconds),
@@ -190,7 +190,7 @@ def report_watch(written_watch: WrittenWatch, watch: TouchWatch, name: str) -> d
             "background_S": watch.images.background,
             "notes": [*watch.notes, *written_watch.notes, *watch.model.notes, *watch.images.reference.notes],
             "units": {"length": "m", "time": "s", "change": "S"},
-            "versions": {package: version_of(package) for package in _WATCH_PACKAGES},
+            "versions": {package: package_version(package) for package in _WATCH_PACKAGES},
         }
     )
 
@@ -299,7 +299,7 @@ def write_contacts(found: RecordedContacts, images: TouchImages, folder: str | P
 
 
 def _report_contacts(found: RecordedContacts, images: TouchImages, name: str) -> dict[str, Any]:
-    return as_plain_values(
+    return to_plain_values(
         {
             "recording": name,
             "frames": len(found.seconds),
@@ -320,7 +320,7 @@ def _report_contacts(found: RecordedContacts, images: TouchImages, name: str) ->
             ],
             "notes": list(found.notes),
             "units": {"onset": "s", "position": "m", "path_length": "m", "peak": "S", "background": "S"},
-            "versions": {package: version_of(package) for package in _WATCH_PACKAGES[:3]},
+            "versions": {package: package_version(package) for package in _WATCH_PACKAGES[:3]},
         }
     )
 
