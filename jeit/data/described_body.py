@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.electrodes import AbstractElectrodes, BoundaryElectrodes, FaceDiscs, FacePatches, PointElectrodes, SheetDiscs
-from jeit.electrodes.face_patches import check_apart, check_on_surface, check_size
+from jeit.electrodes.face_patches import check_no_coincidence, check_on_surface, check_size
 from jeit.electrodes.facets import plates
 from jeit.files import check_electrodes
 from jeit.layout import perimeter, ring
@@ -88,7 +88,7 @@ def check_on_solid(electrodes: AbstractElectrodes, body: Solid) -> None:
     check_on_surface(
         positions, _MAX_SURFACE_DISTANCE * smaller_sizes, lambda points: _surface_distance(body, points)[0]
     )
-    check_apart(positions, smaller_sizes)
+    check_no_coincidence(positions, smaller_sizes)
     if isinstance(electrodes, FacePatches):
         x_min, x_max, y_min, y_max = body.extent
         side_lengths = x_max - x_min, y_max - y_min

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from jeit.data.measurement import Measurement
 from jeit.electrodes import BoundaryElectrodes
-from jeit.mesh.topology import along
+from jeit.mesh.topology import project_to_loop
 from jeit.protocol import Protocol
 from jeit.protocol.reciprocity import transfer_between_drives
 
@@ -217,7 +217,7 @@ def boundary_order(measurement: Measurement) -> Int[np.ndarray, " L"] | None:
     loops = domain.loops()
     if not loops:
         return None
-    return np.argsort(along(np.asarray(electrodes.position), np.asarray(loops[0])), kind="stable")
+    return np.argsort(project_to_loop(np.asarray(electrodes.position), np.asarray(loops[0])), kind="stable")
 
 
 def reciprocity_noise(measurement: Measurement, deviation: Float[np.ndarray, " M"]) -> float | None:

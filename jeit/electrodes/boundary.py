@@ -16,8 +16,8 @@ from jeit.electrodes.electrodes import (
 )
 from jeit.mesh import Body, Mesh, Refine
 from jeit.mesh.mesh import boundary_loops, facet_measures
-from jeit.mesh.outline.straight_sided import along_loop
-from jeit.mesh.topology import along
+from jeit.mesh.outline.straight_sided import points_on_loop
+from jeit.mesh.topology import project_to_loop
 from jeit_solvers.engines import (
     either_engine,
     has_values,
@@ -79,16 +79,16 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         instead, the error is 57 %.
         """
         edge = body.loops(720)[0]
-        centres, half_width = along(np.asarray(self.position), np.asarray(edge)), np.asarray(self.width) / 2
-        ends = along_loop(edge, np.concatenate([centres - half_width, centres + half_width]))
-        return (Refine(np.asarray(ends), factor=4.0),)
+        centres, half_width = project_to_loop(np.asarray(self.position), np.asarray(edge)), np.asarray(self.width) / 2
+        end_points = points_on_loop(edge, np.concatenate([centres - half_width, centres + half_width]))
+        return (Refine(np.asarray(end_points), factor=4.0),)
 
     def directions(self, mesh: Mesh) -> Float[np.ndarray, "L a 2"]:
         """Unit tangents of the boundary of `mesh` at the electrodes, counter-clockwise."""
         start, end = np.asarray(mesh.points)[np.asarray(mesh.facets)].swapaxes(0, 1)
         positions = np.asarray(self.position)
-        nearest = np.argmin(np.linalg.norm(positions[:, None] - (start + end) / 2, axis=-1), axis=1)
-        tangents = (end - start)[nearest]
+        nearest_edges = np.argmin(np.linalg.norm(positions[:, None] - (start + end) / 2, axis=-1), axis=1)
+        tangents = (end - start)[nearest_edges]
         return (tangents / np.linalg.norm(tangents, axis=1, keepdims=True))[:, None]
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
@@ -117,8 +117,8 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         phi = xp.stack([integral(phi_start), integral(phi_end)])
         phi_phi = xp.stack([integral(phi_start**2), integral(phi_start * phi_end), integral(phi_end**2)])
         admittance = 1 / self.contact_impedance
-        entries = phi_phi @ admittance  # (3, b)
-        mass = xp.stack([entries[:2], entries[1:]]).transpose(2, 0, 1)
+        admittance_entries = phi_phi @ admittance  # (3, b)
+        mass = xp.stack([admittance_entries[:2], admittance_entries[1:]]).transpose(2, 0, 1)
         load = sum_into((mesh.num_points, self.num_electrodes), mesh.facets.T, phi * admittance)
         return Contact((mesh.facets,), (mass,), load)
 
@@ -137,8 +137,8 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
                 "of the mesh; they must lie on it (are both in metres?). For electrodes inside a sheet use SheetDiscs."
             )
         covered = np.clip(end - start, 0, None).sum(axis=0)  # (b, L)
-        rounding = max(1e-9, 1e3 * np.finfo(covered.dtype).eps)
-        too_wide = np.flatnonzero(covered.sum(axis=0) < (1 - rounding) * width)
+        rounding_error = max(1e-9, 1e3 * np.finfo(covered.dtype).eps)
+        too_wide = np.flatnonzero(covered.sum(axis=0) < (1 - rounding_error) * width)
         if too_wide.size:
             raise ValueError(
                 f"width: electrode {too_wide[0] + 1} is {float(self.width[too_wide[0]]):.3g} m wide, more than the "
@@ -146,10 +146,10 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
             )
         pairs = overlapping_pairs(start, end)
         if pairs:
-            first, second = pairs[0]
+            first_electrode, second_electrode = pairs[0]
             raise ValueError(
-                f"Electrodes {first + 1} and {second + 1} overlap; move them apart or make them narrower "
-                "(positions and widths are in metres along the boundary)."
+                f"Electrodes {first_electrode + 1} and {second_electrode + 1} overlap; move them apart or make them "
+                "narrower (positions and widths are in metres along the boundary)."
             )
 
 
@@ -159,12 +159,14 @@ def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int
     start, end = start.transpose(2, 1, 0), end.transpose(2, 1, 0)
     is_covered = (end > start).any(axis=2).astype(float)
     pairs = []
-    for first, second in np.argwhere(np.triu(is_covered @ is_covered.T, 1)).tolist():  # both cover a part of one edge
-        common = np.minimum(end[first][:, :, None], end[second][:, None, :]) - np.maximum(
-            start[first][:, :, None], start[second][:, None, :]
+    for first_electrode, second_electrode in np.argwhere(
+        np.triu(is_covered @ is_covered.T, 1)
+    ).tolist():  # both cover a part of one edge
+        common = np.minimum(end[first_electrode][:, :, None], end[second_electrode][:, None, :]) - np.maximum(
+            start[first_electrode][:, :, None], start[second_electrode][:, None, :]
         )
         if common.max() > max(1e-9, 1e3 * np.finfo(end.dtype).eps) * end.max():
-            pairs.append((first, second))
+            pairs.append((first_electrode, second_electrode))
     return pairs
 
 
@@ -175,13 +177,13 @@ def _arc_points(mesh: Mesh, centre: np.ndarray, width: float) -> np.ndarray:
     edge_vectors = edge_points[:, 1] - edge_points[:, 0]
     squared_lengths = np.sum(edge_vectors**2, axis=1)
     fraction = np.clip(np.sum((centre - edge_points[:, 0]) * edge_vectors, axis=1) / squared_lengths, 0, 1)
-    nearest = np.argmin(np.sum((edge_points[:, 0] + fraction[:, None] * edge_vectors - centre) ** 2, axis=1))
+    nearest_edge = np.argmin(np.sum((edge_points[:, 0] + fraction[:, None] * edge_vectors - centre) ** 2, axis=1))
     # The loop that contains this edge, as vertices with their arc length from the start of the loop.
     loop = np.cumsum(np.concatenate([[0], facets[1:, 0] != facets[:-1, 1]]))
-    edges = np.flatnonzero(loop == loop[nearest])
+    edges = np.flatnonzero(loop == loop[nearest_edge])
     lengths = np.sqrt(squared_lengths[edges])
     arc = np.concatenate([[0], np.cumsum(lengths)])
-    middle_position = arc[nearest - edges[0]] + fraction[nearest] * np.sqrt(squared_lengths[nearest])
+    middle_position = arc[nearest_edge - edges[0]] + fraction[nearest_edge] * np.sqrt(squared_lengths[nearest_edge])
     vertices = np.concatenate([edge_points[edges, 0], edge_points[edges[-1:], 1]])
     vertex_positions = np.concatenate([arc - arc[-1], arc, arc + arc[-1]])
     covered_positions = vertex_positions[
@@ -224,16 +226,18 @@ def _project(position, mesh: Mesh):
     # (offset - t along)·τ(t) = 0 reads constant + linear t + quadratic t² = 0; take the root that is regular as
     # quadratic → 0.
     constant = _dot_products(offset, start_tangent)
-    linear = _dot_products(offset, end_tangent - start_tangent) - _dot_products(edge_vectors, start_tangent)
+    linear_coefficient = _dot_products(offset, end_tangent - start_tangent) - _dot_products(edge_vectors, start_tangent)
     quadratic = -_dot_products(edge_vectors, end_tangent - start_tangent)
-    fraction = 2 * constant / (xp.sqrt(xp.maximum(linear**2 - 4 * quadratic * constant, 0)) - linear)
+    fraction = (
+        2 * constant / (xp.sqrt(xp.maximum(linear_coefficient**2 - 4 * quadratic * constant, 0)) - linear_coefficient)
+    )
     return facet, fraction * length, xp.sqrt(squared_distances.min(axis=1))
 
 
-def _dot_products(first, second):
+def _dot_products(first_vectors, second_vectors):
     """Dot products of plane vectors, as an explicit sum, because XLA converts a sum over such a short axis into a slow
     matrix product."""
-    return first[..., 0] * second[..., 0] + first[..., 1] * second[..., 1]
+    return first_vectors[..., 0] * second_vectors[..., 0] + first_vectors[..., 1] * second_vectors[..., 1]
 
 
 def _normalised(vectors):
@@ -256,7 +260,10 @@ def _covered_intervals(position, width, mesh: Mesh):
     perimeter = xp.sum(xp.where(is_same_loop, length[:, None], 0), axis=0)
     centre = arc_start[facet] + arc_offset
     turn_offsets = np.array([-1.0, 0.0, 1.0], length.dtype)[:, None] * perimeter
-    middle = (centre + turn_offsets)[:, None, :] - arc_start[:, None]
-    half_width, limit = 0.5 * width, length[:, None]
-    start, end = xp.clip(middle - half_width, 0, limit), xp.clip(middle + half_width, 0, limit)
+    electrode_centres = (centre + turn_offsets)[:, None, :] - arc_start[:, None]
+    half_width, edge_lengths = 0.5 * width, length[:, None]
+    start, end = (
+        xp.clip(electrode_centres - half_width, 0, edge_lengths),
+        xp.clip(electrode_centres + half_width, 0, edge_lengths),
+    )
     return xp.where(is_same_loop, start, 0), xp.where(is_same_loop, end, 0)

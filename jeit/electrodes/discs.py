@@ -49,15 +49,15 @@ def smooth_step(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     return t**3 * (10 - 15 * t + 6 * t**2)
 
 
-def nearest_electrodes(middles, position, radius) -> Int[Array, "q k"]:
-    """Indices (q, k) of the electrodes that may reach each of the triangles with centroids `middles` (q, d); k is 8, or
+def nearest_electrodes(centres, position, radius) -> Int[Array, "q k"]:
+    """Indices (q, k) of the electrodes that may reach each of the triangles with centroids `centres` (q, d); k is 8, or
     the number of electrodes if smaller.
 
     At most 8 non-overlapping round electrodes, with `position` (L, d) and `radius` (L,), reach a triangle, unless the
     triangle is so much larger than the electrodes that `check` rejects the mesh. The indices have no derivatives.
     """
-    xp = namespace(middles, position, radius)
-    distance = xp.sum((middles[:, None] - position) ** 2, axis=-1) - radius**2
+    xp = namespace(centres, position, radius)
+    distance = xp.sum((centres[:, None] - position) ** 2, axis=-1) - radius**2
     distance = undifferentiated(distance).astype(np.float32)  # the order of distant ones does not matter
     number = min(_MAX_DISCS_PER_TRIANGLE, len(radius))
     if xp is np:
@@ -322,24 +322,24 @@ def check_discs(electrodes: AbstractDiscs, mesh: Mesh, area) -> None:
     gaps = np.linalg.norm(position[:, None] - position, axis=-1) - radius[:, None] - radius
     np.fill_diagonal(gaps, np.inf)
     if gaps.min() < 0:
-        first, second = np.unravel_index(gaps.argmin(), gaps.shape)
-        raise ValueError(f"Electrodes {first + 1} and {second + 1} overlap by {-gaps.min():.3g} m; move them apart.")
+        i, j = np.unravel_index(gaps.argmin(), gaps.shape)
+        raise ValueError(f"Electrodes {i + 1} and {j + 1} overlap by {-gaps.min():.3g} m; move them apart.")
     covered_areas = electrodes.contact(mesh).load.sum(axis=0) * electrodes.contact_impedance
     for electrode in range(len(radius)):
-        share = covered_areas[electrode] / (np.pi * radius[electrode] ** 2)
+        covered_fraction = covered_areas[electrode] / (np.pi * radius[electrode] ** 2)
         label = f"electrode {electrode + 1} at {position[electrode].tolist()} m with radius {radius[electrode]:.3g} m"
-        if share < 0.01:
+        if covered_fraction < 0.01:
             raise ValueError(
                 f"position: {label} touches nothing; it lies off the mesh, which spans "
                 f"{np.asarray(mesh.points).min(axis=0).tolist()} to {np.asarray(mesh.points).max(axis=0).tolist()} m, "
                 "or is far smaller than a cell."
             )
-        if share < 0.8:
+        if covered_fraction < 0.8:
             raise ValueError(
-                f"position: only {100 * share:.0f} % of {label} lies on the mesh; move it inside, or refine "
+                f"position: only {100 * covered_fraction:.0f} % of {label} lies on the mesh; move it inside, or refine "
                 "the mesh there if the disc is smaller than a cell."
             )
-        if share > 1.2:
+        if covered_fraction > 1.2:
             raise ValueError(f"radius: {label} is too small for the mesh there; refine the mesh around it.")
 
 
@@ -402,8 +402,8 @@ class SurfaceDiscs(AbstractDiscs):
         chart = unfold(mesh, self.position, self.radius[:, None] + edge_width + longest_side)
         normal = xp.asarray(undifferentiated(normals(mesh)))
         centre = xp.argmin(undifferentiated(((self.position[:, None] - cell_centres) ** 2).sum(axis=-1)), axis=1)
-        is_exact, facing = chart.exact[nearest], xp.take_along_axis(normal @ normal[centre].T, nearest, axis=1) > 0
-        is_covered = xp.where(is_exact, xp.take_along_axis(chart.reached.T, nearest, axis=1), facing)
+        is_exact, is_facing = chart.exact[nearest], xp.take_along_axis(normal @ normal[centre].T, nearest, axis=1) > 0
+        is_covered = xp.where(is_exact, xp.take_along_axis(chart.reached.T, nearest, axis=1), is_facing)
         squared_distance = xp.where(
             is_exact[..., None], chart.squared(barycentric, nearest), squared_distances(points, self.position[nearest])
         )
@@ -428,23 +428,23 @@ def check_on_surface(position, radius, surface: Triangles) -> None:
     """Raise `ValueError` for discs at `position` (L, 3) with `radius` (L,), metres, that are farther from the surface
     than their radius, extend over its border, or are as large as the surface's radius of curvature."""
     position, radius = np.asarray(position), np.asarray(radius)
-    nearest = surface.nearest(position)
-    margins = surface.distance_to_border(nearest.points)
-    middles, normal = surface.corners.mean(axis=1), surface.normals
+    nearest_points = surface.nearest(position)
+    margins = surface.distance_to_border(nearest_points.points)
+    triangle_centres, normal = surface.corners.mean(axis=1), surface.normals
     for number, (centre, disc_radius) in enumerate(zip(position, radius, strict=True)):
         x, y, z = 1e3 * centre
         label = f"electrode {number + 1}, {2e3 * disc_radius:.3g} mm across at ({x:.4g}, {y:.4g}, {z:.4g}) mm,"
-        if nearest.away[number] > disc_radius:
+        if nearest_points.away[number] > disc_radius:
             raise ValueError(
-                f"position: {label} is {1e3 * nearest.away[number]:.3g} mm off the surface, farther than its "
+                f"position: {label} is {1e3 * nearest_points.away[number]:.3g} mm off the surface, farther than its "
                 "radius; move it onto the surface. Are both in metres?"
             )
         if margins[number] < 0.9 * disc_radius:
             raise ValueError(
                 f"position: {label} lies on the surface's edge, {1e3 * margins[number]:.3g} mm from it; move it inside."
             )
-        is_inside = np.linalg.norm(middles - nearest.points[number], axis=1) < disc_radius
-        normal_cosines = normal[is_inside] @ normal[nearest.triangle[number]]
+        is_inside = np.linalg.norm(triangle_centres - nearest_points.points[number], axis=1) < disc_radius
+        normal_cosines = normal[is_inside] @ normal[nearest_points.triangle[number]]
         if (np.abs(normal_cosines) < _MIN_NORMAL_COSINE).any():
             raise ValueError(
                 f"radius: {label} is larger than the surface's radius of curvature there; a disc so large is "

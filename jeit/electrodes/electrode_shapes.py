@@ -58,9 +58,12 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
         """Copy of the electrodes with new contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError` for values
         that are not positive."""
         values = as_electrode_values("contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m²")
-        pieces = jnp.split(values, np.cumsum([part.num_electrodes for part in self.parts])[:-1])
+        part_values = jnp.split(values, np.cumsum([part.num_electrodes for part in self.parts])[:-1])
         return CombinedElectrodes(
-            *(part.with_contact_impedance(piece) for part, piece in zip(self.parts, pieces, strict=True))
+            *(
+                part.with_contact_impedance(values_of_part)
+                for part, values_of_part in zip(self.parts, part_values, strict=True)
+            )
         )
 
     def geometry(self) -> dict[str, Any]:
@@ -156,11 +159,13 @@ def shapes_of(mesh: Mesh, electrodes: AbstractElectrodes) -> ElectrodeShapes:
     ```
     """
     polygons: list[np.ndarray] = []
-    owner: list[int] = []
+    electrode_indices: list[int] = []
     for number, electrode_polygons in enumerate(_all_polygons(mesh, electrodes)):
         polygons += electrode_polygons
-        owner += [number] * len(electrode_polygons)
-    return ElectrodeShapes(np.concatenate(polygons), np.array([len(polygon) for polygon in polygons]), np.array(owner))
+        electrode_indices += [number] * len(electrode_polygons)
+    return ElectrodeShapes(
+        np.concatenate(polygons), np.array([len(polygon) for polygon in polygons]), np.array(electrode_indices)
+    )
 
 
 def _all_polygons(mesh: Mesh, electrodes: AbstractElectrodes) -> list[list[np.ndarray]]:
@@ -191,9 +196,12 @@ def _all_polygons(mesh: Mesh, electrodes: AbstractElectrodes) -> list[list[np.nd
         flat_shapes = [size * np.stack([np.cos(angle), np.sin(angle)], axis=1) for size in sizes]
     elif "width" in geometry and "height" in geometry:
         side = np.arange(_SIDE_CORNERS) / _SIDE_CORNERS * 2 - 1
-        ones = np.ones(_SIDE_CORNERS)
+        ones_array = np.ones(_SIDE_CORNERS)
         unit_square = np.concatenate(
-            [np.stack(pair, axis=1) for pair in ((side, -ones), (ones, side), (-side, ones), (-ones, -side))]
+            [
+                np.stack(pair, axis=1)
+                for pair in ((side, -ones_array), (ones_array, side), (-side, ones_array), (-ones_array, -side))
+            ]
         )
         sizes = np.broadcast_to(geometry["width"], len(positions)), np.broadcast_to(geometry["height"], len(positions))
         flat_shapes = [unit_square * [width / 2, height / 2] for width, height in zip(*sizes, strict=True)]
@@ -219,22 +227,24 @@ class ProjectionSurface:
         self._normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
         self._tree = KDTree(self._corners.mean(axis=1))
 
-    def normals(self, places: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 3"]:
+    def normals(self, positions: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 3"]:
         """Outward normals of the triangle nearest to each point."""
-        return self._normal[self._tree.query(places)[1]]
+        return self._normal[self._tree.query(positions)[1]]
 
-    def frames(self, places: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 3 3"]:
+    def frames(self, positions: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 3 3"]:
         """Unit vectors at each point: outward, horizontal and upward, as in `FacePatches`."""
-        normal = self.normals(places)
+        normal = self.normals(positions)
         upward = np.where(np.abs(normal[:, 2:]) > 0.9, [0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
         tangent = np.cross(upward, normal)
         tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
         return np.stack([normal, tangent, np.cross(normal, tangent)], axis=1)
 
-    def project(self, places: Float[np.ndarray, "k 3"], normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "k 3"]:
+    def project(self, positions: Float[np.ndarray, "k 3"], normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "k 3"]:
         """Project points along the normal onto the nearest triangle in that direction; points that meet no triangle are
         returned unchanged."""
-        candidates = self._tree.query(places, k=min(_NUM_CANDIDATES, len(self._corners)))[1].reshape(len(places), -1)
+        candidates = self._tree.query(positions, k=min(_NUM_CANDIDATES, len(self._corners)))[1].reshape(
+            len(positions), -1
+        )
         corners = self._corners[candidates]
         first_edge, second_edge = corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]
         # Möller and Trumbore: place + depth normal = corner + first_coordinate first_edge + second_coordinate
@@ -245,7 +255,7 @@ class ProjectionSurface:
             second_edge, axis=-1
         )
         volume = np.where(is_parallel, 1.0, volume)
-        offset = places[:, None] - corners[:, :, 0]
+        offset = positions[:, None] - corners[:, :, 0]
         first_coordinate = np.sum(offset * edge_normal, axis=-1) / volume
         offset_normal = np.cross(offset, first_edge)
         second_coordinate = offset_normal @ normal / volume
@@ -257,9 +267,9 @@ class ProjectionSurface:
             & (first_coordinate + second_coordinate < 1 + 1e-6)
         )
         distances = np.where(is_hit, np.abs(depth), np.inf)
-        nearest, row = distances.argmin(axis=1), np.arange(len(places))
-        shift = np.where(np.isfinite(distances[row, nearest]), depth[row, nearest], 0.0)
-        return places + shift[:, None] * normal
+        nearest_triangles, row = distances.argmin(axis=1), np.arange(len(positions))
+        shift = np.where(np.isfinite(distances[row, nearest_triangles]), depth[row, nearest_triangles], 0.0)
+        return positions + shift[:, None] * normal
 
 
 class _PlanePen:

@@ -187,10 +187,10 @@ def as_electrode_values(name: str, values, num_electrodes: int, *, unit: str) ->
         return jnp.broadcast_to(values, (num_electrodes,))
     is_invalid = ~(np.isfinite(values) & (np.asarray(values) > 0))
     if is_invalid.any():
-        first = int(np.flatnonzero(np.atleast_1d(is_invalid))[0])
+        first_index = int(np.flatnonzero(np.atleast_1d(is_invalid))[0])
         raise ValueError(
-            f"{name} must be positive and finite, in {unit}; electrode {first + 1} has "
-            f"{float(np.atleast_1d(values)[first])}."
+            f"{name} must be positive and finite, in {unit}; electrode {first_index + 1} has "
+            f"{float(np.atleast_1d(values)[first_index])}."
         )
     return as_array(np.broadcast_to(values, (num_electrodes,)))
 

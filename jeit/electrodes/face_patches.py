@@ -115,10 +115,10 @@ def _rim_points(outline, centre, half_size, is_horizontal: bool) -> Float[np.nda
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         # For a rectangle, the points where rays from its centre meet its sides.
         return centre[:2] + circle * half_size / np.abs(circle).max(axis=1, keepdims=True)
-    nearest = np.asarray(outline.nearest(centre[None, :2]))[0]
+    nearest_point = np.asarray(outline.nearest(centre[None, :2]))[0]
     step = 1e-3 * half_size[0]
-    moved_points = np.asarray(outline.nearest(nearest + step * np.eye(2)))
-    tangent = (moved_points - nearest)[np.argmax(np.linalg.norm(moved_points - nearest, axis=1))]
+    moved_points = np.asarray(outline.nearest(nearest_point + step * np.eye(2)))
+    tangent = (moved_points - nearest_point)[np.argmax(np.linalg.norm(moved_points - nearest_point, axis=1))]
     tangent = tangent / np.linalg.norm(tangent)
     return np.asarray(
         outline.nearest(np.stack([centre[:2] - half_size[0] * tangent, centre[:2] + half_size[0] * tangent]))
@@ -132,38 +132,41 @@ Distance = Callable[[Float[np.ndarray, "L 3"]], Float[np.ndarray, " L"]]
 
 
 def check_on_surface(
-    position: Float[np.ndarray, "L 3"], allowed: Float[np.ndarray, " L"], distance_from_surface: Distance
+    position: Float[np.ndarray, "L 3"], max_distances: Float[np.ndarray, " L"], distance_from_surface: Distance
 ) -> None:
-    """Raise `ValueError` for the first electrode whose distance from the surface of the body exceeds `allowed` metres.
-    `distance_from_surface`: function that returns the distances (L,) of positions (L, 3), metres."""
+    """Raise `ValueError` for the first electrode whose distance from the surface of the body exceeds `max_distances`
+    metres. `distance_from_surface`: function that returns the distances (L,) of positions (L, 3), metres."""
     distances = distance_from_surface(position)
-    for number in np.flatnonzero(distances > allowed)[:1]:
-        hint = "give a place on it."
-        if _all_on_surface(position / 1000, allowed, distance_from_surface):
-            hint = IN_MILLIMETRES
-        elif _all_on_surface(position * 1000, 1000 * allowed, distance_from_surface):
-            hint = "is the mesh in millimetres? Read it with scale = 1e-3."
+    for number in np.flatnonzero(distances > max_distances)[:1]:
+        remedy = "give a place on it."
+        if _all_on_surface(position / 1000, max_distances, distance_from_surface):
+            remedy = IN_MILLIMETRES
+        elif _all_on_surface(position * 1000, 1000 * max_distances, distance_from_surface):
+            remedy = "is the mesh in millimetres? Read it with scale = 1e-3."
         raise ValueError(
             f"position: electrode {number + 1} at {np.round(position[number], 6).tolist()} m lies "
-            f"{_length_text(float(distances[number]))} off the body's surface; {hint}"
+            f"{_length_text(float(distances[number]))} off the body's surface; {remedy}"
         )
 
 
-def _all_on_surface(position, allowed, distance_from_surface: Distance) -> bool:
+def _all_on_surface(position, max_distances, distance_from_surface: Distance) -> bool:
     """Whether all positions lie on the surface and are not all nearly the same. Positions that nearly coincide may lie
     on the surface by chance."""
-    return bool((np.ptp(position, axis=0).max() > allowed).all() and (distance_from_surface(position) <= allowed).all())
+    return bool(
+        (np.ptp(position, axis=0).max() > max_distances).all()
+        and (distance_from_surface(position) <= max_distances).all()
+    )
 
 
-def check_apart(position: Float[np.ndarray, "L 3"], size: Float[np.ndarray, " L"]) -> None:
+def check_no_coincidence(position: Float[np.ndarray, "L 3"], size: Float[np.ndarray, " L"]) -> None:
     """Raise `ValueError` for the first two electrodes at the same position. `size`: smaller dimension of each
     electrode, metres."""
     distances = np.linalg.norm(position[:, None] - position, axis=-1)
     coincident = np.argwhere(np.triu(distances < _MIN_SEPARATION * np.minimum(size[:, None], size), 1))
-    for first, second in coincident[:1]:
+    for first_electrode, second_electrode in coincident[:1]:
         raise ValueError(
-            f"position: electrodes {first + 1} and {second + 1} are at the same place, "
-            f"{np.round(position[first], 6).tolist()} m; give each its own."
+            f"position: electrodes {first_electrode + 1} and {second_electrode + 1} are at the same place, "
+            f"{np.round(position[first_electrode], 6).tolist()} m; give each its own."
         )
 
 
@@ -172,10 +175,10 @@ def check_size(name: str, sizes: Float[np.ndarray, " L"], max_size: float, objec
     the object that the electrode lies on; `object_name` names this object."""
     for number in np.flatnonzero(sizes > (1 + _MIN_SEPARATION) * max_size)[:1]:
         size = float(sizes[number])
-        hint = IN_MILLIMETRES if 10 * max_size < size <= 1000 * max_size else "give the size of what lies on it."
+        unit_hint = IN_MILLIMETRES if 10 * max_size < size <= 1000 * max_size else "give the size of what lies on it."
         raise ValueError(
             f"{name}: electrode {number + 1}'s is {_length_text(size)}, larger than {object_name}, "
-            f"{_length_text(max_size)}; {hint}"
+            f"{_length_text(max_size)}; {unit_hint}"
         )
 
 
@@ -272,21 +275,21 @@ class FacePatches(AbstractMovableElectrodes):
         area, half_size = facet_measures(mesh), xp.stack([self.width, self.height], axis=-1) / 2
         normal, tangent, upward = tangent_frames(mesh, self.position)
         corners = mesh.points[mesh.facets]
-        nearest, is_reached = _reaching_patches(mesh, self.position, half_size, (normal, tangent, upward))
+        nearest_indices, is_reached = _reaching_patches(mesh, self.position, half_size, (normal, tangent, upward))
         reached_facets = is_reached.any(axis=1).nonzero()[0] if xp is np else np.arange(len(area))
-        nearest, is_reached = nearest[reached_facets], is_reached[reached_facets]
-        offset = corners[reached_facets][:, None] - self.position[nearest][:, :, None]  # (q, k, 3, 3)
+        nearest_indices, is_reached = nearest_indices[reached_facets], is_reached[reached_facets]
+        offset = corners[reached_facets][:, None] - self.position[nearest_indices][:, :, None]  # (q, k, 3, 3)
         corner_coordinates = xp.stack(
-            [(offset * axis[nearest][:, :, None]).sum(axis=-1) for axis in (tangent, upward)], axis=-1
+            [(offset * axis[nearest_indices][:, :, None]).sum(axis=-1) for axis in (tangent, upward)], axis=-1
         )
         # A triangle perpendicular to the patch has no projected area; replace it to avoid a division by zero.
         corner_coordinates = xp.where(is_reached[..., None, None], corner_coordinates, _UNIT_TRIANGLE)
-        covered_area, covered_mass = covered_moments(corner_coordinates, half_size[nearest])
-        current = xp.where(is_reached, area[reached_facets][:, None] / self.contact_impedance[nearest], 0)
+        covered_area, covered_mass = covered_moments(corner_coordinates, half_size[nearest_indices])
+        current = xp.where(is_reached, area[reached_facets][:, None] / self.contact_impedance[nearest_indices], 0)
         mass = (current[..., None, None] * covered_mass).sum(axis=1)
         nodes = mesh.facets[reached_facets]
         shape = mesh.num_points, self.num_electrodes
-        load = sum_into(shape, (nodes[:, None], nearest[..., None]), current[..., None] * covered_area)
+        load = sum_into(shape, (nodes[:, None], nearest_indices[..., None]), current[..., None] * covered_area)
         if xp is np:
             all_masses: Any = np.zeros((len(area), 3, 3), mass.dtype)
             all_masses[reached_facets] = mass
@@ -300,23 +303,23 @@ class FacePatches(AbstractMovableElectrodes):
         if not has_values(self, mesh):
             return
         electrodes, mesh = on_host((self, mesh))
-        check_apart(electrodes.position, np.minimum(electrodes.width, electrodes.height))
+        check_no_coincidence(electrodes.position, np.minimum(electrodes.width, electrodes.height))
         covered_areas = electrodes.contact(mesh).load * electrodes.contact_impedance
-        share = covered_areas.sum(axis=0) / (electrodes.width * electrodes.height)
+        covered_fractions = covered_areas.sum(axis=0) / (electrodes.width * electrodes.height)
         # A patch on a curved wall is longer than its chord: by a tenth at 80° of arc.
-        misplaced = np.flatnonzero((share < 0.8) | (share > 1.25))
-        if misplaced.size:
+        misplaced_electrodes = np.flatnonzero((covered_fractions < 0.8) | (covered_fractions > 1.25))
+        if misplaced_electrodes.size:
             check_placed(electrodes, mesh)
             raise ValueError(
-                f"position: {100 * share[misplaced[0]]:.0f} % of electrode {misplaced[0] + 1}'s area is found on the "
-                "mesh's surface; move it onto the surface, or refine the mesh there if the patch is smaller than a "
-                "facet."
+                f"position: {100 * covered_fractions[misplaced_electrodes[0]]:.0f} % of electrode "
+                f"{misplaced_electrodes[0] + 1}'s area is found on the mesh's surface; move it onto the surface, or "
+                "refine the mesh there if the patch is smaller than a facet."
             )
         overlap = (covered_areas.T @ covered_areas) / np.sqrt(np.outer(*(2 * [(covered_areas**2).sum(axis=0)])))
         np.fill_diagonal(overlap, 0)
         if overlap.max() > 0.2:
-            first, second = np.unravel_index(overlap.argmax(), overlap.shape)
-            raise ValueError(f"Electrodes {first + 1} and {second + 1} overlap; move them apart.")
+            first_electrode, second_electrode = np.unravel_index(overlap.argmax(), overlap.shape)
+            raise ValueError(f"Electrodes {first_electrode + 1} and {second_electrode + 1} overlap; move them apart.")
 
 
 def _reaching_patches(mesh: Mesh, position, half_size, frames):
@@ -331,14 +334,14 @@ def _reaching_patches(mesh: Mesh, position, half_size, frames):
     centres = corners.mean(axis=1)
     radius = xp.sqrt(((corners - centres[:, None]) ** 2).sum(axis=-1).max(axis=1))
     offsets = [centres @ axis.T - (position * axis).sum(axis=1) for axis in frames]
-    excess = [xp.maximum(abs(offsets[1 + i]) - half_size[:, i], 0) for i in range(2)]
+    excess_distances = [xp.maximum(abs(offsets[1 + i]) - half_size[:, i], 0) for i in range(2)]
     is_facing = (facet_normals(mesh) @ frames[0].T > 0.5) & (abs(offsets[0]) < half_size.max(axis=1))
-    distance = undifferentiated(xp.where(is_facing, excess[0] ** 2 + excess[1] ** 2, xp.inf))
+    distance = undifferentiated(xp.where(is_facing, excess_distances[0] ** 2 + excess_distances[1] ** 2, xp.inf))
     is_reached = distance <= undifferentiated(radius**2)[:, None]
     count = min(_MAX_PATCHES_PER_TRIANGLE, len(position))
     if xp is np:
         count = max(1, min(count, int(is_reached.sum(axis=1).max(initial=0))))
-        nearest = np.argsort(distance, axis=1, kind="stable")[:, :count]
+        nearest_indices = np.argsort(distance, axis=1, kind="stable")[:, :count]
     else:
-        nearest = jax.lax.top_k(-distance, count)[1]
-    return nearest, xp.take_along_axis(is_reached, nearest, axis=1)
+        nearest_indices = jax.lax.top_k(-distance, count)[1]
+    return nearest_indices, xp.take_along_axis(is_reached, nearest_indices, axis=1)

@@ -46,12 +46,12 @@ def covered_moments(
     """
     if namespace(corners, half_size) is not np:
         return _clipped_moments(corners, half_size)
-    limit = np.broadcast_to(half_size, (*corners.shape[:-2], 2))[..., None, :]
-    is_inside = (abs(corners) <= limit).all(axis=(-1, -2))
-    is_beyond_a_side = ((corners >= limit).all(axis=-2) | (corners <= -limit).all(axis=-2)).any(axis=-1)
+    limits = np.broadcast_to(half_size, (*corners.shape[:-2], 2))[..., None, :]
+    is_inside = (abs(corners) <= limits).all(axis=(-1, -2))
+    is_beyond_a_side = ((corners >= limits).all(axis=-2) | (corners <= -limits).all(axis=-2)).any(axis=-1)
     mass: Any = np.where(is_inside[..., None, None], (1 + np.eye(3)) / 12, 0).astype(corners.dtype)
     is_cut = ~(is_inside | is_beyond_a_side)
-    mass[is_cut] = _clipped_moments(corners[is_cut], limit[is_cut][..., 0, :])[1]
+    mass[is_cut] = _clipped_moments(corners[is_cut], limits[is_cut][..., 0, :])[1]
     return mass.sum(axis=-1), mass
 
 
@@ -62,11 +62,11 @@ def _clipped_moments(corners, half_size):
     for axis in range(2):
         outline = _clip_to_band(outline, axis, half_size[..., axis])
     # Barycentric coordinates of the second and third corner, in which the triangle is (0, 0), (1, 0), (0, 1).
-    first, second = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
+    first_sides, second_sides = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
     offset = outline - corners[..., :1, :]
-    double_area = _cross_product(first, second)[..., None]
+    double_area = _cross_product(first_sides, second_sides)[..., None]
     coordinates = xp.stack(
-        [_cross_product(offset, second[..., None, :]), _cross_product(first[..., None, :], offset)], axis=-1
+        [_cross_product(offset, second_sides[..., None, :]), _cross_product(first_sides[..., None, :], offset)], axis=-1
     )
     coordinates = coordinates / double_area[..., None]
     next_coordinates = xp.roll(coordinates, -1, axis=-2)
@@ -95,10 +95,12 @@ def _clip_to_band(outline: Float[Array, "*q k 2"], axis: int, half_width: Float[
     becomes three."""
     xp = namespace(outline, half_width)
     step = xp.roll(outline, -1, axis=-2) - outline
-    step_along, half_width = step[..., axis], half_width[..., None]
-    slope = xp.where(step_along == 0, 1, step_along)
-    crossings = [xp.clip((side * half_width - outline[..., axis]) / slope, 0, 1) for side in (-1, 1)]
-    fractions = xp.stack([xp.zeros_like(step_along), xp.minimum(*crossings), xp.maximum(*crossings)], axis=-1)
+    axis_steps, half_width = step[..., axis], half_width[..., None]
+    slope = xp.where(axis_steps == 0, 1, axis_steps)
+    crossing_fractions = [xp.clip((side * half_width - outline[..., axis]) / slope, 0, 1) for side in (-1, 1)]
+    fractions = xp.stack(
+        [xp.zeros_like(axis_steps), xp.minimum(*crossing_fractions), xp.maximum(*crossing_fractions)], axis=-1
+    )
     corners = outline[..., None, :] + fractions[..., None] * step[..., None, :]
     corners = corners.reshape(*corners.shape[:-3], 3 * corners.shape[-3], 2)  # also if there are no triangles
     clipped = xp.clip(corners[..., axis], -half_width, half_width)
@@ -106,8 +108,8 @@ def _clip_to_band(outline: Float[Array, "*q k 2"], axis: int, half_width: Float[
     return xp.stack([clipped, other_coordinate] if axis == 0 else [other_coordinate, clipped], axis=-1)
 
 
-def _cross_product(first: Float[Array, "*q 2"], second: Float[Array, "*q 2"]) -> Float[Array, "*q"]:
-    return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+def _cross_product(first_vectors: Float[Array, "*q 2"], second_vectors: Float[Array, "*q 2"]) -> Float[Array, "*q"]:
+    return first_vectors[..., 0] * second_vectors[..., 1] - first_vectors[..., 1] * second_vectors[..., 0]
 
 
 class FacetElectrodes(AbstractCompleteElectrodes):
@@ -147,8 +149,10 @@ class FacetElectrodes(AbstractCompleteElectrodes):
             covers[indices, electrode] = 1
         shared = np.flatnonzero(covers.sum(axis=1) > 1)
         if shared.size:
-            first, second = np.flatnonzero(covers[shared[0]])[:2] + 1
-            raise ValueError(f"Electrodes {first} and {second} overlap: both cover boundary facet {shared[0]}.")
+            first_electrode, second_electrode = np.flatnonzero(covers[shared[0]])[:2] + 1
+            raise ValueError(
+                f"Electrodes {first_electrode} and {second_electrode} overlap: both cover boundary facet {shared[0]}."
+            )
         self.covers = jnp.asarray(covers)
         self.contact_impedance = as_electrode_values(
             "contact_impedance", contact_impedance, len(facets), unit="ohm·m² (ohm·m in 2-D)"
@@ -165,13 +169,13 @@ class FacetElectrodes(AbstractCompleteElectrodes):
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Draw the facets of a plane mesh; for a solid, a dot in the middle of each electrode."""
-        ends, covers = np.asarray(mesh.points)[np.asarray(mesh.facets)], np.asarray(self.covers)
-        middles = covers.T @ ends.mean(axis=1) / covers.sum(axis=0)[:, None]
-        for covered, middle in zip(covers.T, middles, strict=True):
+        end_points, covers = np.asarray(mesh.points)[np.asarray(mesh.facets)], np.asarray(self.covers)
+        centres = covers.T @ end_points.mean(axis=1) / covers.sum(axis=0)[:, None]
+        for covered, centre in zip(covers.T, centres, strict=True):
             if mesh.dimension == 2:
-                pen.lines(list(ends[covered > 0]), middle)
+                pen.lines(list(end_points[covered > 0]), centre)
             else:
-                pen.dot(middle)
+                pen.dot(centre)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
         """Empty, because the electrodes belong to an existing mesh."""

@@ -57,8 +57,8 @@ class PointElectrodes(AbstractPointElectrodes):
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Draw each electrode as a dot."""
-        for place in np.asarray(self.position):
-            pen.dot(place)
+        for position in np.asarray(self.position):
+            pen.dot(position)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
         """Halve the cell size at the positions, seen from above."""
@@ -67,9 +67,9 @@ class PointElectrodes(AbstractPointElectrodes):
     @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
         """Values of the n basis functions at the L electrodes as `load` (n, L) of the contact, with zero mass."""
-        cell, weights, _ = _locate(self.position, mesh)
-        index = mesh.cells[cell], np.arange(self.num_electrodes)[:, None]
-        load = sum_into((mesh.num_points, self.num_electrodes), index, weights)
+        cell, weights, _ = _find_containing_cells(self.position, mesh)
+        node_indices = mesh.cells[cell], np.arange(self.num_electrodes)[:, None]
+        load = sum_into((mesh.num_points, self.num_electrodes), node_indices, weights)
         return _point_contact(self.contact_nodes(mesh), load)
 
     def check(self, mesh: Mesh) -> None:
@@ -81,9 +81,9 @@ class PointElectrodes(AbstractPointElectrodes):
         if not has_values(self.position, mesh.points, mesh.cells):
             return
         position, points = np.asarray(self.position), np.asarray(mesh.points)
-        outside = np.asarray(_locate(self.position, mesh)[2])
+        distances_outside = np.asarray(_find_containing_cells(self.position, mesh)[2])
         # A point on a curved boundary lies slightly outside the polygon: allow a third of a cell.
-        far = np.flatnonzero(outside < -1 / 3)
+        far = np.flatnonzero(distances_outside < -1 / 3)
         if far.size and mesh.is_surface:
             raise ValueError(
                 f"position: electrode {far[0] + 1} at {position[far[0]].tolist()} m lies off the surface, by more than "
@@ -97,8 +97,8 @@ class PointElectrodes(AbstractPointElectrodes):
             )
         gap = np.linalg.norm(position[:, None] - position, axis=-1) + np.eye(len(position)) * 1e300
         if gap.min() < 1e-9 * np.ptp(points, axis=0).max():
-            first, second = np.unravel_index(gap.argmin(), gap.shape)
-            raise ValueError(f"Electrodes {first + 1} and {second + 1} are at the same position.")
+            first_electrode, second_electrode = np.unravel_index(gap.argmin(), gap.shape)
+            raise ValueError(f"Electrodes {first_electrode + 1} and {second_electrode + 1} are at the same position.")
 
 
 class NodeElectrodes(AbstractPointElectrodes):
@@ -136,8 +136,8 @@ class NodeElectrodes(AbstractPointElectrodes):
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Draw each electrode as a dot."""
-        for place in np.asarray(mesh.points)[np.asarray(self.nodes)]:
-            pen.dot(place)
+        for position in np.asarray(mesh.points)[np.asarray(self.nodes)]:
+            pen.dot(position)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
         """Empty, because the electrodes belong to an existing mesh."""
@@ -164,21 +164,23 @@ def _point_contact(nodes, load) -> Contact:
 
 
 @either_engine
-def _locate(position, mesh: Mesh):
+def _find_containing_cells(position, mesh: Mesh):
     """Cell that contains each position, barycentric coordinates in the cell, and the smallest of the coordinates, which
     is negative for a position outside the mesh."""
     xp = namespace(position, mesh)
     corners = mesh.points[mesh.cells]  # (m, d + 1, d)
     # Basis functions are linear, so their values at a position follow from their gradients.
-    local = xp.einsum("mij,lmj->lmi", gradients(mesh)[:, 1:], position[:, None] - corners[:, 0])
-    barycentric = xp.concatenate([1 - local.sum(axis=-1, keepdims=True), local], axis=-1)
-    inside = undifferentiated(barycentric).min(axis=-1)
+    local_coordinates = xp.einsum("mij,lmj->lmi", gradients(mesh)[:, 1:], position[:, None] - corners[:, 0])
+    barycentric = xp.concatenate([1 - local_coordinates.sum(axis=-1, keepdims=True), local_coordinates], axis=-1)
+    smallest_weights = undifferentiated(barycentric).min(axis=-1)
     if mesh.is_surface:  # a position may project into many triangles: prefer the closest
         off = xp.einsum("mi,lmi->lm", normals(mesh), position[:, None] - corners[:, 0])
-        inside = xp.minimum(inside, 0) - abs(undifferentiated(off)) / xp.sqrt(2 * undifferentiated(measures(mesh)))
-    cell = xp.argmax(inside, axis=1)
+        smallest_weights = xp.minimum(smallest_weights, 0) - abs(undifferentiated(off)) / xp.sqrt(
+            2 * undifferentiated(measures(mesh))
+        )
+    cell = xp.argmax(smallest_weights, axis=1)
     weights = xp.take_along_axis(barycentric, cell[:, None, None], 1)[:, 0]
-    return cell, weights, inside.max(axis=1)
+    return cell, weights, smallest_weights.max(axis=1)
 
 
 class IntegratedElectrodes(AbstractElectrodes):

@@ -32,8 +32,8 @@ def first_crossing(points: np.ndarray, cells: np.ndarray) -> tuple[int, int] | N
         is_crossing[shares_node] = _cross_opposite(points, cells, pairs[shares_node], tolerance)
         is_crossing[shares_edge] = _overlap_at_edge(points, cells, pairs[shares_edge])
         if is_crossing.any():
-            first, second = np.sort(pairs[is_crossing][0]).tolist()
-            return first, second
+            first_cell, second_cell = np.sort(pairs[is_crossing][0]).tolist()
+            return first_cell, second_cell
     return None
 
 
@@ -56,21 +56,23 @@ def _near_pairs(corners: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
             queried = same_or_larger[start : start + batch_size]
             neighbours = tree.query_ball_point(centroids[queried], radii[queried] + radii[members].max() + tolerance)
             num_neighbours = np.fromiter(map(len, neighbours), int, len(neighbours))
-            first = np.repeat(queried, num_neighbours)
-            second = members[np.concatenate([np.asarray(indices, int) for indices in neighbours])]
+            first_cells = np.repeat(queried, num_neighbours)
+            second_cells = members[np.concatenate([np.asarray(indices, int) for indices in neighbours])]
             # A pair of triangles of the same size class occurs twice; return it once.
-            is_first_occurrence = np.where(size_class[first] == size_class[second], first < second, True)
-            boxes_overlap = (lower_corners[first] <= upper_corners[second]).all(axis=1) & (
-                lower_corners[second] <= upper_corners[first]
+            is_first_occurrence = np.where(
+                size_class[first_cells] == size_class[second_cells], first_cells < second_cells, True
+            )
+            boxes_overlap = (lower_corners[first_cells] <= upper_corners[second_cells]).all(axis=1) & (
+                lower_corners[second_cells] <= upper_corners[first_cells]
             ).all(axis=1)
-            yield np.column_stack([first, second])[is_first_occurrence & boxes_overlap]
+            yield np.column_stack([first_cells, second_cells])[is_first_occurrence & boxes_overlap]
 
 
 def _intersect(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray, tolerance: float) -> np.ndarray:
     """Whether the two triangles of each pair intersect (p,); the triangles have no node in common."""
-    first, second = points[cells[pairs[:, 0]]], points[cells[pairs[:, 1]]]
-    is_crossing = _overlap_in_plane(first, second, tolerance)
-    for segment_triangles, face_triangles in ((first, second), (second, first)):
+    first_corners, second_corners = points[cells[pairs[:, 0]]], points[cells[pairs[:, 1]]]
+    is_crossing = _overlap_in_plane(first_corners, second_corners, tolerance)
+    for segment_triangles, face_triangles in ((first_corners, second_corners), (second_corners, first_corners)):
         for k in range(3):
             is_crossing |= _pierces(
                 segment_triangles[:, k], segment_triangles[:, _NEXT_CORNER[k]], face_triangles, tolerance
@@ -94,14 +96,16 @@ def _cross_opposite(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray, to
 
 def _overlap_at_edge(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Whether the two triangles of each pair overlap (p,); the triangles share an edge."""
-    first, second = cells[pairs[:, 0]], cells[pairs[:, 1]]
-    is_tip = ~(first[:, :, None] == second[:, None, :]).any(axis=2)
-    is_other_tip = ~(second[:, :, None] == first[:, None, :]).any(axis=2)
-    tips = points[first[is_tip]], points[second[is_other_tip]]
-    edge = first[~is_tip].reshape(-1, 2)
+    first_cells, second_cells = cells[pairs[:, 0]], cells[pairs[:, 1]]
+    is_tip = ~(first_cells[:, :, None] == second_cells[:, None, :]).any(axis=2)
+    is_other_tip = ~(second_cells[:, :, None] == first_cells[:, None, :]).any(axis=2)
+    tip_points = points[first_cells[is_tip]], points[second_cells[is_other_tip]]
+    edge = first_cells[~is_tip].reshape(-1, 2)
     start, direction = points[edge[:, 0]], points[edge[:, 1]] - points[edge[:, 0]]
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    perpendiculars = [tip - start - ((tip - start) * direction).sum(axis=1, keepdims=True) * direction for tip in tips]
+    perpendiculars = [
+        tip - start - ((tip - start) * direction).sum(axis=1, keepdims=True) * direction for tip in tip_points
+    ]
     lengths = [np.linalg.norm(perpendicular, axis=1) for perpendicular in perpendiculars]
     return (perpendiculars[0] * perpendiculars[1]).sum(axis=1) > (1 - 1e-12) * lengths[0] * lengths[1]
 
@@ -125,21 +129,31 @@ def _pierces(start: np.ndarray, end: np.ndarray, corners: np.ndarray, tolerance:
     return is_crossing & (np.minimum(np.minimum(u, v), 1 - u - v) >= -_TOUCH_TOLERANCE)
 
 
-def _overlap_in_plane(first: np.ndarray, second: np.ndarray, tolerance: float) -> np.ndarray:
-    """Whether the two triangles with corners `first` and `second` (p, 3, 3) are coplanar and overlap, as booleans (p,).
-    Coplanar triangles do not overlap if the line through an edge of either triangle separates them."""
-    normal = np.cross(first[:, 1] - first[:, 0], first[:, 2] - first[:, 0])
+def _overlap_in_plane(first_triangles: np.ndarray, second_triangles: np.ndarray, tolerance: float) -> np.ndarray:
+    """Whether the two triangles with corners `first_triangles` and `second_triangles` (p, 3, 3) are coplanar and
+    overlap, as booleans (p,). Coplanar triangles do not overlap if the line through an edge of either triangle
+    separates them."""
+    normal = np.cross(first_triangles[:, 1] - first_triangles[:, 0], first_triangles[:, 2] - first_triangles[:, 0])
     unit = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-    height = np.einsum("pki,pi->pk", second - first[:, :1], unit)
+    height = np.einsum("pki,pi->pk", second_triangles - first_triangles[:, :1], unit)
     is_overlapping = np.abs(height).max(axis=1) <= tolerance
-    first, second, unit = first[is_overlapping], second[is_overlapping], unit[is_overlapping]
-    is_separated = np.zeros(len(first), bool)
-    for edge_triangles in (first, second):
+    first_triangles, second_triangles, unit = (
+        first_triangles[is_overlapping],
+        second_triangles[is_overlapping],
+        unit[is_overlapping],
+    )
+    is_separated = np.zeros(len(first_triangles), bool)
+    for edge_triangles in (first_triangles, second_triangles):
         for k in range(3):
             edge_normals = np.cross(edge_triangles[:, _NEXT_CORNER[k]] - edge_triangles[:, k], unit)
             edge_normals = edge_normals / np.linalg.norm(edge_normals, axis=1, keepdims=True)
-            spans = [np.einsum("pki,pi->pk", corners, edge_normals) for corners in (first, second)]
-            gap = np.maximum(spans[0].min(axis=1) - spans[1].max(axis=1), spans[1].min(axis=1) - spans[0].max(axis=1))
+            projections = [
+                np.einsum("pki,pi->pk", corners, edge_normals) for corners in (first_triangles, second_triangles)
+            ]
+            gap = np.maximum(
+                projections[0].min(axis=1) - projections[1].max(axis=1),
+                projections[1].min(axis=1) - projections[0].max(axis=1),
+            )
             is_separated |= gap > tolerance
     is_overlapping[is_overlapping] = ~is_separated
     return is_overlapping
@@ -153,17 +167,17 @@ def orient_surface(cells: np.ndarray, points: np.ndarray | None) -> np.ndarray:
     more than two triangles, a one-sided surface, parts of the surface that meet only in a node, and triangles that
     cross. Warns if all triangles of a closed surface face inwards.
     """
-    first, second = _pair_edges(cells)
-    first_triangle, second_triangle = first // 3, second // 3
+    first_edges, second_edges = _pair_edges(cells)
+    first_triangle, second_triangle = first_edges // 3, second_edges // 3
     is_odd = topology.odd_permutation(topology.cell_facets(cells))
     # Two triangles have the same orientation if they traverse their common edge in opposite directions; otherwise one
     # of the two must be turned.
-    needs_turn = is_odd[first] == is_odd[second]
-    is_turned = _triangles_to_turn(first_triangle, second_triangle, needs_turn, cells)
-    _check_node_contacts(cells, first, second)
+    needs_turn = is_odd[first_edges] == is_odd[second_edges]
+    is_turned = _find_triangles_to_flip(first_triangle, second_triangle, needs_turn, cells)
+    _check_node_contacts(cells, first_edges, second_edges)
     if np.count_nonzero(is_turned) * 2 > len(cells):
         is_turned = ~is_turned
-    is_closed = 2 * len(first) == 3 * len(cells)
+    is_closed = 2 * len(first_edges) == 3 * len(cells)
     oriented = np.where(is_turned[:, None], cells[:, [0, 2, 1]], cells)
     if points is None:
         return oriented
@@ -195,18 +209,20 @@ def _pair_edges(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of rows of `topology.cell_facets(cells)` that contain the same edge. Raises `ValueError` for an edge of
     more than two triangles."""
     edges = topology.cell_facets(cells)
-    first, second, crowded = topology.match_facets(edges, int(cells.max()) + 1)
-    if crowded.size:
-        nodes = np.sort(edges[crowded[0]]).tolist()
+    first_edges, second_edges, overcrowded_edges = topology.match_facets(edges, int(cells.max()) + 1)
+    if overcrowded_edges.size:
+        nodes = np.sort(edges[overcrowded_edges[0]]).tolist()
         raise ValueError(
             f"cells: the edge of nodes {nodes} belongs to more than two triangles (among them "
-            f"{sorted((crowded // 3).tolist())}), so the surface is not manifold there, as where walls "
+            f"{sorted((overcrowded_edges // 3).tolist())}), so the surface is not manifold there, as where walls "
             "meet in a T. Remove the triangles that are not of the skin, such as inner walls."
         )
-    return first, second
+    return first_edges, second_edges
 
 
-def _triangles_to_turn(first: np.ndarray, second: np.ndarray, opposite: np.ndarray, cells: np.ndarray) -> np.ndarray:
+def _find_triangles_to_flip(
+    first_edges: np.ndarray, second_edges: np.ndarray, has_opposite_direction: np.ndarray, cells: np.ndarray
+) -> np.ndarray:
     """Whether each triangle (m,) must be reversed so that all are oriented like triangle 0. Raises `ValueError` for a
     one-sided surface.
 
@@ -214,8 +230,10 @@ def _triangles_to_turn(first: np.ndarray, second: np.ndarray, opposite: np.ndarr
     edge. The graph falls into two components if the surface has two sides.
     """
     num_triangles = len(cells)
-    rows = np.concatenate([first, first + num_triangles])
-    columns = np.concatenate([second + num_triangles * opposite, second + num_triangles * ~opposite])
+    rows = np.concatenate([first_edges, first_edges + num_triangles])
+    columns = np.concatenate(
+        [second_edges + num_triangles * has_opposite_direction, second_edges + num_triangles * ~has_opposite_direction]
+    )
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * num_triangles, 2 * num_triangles))
     _, label = connected_components(graph, directed=False)
     if label[0] == label[num_triangles]:
@@ -226,25 +244,25 @@ def _triangles_to_turn(first: np.ndarray, second: np.ndarray, opposite: np.ndarr
     return label[:num_triangles] != label[0]
 
 
-def _check_node_contacts(cells: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
+def _check_node_contacts(cells: np.ndarray, first_edges: np.ndarray, second_edges: np.ndarray) -> None:
     """Raise `ValueError` if parts of a surface meet only in a node, so that the triangles around this node form several
     fans."""
     corner_index = np.arange(cells.size).reshape(cells.shape)
-    ends = topology.LOCAL_FACETS[2]
+    edge_ends = topology.LOCAL_FACETS[2]
     pairs = []
     for a in range(2):
         for b in range(2):
             first_corner, second_corner = (
-                corner_index[first // 3, ends[first % 3, a]],
-                corner_index[second // 3, ends[second % 3, b]],
+                corner_index[first_edges // 3, edge_ends[first_edges % 3, a]],
+                corner_index[second_edges // 3, edge_ends[second_edges % 3, b]],
             )
             is_same_node = cells.ravel()[first_corner] == cells.ravel()[second_corner]
             pairs.append(np.stack([first_corner[is_same_node], second_corner[is_same_node]]))
     rows, columns = np.concatenate(pairs, axis=1)
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(cells.size, cells.size))
     _, label = connected_components(graph, directed=False)
-    fans = np.unique(np.stack([cells.ravel(), label]), axis=1)[0]
-    node, num_fans = np.unique(fans, return_counts=True)
+    fan_nodes = np.unique(np.stack([cells.ravel(), label]), axis=1)[0]
+    node, num_fans = np.unique(fan_nodes, return_counts=True)
     if (num_fans > 1).any():
         raise ValueError(
             f"cells: the surface touches itself at node {node[num_fans > 1][0]}: parts of it hang together there by "

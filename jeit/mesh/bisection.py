@@ -67,7 +67,7 @@ def bisect_with_parents(
     exceeds_size = _exceeds_size(split_mesh, everywhere, longest_length, size)
     while exceeds_size.any():
         points = split_mesh.points
-        split_edges = _edges_to_split(
+        split_edges = _find_edges_to_split(
             split_mesh.cells, longest_edge, np.unique(longest_edge[exceeds_size]), len(points)
         )
         if len(points) + len(split_edges) > max_points:
@@ -80,26 +80,26 @@ def bisect_with_parents(
     return split_mesh.mesh(mesh.tags), parent
 
 
-def _edges_to_split(cells, longest_edge, marked, num_points: int) -> Int[np.ndarray, "e 2"]:
-    """The edges (e, 2) that are split next so that the `marked` edges can be split: the longest edges of all the cells
-    around them. If a marked edge is not the longest edge of a cell, that cell's longest edge is marked, too.
+def _find_edges_to_split(cells, longest_edge, marked_edges, num_points: int) -> Int[np.ndarray, "e 2"]:
+    """The edges (e, 2) that are split next so that the edges `marked_edges` can be split: the longest edges of all the
+    cells around them. If a marked edge is not the longest edge of a cell, that cell's longest edge is marked, too.
 
-    `longest_edge` (m,) and `marked` are numbers of edges, as returned by `_edge_numbers`.
+    `longest_edge` (m,) and `marked_edges` are numbers of edges, as returned by `_edge_numbers`.
     """
-    to_split, new = [], marked
-    while len(new):
-        around, edge = _cells_around(cells, new, num_points)
+    edges_to_split, new_edges = [], marked_edges
+    while len(new_edges):
+        around, edge = _find_cells_of_edges(cells, new_edges, num_points)
         is_longest = longest_edge[around] == edge
-        to_split.append(np.setdiff1d(new, edge[~is_longest], assume_unique=True))
-        new = np.setdiff1d(longest_edge[around[~is_longest]], marked)
-        marked = np.union1d(marked, new)
-    return _edges_of_numbers(np.sort(np.concatenate(to_split)))
+        edges_to_split.append(np.setdiff1d(new_edges, edge[~is_longest], assume_unique=True))
+        new_edges = np.setdiff1d(longest_edge[around[~is_longest]], marked_edges)
+        marked_edges = np.union1d(marked_edges, new_edges)
+    return _edges_of_numbers(np.sort(np.concatenate(edges_to_split)))
 
 
-def _cells_around(cells, edges, num_points: int) -> tuple[Int[np.ndarray, " i"], Int[np.ndarray, " i"]]:
+def _find_cells_of_edges(cells, edges, num_points: int) -> tuple[Int[np.ndarray, " i"], Int[np.ndarray, " i"]]:
     """All pairs of a cell and an edge of the cell among `edges`, which are sorted numbers: indices of the cells, and
     numbers of the edges."""
-    candidates = _with_two_nodes(cells, _edges_of_numbers(edges), num_points)
+    candidates = _find_simplices_with_two_nodes(cells, _edges_of_numbers(edges), num_points)
     numbers = _edge_numbers(_edge_nodes(cells[candidates]))
     row, column = np.nonzero(edges[np.minimum(np.searchsorted(edges, numbers), len(edges) - 1)] == numbers)
     return candidates[row], numbers[row, column]
@@ -134,12 +134,12 @@ def cut(mesh: Mesh, level: Callable[[Float[np.ndarray, "n s"]], Float[np.ndarray
         crossed_cells = np.flatnonzero(side.min(axis=1) * side.max(axis=1) < 0)
         if not len(crossed_cells):
             return split_mesh.mesh(mesh.tags)
-        crossed_cells = np.flatnonzero(_is_node_used_by(cells[crossed_cells], len(points))[cells].any(axis=1))
+        crossed_cells = np.flatnonzero(_mark_nodes(cells[crossed_cells], len(points))[cells].any(axis=1))
         edges, edge_indices, rank = _edges(points, cells[crossed_cells])
         is_crossed = np.prod(np.sign(levels)[edges], axis=1) < 0
-        split_edges = edges[is_crossed & _is_longest_around(edge_indices, np.where(is_crossed, rank, -1))]
+        split_edges = edges[is_crossed & _is_longest_in_its_cells(edge_indices, np.where(is_crossed, rank, -1))]
         split_mesh, _ = split_mesh.split(
-            split_edges, _zero_on_edges(points[split_edges], levels[split_edges[:, 0]], level)
+            split_edges, _find_zeros_on_edges(points[split_edges], levels[split_edges[:, 0]], level)
         )
         levels = np.append(levels, np.zeros(len(split_edges)))
 
@@ -166,24 +166,28 @@ class _SplitMesh:
 
     def mesh(self, tags) -> Mesh:
         """Create a `Mesh` from the arrays, with the `tags` of the original mesh."""
-        named = {name: self.facets[np.isin(self.side, np.asarray(index))] for name, index in tags.items()}
+        named = {
+            name: self.facets[np.isin(self.side, np.asarray(facet_indices))] for name, facet_indices in tags.items()
+        }
         with size_checked():
             return Mesh.create(self.points, self.cells, tags=named)
 
-    def split(self, edges: Int[np.ndarray, "e 2"], middles: Float[np.ndarray, "e s"]) -> tuple[_SplitMesh, np.ndarray]:
-        """Split `edges` at the points `middles`, metres; no cell may contain two of the edges. Returns the arrays after
-        the split and, for each new cell, the index of the old cell that contains it."""
+    def split(
+        self, edges: Int[np.ndarray, "e 2"], midpoints: Float[np.ndarray, "e s"]
+    ) -> tuple[_SplitMesh, np.ndarray]:
+        """Split `edges` at the points `midpoints`, metres; no cell may contain two of the edges. Returns the arrays
+        after the split and, for each new cell, the index of the old cell that contains it."""
         new_nodes = len(self.points) + np.arange(len(edges))
         cells, origin = _split_simplices(self.cells, edges, new_nodes, len(self.points))
         facets, side = _split_simplices(self.facets, edges, new_nodes, len(self.points))
-        return _SplitMesh(np.concatenate([self.points, middles]), cells, facets, self.side[side]), origin
+        return _SplitMesh(np.concatenate([self.points, midpoints]), cells, facets, self.side[side]), origin
 
 
 def _longest_edges(split_mesh: _SplitMesh, selected_cells) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Number and length in metres of the longest edge of each selected cell. Of edges of the same length, the one with
     the largest number counts as the longest, in every cell."""
-    ends = _edge_nodes(split_mesh.cells[selected_cells])
-    lengths, numbers = _edge_lengths(split_mesh.points[ends]), _edge_numbers(ends)
+    end_nodes = _edge_nodes(split_mesh.cells[selected_cells])
+    lengths, numbers = _edge_lengths(split_mesh.points[end_nodes]), _edge_numbers(end_nodes)
     longest_length = lengths.max(axis=1)
     return np.where(lengths == longest_length[:, None], numbers, -1).max(axis=1), longest_length
 
@@ -214,43 +218,46 @@ def _move_nodes_onto(split_mesh: _SplitMesh, level) -> tuple[_SplitMesh, Float[n
     side = np.sign(levels)[cells]
     edges, _, _ = _edges(points, cells[side.min(axis=1) * side.max(axis=1) < 0])
     edges = edges[np.prod(np.sign(levels)[edges], axis=1) < 0]
-    crossings = _zero_on_edges(points[edges], levels[edges[:, 0]], level)
-    distance = np.linalg.norm(points[edges] - crossings[:, None], axis=2) / _edge_lengths(points[edges])[:, None]
+    crossing_points = _find_zeros_on_edges(points[edges], levels[edges[:, 0]], level)
+    distance = np.linalg.norm(points[edges] - crossing_points[:, None], axis=2) / _edge_lengths(points[edges])[:, None]
     end_nodes, order = edges.ravel(), np.argsort(-distance.ravel())  # a node's nearest crossing is assigned last
     nearest_distance, target = np.full(len(points), np.inf), points.copy()
     nearest_distance[end_nodes[order]], target[end_nodes[order]] = (
         distance.ravel()[order],
-        np.repeat(crossings, 2, axis=0)[order],
+        np.repeat(crossing_points, 2, axis=0)[order],
     )
-    is_moved = (nearest_distance < _MAX_MOVE) & ~_is_node_used_by(split_mesh.facets, len(points))
+    is_moved = (nearest_distance < _MAX_MOVE) & ~_mark_nodes(split_mesh.facets, len(points))
     volumes_before = _volumes(points, cells)
     while True:
         moved_points = np.where(is_moved[:, None], target, points)
         is_crushed = _volumes(moved_points, cells) < _MIN_VOLUME_RATIO * volumes_before
         if not is_crushed.any():
             return replace(split_mesh, points=moved_points), np.where(is_moved, 0, levels)
-        is_moved &= ~_is_node_used_by(cells[is_crushed], len(points))
+        is_moved &= ~_mark_nodes(cells[is_crushed], len(points))
 
 
-def _zero_on_edges(
-    ends: Float[np.ndarray, "e 2 s"], first_level: Float[np.ndarray, " e"], level
+def _find_zeros_on_edges(
+    end_points: Float[np.ndarray, "e 2 s"], first_level: Float[np.ndarray, " e"], level
 ) -> Float[np.ndarray, "e s"]:
     """Locate the point on each edge where `level` is zero, by bisection. `first_level` (e,): values of `level` at the
     first ends of the edges; its values at the second ends have the opposite sign."""
-    lower, upper = np.zeros((len(ends), 1)), np.ones((len(ends), 1))
-    start, direction = ends[:, 0], ends[:, 1] - ends[:, 0]
+    lower_fractions, upper_fractions = np.zeros((len(end_points), 1)), np.ones((len(end_points), 1))
+    start, direction = end_points[:, 0], end_points[:, 1] - end_points[:, 0]
     for _ in range(_BISECTION_STEPS):
-        middle = (lower + upper) / 2
-        is_same_sign = (level(start + middle * direction) * first_level > 0)[:, None]
-        lower, upper = np.where(is_same_sign, middle, lower), np.where(is_same_sign, upper, middle)
-    return start + upper * direction
+        midpoint = (lower_fractions + upper_fractions) / 2
+        is_same_sign = (level(start + midpoint * direction) * first_level > 0)[:, None]
+        lower_fractions, upper_fractions = (
+            np.where(is_same_sign, midpoint, lower_fractions),
+            np.where(is_same_sign, upper_fractions, midpoint),
+        )
+    return start + upper_fractions * direction
 
 
 def _edges(points, simplices) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "m k"], Int[np.ndarray, " e"]]:
     """All edges (e, 2) of the simplices, each with its lower-numbered node first; the indices (m, k) of the edges of
     each simplex; and the ranks (e,) of the edges by length."""
-    ends = _edge_nodes(simplices).reshape(-1, 2)
-    key, edge_index = np.unique(ends[:, 0] * len(points) + ends[:, 1], return_inverse=True)
+    end_nodes = _edge_nodes(simplices).reshape(-1, 2)
+    key, edge_index = np.unique(end_nodes[:, 0] * len(points) + end_nodes[:, 1], return_inverse=True)
     edges = np.stack(np.divmod(key, len(points)), axis=1)
     rank = np.empty(len(edges), int)
     rank[np.argsort(_edge_lengths(points[edges]), kind="stable")] = np.arange(len(edges))
@@ -260,8 +267,8 @@ def _edges(points, simplices) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "
 def _edge_nodes(simplices) -> Int[np.ndarray, "m k 2"]:
     """The two nodes of each edge of each simplex, the lower-numbered node first."""
     pairs = np.array(list(itertools.combinations(range(simplices.shape[1]), 2)))
-    first, second = (simplices[:, nodes].astype(np.int64) for nodes in pairs.T)
-    return np.stack([np.minimum(first, second), np.maximum(first, second)], axis=2)
+    first_nodes, second_nodes = (simplices[:, nodes].astype(np.int64) for nodes in pairs.T)
+    return np.stack([np.minimum(first_nodes, second_nodes), np.maximum(first_nodes, second_nodes)], axis=2)
 
 
 def _edge_numbers(edges: Int[np.ndarray, "... 2"]) -> Int[np.ndarray, "..."]:
@@ -274,9 +281,9 @@ def _edges_of_numbers(numbers: Int[np.ndarray, " e"]) -> Int[np.ndarray, "e 2"]:
     return np.stack([numbers >> 32, numbers & 0xFFFFFFFF], axis=1)
 
 
-def _edge_lengths(ends: Float[np.ndarray, "... 2 s"]) -> Float[np.ndarray, "..."]:
-    """Lengths (…) of edges with the end points `ends` (…, 2, s)."""
-    return np.linalg.norm(ends[..., 1, :] - ends[..., 0, :], axis=-1)
+def _edge_lengths(end_points: Float[np.ndarray, "... 2 s"]) -> Float[np.ndarray, "..."]:
+    """Lengths (…) of edges with the end points `end_points` (…, 2, s)."""
+    return np.linalg.norm(end_points[..., 1, :] - end_points[..., 0, :], axis=-1)
 
 
 def _longest_edge_of_cell(edge_indices, rank) -> Int[np.ndarray, " m"]:
@@ -284,7 +291,7 @@ def _longest_edge_of_cell(edge_indices, rank) -> Int[np.ndarray, " m"]:
     return np.take_along_axis(edge_indices, np.argmax(rank[edge_indices], axis=1)[:, None], axis=1)[:, 0]
 
 
-def _is_longest_around(edge_indices, rank) -> Bool[np.ndarray, " e"]:
+def _is_longest_in_its_cells(edge_indices, rank) -> Bool[np.ndarray, " e"]:
     """Whether each edge is the longest edge of every cell that contains it, according to the ranks of the edges by
     length."""
     return np.bincount(_longest_edge_of_cell(edge_indices, rank), minlength=len(rank)) == np.bincount(
@@ -292,16 +299,16 @@ def _is_longest_around(edge_indices, rank) -> Bool[np.ndarray, " e"]:
     )
 
 
-def _is_node_used_by(simplices, num_points: int) -> Bool[np.ndarray, " n"]:
+def _mark_nodes(simplices, num_points: int) -> Bool[np.ndarray, " n"]:
     """Whether each node belongs to any of the simplices."""
     is_node = np.zeros(num_points, bool)
     is_node[simplices] = True
     return is_node
 
 
-def _with_two_nodes(simplices, edges, num_points: int) -> Int[np.ndarray, " c"]:
+def _find_simplices_with_two_nodes(simplices, edges, num_points: int) -> Int[np.ndarray, " c"]:
     """Indices of the simplices with at least two nodes that belong to any of the edges."""
-    is_node = _is_node_used_by(edges, num_points).astype(np.int8)
+    is_node = _mark_nodes(edges, num_points).astype(np.int8)
     return np.flatnonzero(sum(is_node[nodes] for nodes in simplices.T) > 1)  # quicker than sum(axis=1)
 
 
@@ -317,20 +324,22 @@ def _volumes(points, cells) -> Float[np.ndarray, " m"]:
 def _split_simplices(simplices, edges, new_nodes, num_points: int) -> tuple[np.ndarray, np.ndarray]:
     """Split each simplex that contains one of the `edges` into two, at the edge's new node in `new_nodes`. Also
     returns, for each resulting simplex, the index of the original simplex that contains it."""
-    candidates = _with_two_nodes(simplices, edges, num_points)
+    candidates = _find_simplices_with_two_nodes(simplices, edges, num_points)
     split_keys = edges @ [num_points, 1]
-    order = np.argsort(split_keys)
+    sort_order = np.argsort(split_keys)
     ends = _edge_nodes(simplices[candidates])
     edge_keys = ends @ [num_points, 1]
-    edge_positions = order[np.minimum(np.searchsorted(split_keys[order], edge_keys), len(split_keys) - 1)]
+    edge_positions = sort_order[np.minimum(np.searchsorted(split_keys[sort_order], edge_keys), len(split_keys) - 1)]
     is_split = split_keys[edge_positions] == edge_keys
     has_split_edge = is_split.any(axis=1)
     candidates, split_edge = candidates[has_split_edge], np.argmax(is_split[has_split_edge], axis=1)
     rows = np.flatnonzero(has_split_edge)
     middle_nodes = new_nodes[edge_positions[rows, split_edge]][:, None]
-    halves = [
+    half_simplices = [
         np.where(simplices[candidates] == end[:, None], middle_nodes, simplices[candidates])
         for end in ends[rows, split_edge].T
     ]
-    unsplit = np.delete(np.arange(len(simplices)), candidates)
-    return np.concatenate([simplices[unsplit], *halves]), np.concatenate([unsplit, candidates, candidates])
+    unsplit_indices = np.delete(np.arange(len(simplices)), candidates)
+    return np.concatenate([simplices[unsplit_indices], *half_simplices]), np.concatenate(
+        [unsplit_indices, candidates, candidates]
+    )

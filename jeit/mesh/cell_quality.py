@@ -64,8 +64,8 @@ def quality(mesh: Mesh) -> Quality:
     """
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
     corners = points[cells]
-    first, second = np.triu_indices(mesh.dimension + 1, 1)
-    length = np.linalg.norm(corners[:, first] - corners[:, second], axis=2)
+    first_corners, second_corners = np.triu_indices(mesh.dimension + 1, 1)
+    length = np.linalg.norm(corners[:, first_corners] - corners[:, second_corners], axis=2)
     angle, ratio = _triangle_measures(corners) if mesh.dimension == 2 else _tetrahedron_measures(corners)
     return Quality(
         dimension=mesh.dimension,
@@ -98,8 +98,8 @@ def _tetrahedron_measures(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     normals = np.concatenate([normals, -normals.sum(axis=1, keepdims=True)], axis=1)
     area = np.linalg.norm(normals, axis=2)
     unit = normals / area[..., None]
-    first, second = np.triu_indices(4, 1)
-    cosine = np.clip(-(unit[:, first] * unit[:, second]).sum(axis=2), -1.0, 1.0)
+    first_corners, second_corners = np.triu_indices(4, 1)
+    cosine = np.clip(-(unit[:, first_corners] * unit[:, second_corners]).sum(axis=2), -1.0, 1.0)
     angle = np.degrees(np.arccos(cosine)).min(axis=1)
     volume = np.abs((a * normals[:, 0]).sum(axis=1))
     # The inscribed sphere has the radius 3 V / ΣA, with the volume V and the areas A of the faces. The centre of the
@@ -149,9 +149,9 @@ def read_leniently(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
     """
     suffix = path.suffix.lower()
     check_memory(name, _MEMORY_FACTORS[suffix] * path.stat().st_size)
-    content = path.read_bytes()
+    data = path.read_bytes()
     try:
-        points, cells = _parse_stl(content) if suffix == ".stl" else _parse_obj(content)
+        points, cells = _parse_stl(data) if suffix == ".stl" else _parse_obj(data)
     except (ValueError, IndexError, OverflowError) as error:
         message = " ".join(str(error).split())
         message = message if len(message) <= _MAX_MESSAGE else f"{message[:_MAX_MESSAGE]} …"
@@ -173,30 +173,30 @@ def read_leniently(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
     return points, cells
 
 
-def _parse_stl(content: bytes) -> tuple[np.ndarray, np.ndarray]:
-    num_triangles = int.from_bytes(content[_STL_HEADER_BYTES - 4 : _STL_HEADER_BYTES], "little")
-    if len(content) == _STL_HEADER_BYTES + num_triangles * _STL_TRIANGLE.itemsize:
-        corners = np.frombuffer(content, _STL_TRIANGLE, offset=_STL_HEADER_BYTES)["corners"].astype(float)
-    elif content[:5].lower() != b"solid":
+def _parse_stl(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+    num_triangles = int.from_bytes(data[_STL_HEADER_BYTES - 4 : _STL_HEADER_BYTES], "little")
+    if len(data) == _STL_HEADER_BYTES + num_triangles * _STL_TRIANGLE.itemsize:
+        corners = np.frombuffer(data, _STL_TRIANGLE, offset=_STL_HEADER_BYTES)["corners"].astype(float)
+    elif data[:5].lower() != b"solid":
         raise ValueError("it is neither a text that begins with 'solid' nor as long as its number of triangles asks")
     else:
-        corners = np.array([[float(value) for value in coordinates] for coordinates in _VERTEX.findall(content)])
+        corners = np.array([[float(value) for value in coordinates] for coordinates in _VERTEX.findall(data)])
         if corners.size % 9:
             raise ValueError("a facet has not three vertices")
     points = corners.reshape(-1, 3)
     return points, np.arange(len(points)).reshape(-1, 3)
 
 
-def _parse_obj(content: bytes) -> tuple[np.ndarray, np.ndarray]:
+def _parse_obj(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     points: list[list[float]] = []
     cells: list[tuple[int, int, int]] = []
-    for line in content.replace(b"\\\n", b" ").splitlines():
-        word, *values = line.split() or [b""]
-        if word == b"v":
+    for line in data.replace(b"\\\n", b" ").splitlines():
+        keyword, *values = line.split() or [b""]
+        if keyword == b"v":
             points.append([float(value) for value in values[:3]])  # colours may follow
             if len(points[-1]) != 3:
                 raise ValueError("a vertex has not three coordinates")
-        elif word == b"f":
+        elif keyword == b"f":
             corners = [_vertex_index(value, len(points)) for value in values]
             cells += [(corners[0], *pair) for pair in pairwise(corners[1:])]
     array = np.array(cells, np.int64).reshape(-1, 3)

@@ -31,8 +31,8 @@ def check_points(points: ArrayLike) -> np.ndarray:
     except (TypeError, ValueError) as error:
         raise ValueError(f"points: expected real numbers of shape (n, 2) or (n, 3); {error}.") from None
     if array.ndim != 2 or array.shape[1] not in (2, 3):
-        hint = " Transpose the array." if array.ndim == 2 and array.shape[0] in (2, 3) else ""
-        raise ValueError(f"points: expected shape (n, 2) or (n, 3), got {array.shape}.{hint}")
+        shape_hint = " Transpose the array." if array.ndim == 2 and array.shape[0] in (2, 3) else ""
+        raise ValueError(f"points: expected shape (n, 2) or (n, 3), got {array.shape}.{shape_hint}")
     invalid_nodes = np.flatnonzero(~np.isfinite(array).all(axis=1))
     if invalid_nodes.size:
         raise ValueError(
@@ -41,7 +41,7 @@ def check_points(points: ArrayLike) -> np.ndarray:
         )
     if not len(array):
         raise ValueError("points: the array is empty; a mesh needs at least one cell.")
-    warn_large(float(np.ptp(array, axis=0).max()), "points", of_file=True)
+    warn_large(float(np.ptp(array, axis=0).max()), "points", is_from_file=True)
     return array
 
 
@@ -60,10 +60,10 @@ def check_cells(cells: ArrayLike, num_points: int, dimension: int) -> np.ndarray
         raise ValueError(f"points: {num_points} nodes are more than the {MOST_POINTS} that jeit can index.")
     lowest_index, highest_index = int(array.min()), int(array.max())
     if lowest_index < 0 or highest_index >= num_points:
-        hint = " They look one-based: subtract 1." if lowest_index >= 1 and highest_index == num_points else ""
+        index_hint = " They look one-based: subtract 1." if lowest_index >= 1 and highest_index == num_points else ""
         raise ValueError(
             f"cells: node indices run from {lowest_index} to {highest_index}, but the mesh has nodes 0 to "
-            f"{num_points - 1}.{hint}"
+            f"{num_points - 1}.{index_hint}"
         )
     sorted_cells = np.sort(array, axis=1)
     repeated_cells = np.flatnonzero((sorted_cells[:, 1:] == sorted_cells[:, :-1]).any(axis=1))
@@ -80,11 +80,11 @@ def check_cells(cells: ArrayLike, num_points: int, dimension: int) -> np.ndarray
             f"cells: {duplicates.size} cell(s) are duplicated, first cells {pair[0]} and {pair[1]} with nodes "
             f"{sorted_cells[order[duplicates[0]]].tolist()}. Keep one of each."
         )
-    unused = np.setdiff1d(np.arange(num_points), array)
-    if unused.size:
+    unused_nodes = np.setdiff1d(np.arange(num_points), array)
+    if unused_nodes.size:
         raise ValueError(
-            f"points: {unused.size} node(s) belong to no cell, first node {unused[0]}. They would make the stiffness "
-            "matrix singular: drop them and renumber the cells."
+            f"points: {unused_nodes.size} node(s) belong to no cell, first node {unused_nodes[0]}. They would make the "
+            "stiffness matrix singular: drop them and renumber the cells."
         )
     return array
 
@@ -96,11 +96,13 @@ def check_coinciding(points: np.ndarray) -> None:
     distance, neighbour = map(np.asarray, KDTree(points).query(points, k=2))
     close_nodes = np.flatnonzero(distance[:, 1] <= _COINCIDENT_DISTANCE * np.ptp(points, axis=0).max())
     if close_nodes.size:
-        first = int(close_nodes[0])
-        neighbour_index = int(neighbour[first, 1] if neighbour[first, 1] != first else neighbour[first, 0])
+        first_node = int(close_nodes[0])
+        neighbour_index = int(
+            neighbour[first_node, 1] if neighbour[first_node, 1] != first_node else neighbour[first_node, 0]
+        )
         raise ValueError(
-            f"points: {close_nodes.size} nodes coincide with another, first nodes {first} and {neighbour_index} at "
-            f"{points[first].tolist()}. Merge them, or the mesh has an invisible crack there."
+            f"points: {close_nodes.size} nodes coincide with another, first nodes {first_node} and {neighbour_index} "
+            f"at {points[first_node].tolist()}. Merge them, or the mesh has an invisible crack there."
         )
 
 
@@ -131,10 +133,10 @@ def orient(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
     return np.where((measure > 0)[:, None], cells, swapped_cells)
 
 
-def check_connected(first: np.ndarray, second: np.ndarray, num_cells: int) -> None:
-    """Raise `ValueError` if the `num_cells` cells are not connected; `first` and `second`: indices of the two cells at
-    each interior facet."""
-    graph = coo_array((np.ones(len(first)), (first, second)), shape=(num_cells, num_cells))
+def check_connected(first_cells: np.ndarray, second_cells: np.ndarray, num_cells: int) -> None:
+    """Raise `ValueError` if the `num_cells` cells are not connected; `first_cells` and `second_cells`: indices of the
+    two cells at each interior facet."""
+    graph = coo_array((np.ones(len(first_cells)), (first_cells, second_cells)), shape=(num_cells, num_cells))
     num_parts, label = connected_components(graph, directed=False)
     if num_parts > 1:
         sizes = np.bincount(label)
@@ -202,21 +204,23 @@ def size_checked() -> Iterator[None]:
         _SIZE_CHECKED.reset(token)
 
 
-def warn_large(extent: float, name: str, size_factor: float = 1.0, *, of_file: bool = False) -> None:
-    """Warn if an object is so large that its length of `extent` metres was probably specified in a different unit.
+def warn_large(largest_side: float, name: str, size_factor: float = 1.0, *, is_from_file: bool = False) -> None:
+    """Warn if an object is so large that its length of `largest_side` metres was probably specified in a different
+    unit.
 
-    `size_factor`: size of the object divided by `extent`; `of_file`: whether the length may come from a file; if so,
-    the message suggests a scale. No warning is issued inside `size_checked`.
+    `size_factor`: size of the object divided by `largest_side`; `is_from_file`: whether the length may come from a
+    file; if so, the message suggests a scale. No warning is issued inside `size_checked`.
     """
-    if not size_factor * extent > MAX_PLAUSIBLE_SIZE or _SIZE_CHECKED.get():
+    if not size_factor * largest_side > MAX_PLAUSIBLE_SIZE or _SIZE_CHECKED.get():
         return
     scale_hints = [
-        f" (a file is read with scale={unit_scale})" if of_file else "" for unit_scale in ("1e-3", "1e-2", "0.0254")
+        f" (a file is read with scale={unit_scale})" if is_from_file else ""
+        for unit_scale in ("1e-3", "1e-2", "0.0254")
     ]
     warnings.warn(
-        f"{name}: {extent:g} m is large for what electrodes are put on. If the lengths are millimetres, give "
-        f"{1e-3 * extent:g}{scale_hints[0]}, if centimetres, {1e-2 * extent:g}{scale_hints[1]}, if inches, "
-        f"{0.0254 * extent:g}{scale_hints[2]}: jeit computes in metres.",
+        f"{name}: {largest_side:g} m is large for what electrodes are put on. If the lengths are millimetres, give "
+        f"{1e-3 * largest_side:g}{scale_hints[0]}, if centimetres, {1e-2 * largest_side:g}{scale_hints[1]}, if inches, "
+        f"{0.0254 * largest_side:g}{scale_hints[2]}: jeit computes in metres.",
         UserWarning,
         stacklevel=4,
     )

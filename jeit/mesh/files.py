@@ -65,7 +65,7 @@ _MAX_NODE_NUMBER = 10**7
 _reading_lock = threading.Lock()
 
 
-def meshio_format_of(path: Path) -> str:
+def check_meshio_format(path: Path) -> str:
     """Name that meshio uses for the format of a file. Raises `ValueError` if the format is not in `FORMATS`, or if the
     file refers to other files, declares XML entities, or is too large for memory."""
     kind = FORMATS.get(path.suffix.lower())
@@ -93,22 +93,22 @@ def meshio_format_of(path: Path) -> str:
 def _check_numbers(path: Path) -> None:
     """Raise `ValueError` for a .msh file whose counts or node numbers are larger than a file of its size can
     contain."""
-    content = path.read_bytes()
-    version, binary = [*content[:64].split(), b"", b"", b""][1:3]
-    if content.startswith(b"$MeshFormat") and binary == b"1" and not version.startswith(b"2"):
+    data = path.read_bytes()
+    version, binary = [*data[:64].split(), b"", b"", b""][1:3]
+    if data.startswith(b"$MeshFormat") and binary == b"1" and not version.startswith(b"2"):
         raise ValueError(
             f"path: {path.name[:80]} is a binary file of Gmsh's format {version[:8].decode('ascii', 'replace')}; save "
             "it as text, or in version 2.2."
         )
-    numbers = [int(match[2][:20]) for match in _MSH_COUNTS.finditer(content)]
+    numbers = [int(match[2][:20]) for match in _MSH_COUNTS.finditer(data)]
     if binary == b"1":
-        for match in _MSH_COUNTS.finditer(content):
-            num_nodes = min(int(match[2][:20]), (len(content) - match.end()) // _MSH_NODE.itemsize)
+        for match in _MSH_COUNTS.finditer(data):
+            num_nodes = min(int(match[2][:20]), (len(data) - match.end()) // _MSH_NODE.itemsize)
             if match[1] == b"Nodes" and num_nodes:
-                numbers.append(int(np.frombuffer(content, _MSH_NODE, num_nodes, match.end())["number"].max()))
+                numbers.append(int(np.frombuffer(data, _MSH_NODE, num_nodes, match.end())["number"].max()))
     else:
-        numbers += [int(match[0][:20]) for match in _LONG_INTEGER.finditer(content)]
-    max_number = max(_MAX_NODE_NUMBER, len(content))
+        numbers += [int(match[0][:20]) for match in _LONG_INTEGER.finditer(data)]
+    max_number = max(_MAX_NODE_NUMBER, len(data))
     if max(numbers, default=0) > max_number:
         raise ValueError(
             f"path: {path.name[:80]} does not work as a mesh file: it counts to {max(numbers)}, and a file of its size "
@@ -118,14 +118,14 @@ def _check_numbers(path: Path) -> None:
 
 def _check_counts(path: Path) -> None:
     """Raise `ValueError` for a VTK file that declares more points or cells than a file of its size can contain."""
-    content = path.read_bytes()
-    for match in _VTK_COUNTS.finditer(content):
+    data = path.read_bytes()
+    for match in _VTK_COUNTS.finditer(data):
         counts = [int(digits[:20]) for digits in match[2].split()]
         num_items = math.prod(counts) if match[1].upper() == b"DIMENSIONS" else max(counts)
-        if num_items > max(len(content), 1000):
+        if num_items > max(len(data), 1000):
             raise ValueError(
                 f"path: {path.name[:80]} does not work as a mesh file: it counts to {num_items} in "
-                f"{match[1].decode()}, and has {len(content)} bytes; grids with implicit ends are not read."
+                f"{match[1].decode()}, and has {len(data)} bytes; grids with implicit ends are not read."
             )
 
 
@@ -181,11 +181,11 @@ def bounded_inflation(path: Path) -> Iterator[None]:
     def bounded_decompress(create_decompressor: Callable[[], Any]) -> Callable[[bytes], bytes]:
         def decompress(data: bytes) -> bytes:
             nonlocal num_bytes_left
-            content = create_decompressor().decompress(data, int(num_bytes_left) + 1)
-            num_bytes_left -= len(content)
+            decompressed = create_decompressor().decompress(data, int(num_bytes_left) + 1)
+            num_bytes_left -= len(decompressed)
             if num_bytes_left < 0:
                 check_memory(f"{path.name[:80]}, unpacked,", most_bytes() + 1)
-            return content
+            return decompressed
 
         return decompress
 
@@ -242,14 +242,14 @@ def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh
         raise ValueError(f"scale: expected the file's unit in metres, such as 1e-3 for millimetres, got {scale!r}.")
     if not path.stat().st_size:
         raise ValueError(f"path: {path.name[:80]} does not work as a mesh file: it is empty.")
-    kind = None if trusted else meshio_format_of(path)
+    kind = None if trusted else check_meshio_format(path)
     if path.suffix.lower() in _UNCONNECTED:
         points, cells = read_leniently(path, path.name[:80])
         return _create_mesh(points * float(scale), cells, {})
     with bounded_inflation(path) if kind == "vtu" else nullcontext():
-        content = _call_meshio(path, lambda meshio: meshio.read(path, file_format=kind))
+        meshio_mesh = _call_meshio(path, lambda meshio: meshio.read(path, file_format=kind))
     try:
-        return _from_meshio(content, float(scale), path.name[:80])
+        return _convert_from_meshio(meshio_mesh, float(scale), path.name[:80])
     except _READ_ERRORS as error:
         raise ValueError(f"path: {path.name[:80]} holds no mesh ({_shorten_message(error)}).") from None
 
@@ -363,8 +363,8 @@ def _shorten_message(error: BaseException | str) -> str:
     return message if len(message) <= _MAX_MESSAGE else f"{message[: _MAX_MESSAGE - 1]}…"
 
 
-def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:
-    cell_types = {block.type for block in content.cells}
+def _convert_from_meshio(meshio_mesh: meshio.Mesh, scale: float, source: str) -> Mesh:
+    cell_types = {block.type for block in meshio_mesh.cells}
     dimension = 3 if "tetra" in cell_types else 2
     if not cell_types:
         raise ValueError(f"path: {source} does not work as a mesh file: there are no cells in it.")
@@ -373,16 +373,16 @@ def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:
             f"path: {source} holds cells of type {sorted(cell_types)}, but jeit needs linear triangles or tetrahedra. "
             "Save it with elements of order 1 and without quadrilaterals or hexahedra."
         )
-    if other_types := cell_types & ({"quad"} if dimension == 2 else {"hexahedron", "wedge", "pyramid"}):
+    if unsupported_types := cell_types & ({"quad"} if dimension == 2 else {"hexahedron", "wedge", "pyramid"}):
         raise ValueError(
-            f"path: {source} mixes in cells of type {sorted(other_types)}. Split them into simplices first."
+            f"path: {source} mixes in cells of type {sorted(unsupported_types)}. Split them into simplices first."
         )
-    points = np.asarray(content.points, dtype=float) * scale
-    cells = np.concatenate([block.data for block in content.cells if block.type == _CELL_TYPES[dimension]])
+    points = np.asarray(meshio_mesh.points, dtype=float) * scale
+    cells = np.concatenate([block.data for block in meshio_mesh.cells if block.type == _CELL_TYPES[dimension]])
     used_points, inverse = np.unique(cells, return_inverse=True)
     cells = inverse.reshape(cells.shape)
     points = points[used_points]
-    new_index = np.full(len(content.points), -1)
+    new_index = np.full(len(meshio_mesh.points), -1)
     new_index[used_points] = np.arange(len(used_points))
     # The cells are not yet oriented, so boundary facets are identified as the facets that occur once.
     keys, occurrences = np.unique(
@@ -390,7 +390,7 @@ def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:
     )
     boundary = keys[occurrences == 1]
     tags = {}
-    for name, facets in _facet_groups(content, _FACET_TYPES[dimension]).items():
+    for name, facets in _facet_groups(meshio_mesh, _FACET_TYPES[dimension]).items():
         nodes = new_index[facets]
         nodes = nodes[(nodes >= 0).all(axis=1)]
         nodes = nodes[np.isin(topology.facet_keys(nodes, len(used_points)), boundary)]
@@ -406,13 +406,13 @@ def _create_mesh(points: np.ndarray, cells: np.ndarray, tags: Mapping[str, Array
     return Mesh.create(points, cells, tags=tags)
 
 
-def _facet_groups(content: meshio.Mesh, facet_type: str) -> dict[str, np.ndarray]:
+def _facet_groups(meshio_mesh: meshio.Mesh, facet_type: str) -> dict[str, np.ndarray]:
     """Nodes (t, d) of the facets in each named group of a mesh file."""
     groups: dict[str, list[np.ndarray]] = {}
     facet_dimension = 2 if facet_type == "triangle" else 1
-    names = {int(value[0]): name for name, value in content.field_data.items() if int(value[1]) == facet_dimension}
-    physical = content.cell_data.get("gmsh:physical", [])
-    for block, group_numbers in zip(content.cells, physical, strict=False):
+    names = {int(value[0]): name for name, value in meshio_mesh.field_data.items() if int(value[1]) == facet_dimension}
+    physical = meshio_mesh.cell_data.get("gmsh:physical", [])
+    for block, group_numbers in zip(meshio_mesh.cells, physical, strict=False):
         if block.type != facet_type:
             continue
         for value in np.unique(group_numbers):
@@ -420,8 +420,8 @@ def _facet_groups(content: meshio.Mesh, facet_type: str) -> dict[str, np.ndarray
                 name = names.get(int(value), f"physical_{value}")
                 groups.setdefault(name, []).append(block.data[np.asarray(group_numbers) == value])
     if not groups:
-        for name, members in content.cell_sets.items():
-            for block, set_members in zip(content.cells, members, strict=False):
+        for name, members in meshio_mesh.cell_sets.items():
+            for block, set_members in zip(meshio_mesh.cells, members, strict=False):
                 if block.type == facet_type and np.size(set_members) and not name.startswith("gmsh:"):
                     groups.setdefault(name, []).append(block.data[np.asarray(set_members)])
     return {name: np.concatenate(facets) for name, facets in groups.items()}

@@ -117,8 +117,12 @@ def _mesh_with_gmsh(
             for group in gmsh.model.getPhysicalGroups(dimension)
             for entity in gmsh.model.getEntitiesForPhysicalGroup(*group)
         }
-        ungrouped = [entity for _, entity in gmsh.model.getEntities(dimension) if entity not in grouped_entities]
-        added_groups = [(dimension, gmsh.model.addPhysicalGroup(dimension, ungrouped))] if ungrouped else []
+        ungrouped_entities = [
+            entity for _, entity in gmsh.model.getEntities(dimension) if entity not in grouped_entities
+        ]
+        added_groups = (
+            [(dimension, gmsh.model.addPhysicalGroup(dimension, ungrouped_entities))] if ungrouped_entities else []
+        )
         gmsh.option.setNumber("Mesh.MshFileVersion", 2.2)
         gmsh.write(str(path))
         if added_groups:

@@ -136,7 +136,7 @@ class Mesh(Module):
             points=as_array(points if coordinates is None else coordinates),
             cells=as_array(indices.astype(np.int32)),
             facets=as_array(facets.astype(np.int32)),
-            tags={name: as_array(index.astype(np.int32)) for name, index in located.items()},
+            tags={name: as_array(facet_indices.astype(np.int32)) for name, facet_indices in located.items()},
         )
 
 
@@ -182,7 +182,7 @@ def measures(mesh: Mesh) -> Float[Array, " m"]:
     if mesh.is_surface:
         return 0.5 * _length(xp.cross(edges[:, 0], edges[:, 1]))
     if mesh.dimension == 2:
-        return 0.5 * _cross(edges[:, 0], edges[:, 1])
+        return 0.5 * _cross_product(edges[:, 0], edges[:, 1])
     return xp.sum(xp.cross(edges[:, 0], edges[:, 1]) * edges[:, 2], axis=-1) / 6.0
 
 
@@ -217,7 +217,7 @@ def gradients(mesh: Mesh) -> Float[Array, "m k s"]:
         later_gradients = xp.stack([xp.cross(b, normal), xp.cross(normal, a)], axis=1)
     elif mesh.dimension == 2:
         a, b = edges[:, 0], edges[:, 1]
-        determinant = _cross(a, b)[:, None]
+        determinant = _cross_product(a, b)[:, None]
         later_gradients = xp.stack([xp.stack([b[:, 1], -b[:, 0]], -1), xp.stack([-a[:, 1], a[:, 0]], -1)], axis=1)
     else:
         a, b, c = edges[:, 0], edges[:, 1], edges[:, 2]
@@ -303,9 +303,9 @@ def boundary_loops(mesh: Mesh) -> tuple[Int[Array, " b"], Float[Array, " b"]]:
     xp = namespace(mesh)
     is_loop_start = xp.concatenate([xp.ones(1, bool), mesh.facets[1:, 0] != mesh.facets[:-1, 1]])
     # Sums over all pairs of facets, because XLA converts a cumulative sum into dozens of small operations.
-    order = np.arange(mesh.num_facets)
-    loop = xp.sum((order <= order[:, None]) & is_loop_start, axis=1)
-    is_earlier = (order < order[:, None]) & (loop == loop[:, None])
+    facet_order = np.arange(mesh.num_facets)
+    loop = xp.sum((facet_order <= facet_order[:, None]) & is_loop_start, axis=1)
+    is_earlier = (facet_order < facet_order[:, None]) & (loop == loop[:, None])
     return loop, xp.sum(xp.where(is_earlier, facet_measures(mesh), 0), axis=1)
 
 
@@ -326,5 +326,5 @@ def _length(vectors):
     return namespace(vectors).sqrt(vectors[:, 0] ** 2 + vectors[:, 1] ** 2 + vectors[:, 2] ** 2)
 
 
-def _cross(a: Float[Array, "m 2"], b: Float[Array, "m 2"]) -> Float[Array, " m"]:
+def _cross_product(a: Float[Array, "m 2"], b: Float[Array, "m 2"]) -> Float[Array, " m"]:
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

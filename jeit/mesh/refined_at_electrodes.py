@@ -35,18 +35,18 @@ def graded_box(outline: Rectangle, height: float, planes: Sequence[Float[np.ndar
     The mesh has the tags of `jeit.mesh.box`.
     """
     x_min, x_max, y_min, y_max = outline.extent
-    ends = [(x_min, x_max), (y_min, y_max), (0.0, height)]
-    stops = [
+    axis_limits = [(x_min, x_max), (y_min, y_max), (0.0, height)]
+    axis_positions = [
         _distinct_positions(positions, lower_end, upper_end)
-        for positions, (lower_end, upper_end) in zip(planes, ends, strict=True)
+        for positions, (lower_end, upper_end) in zip(planes, axis_limits, strict=True)
     ]
-    max_extent = max(upper_end - lower_end for lower_end, upper_end in ends)
+    max_extent = max(upper_end - lower_end for lower_end, upper_end in axis_limits)
     size = _largest_cell_size(
-        lambda size: float(np.prod([len(_divide_axis(axis_stops, size)) for axis_stops in stops])),
+        lambda size: float(np.prod([len(_divide_axis(axis_stops, size)) for axis_stops in axis_positions])),
         num_points,
         max_extent,
     )
-    node_positions = [_divide_axis(axis_stops, size) for axis_stops in stops]
+    node_positions = [_divide_axis(axis_stops, size) for axis_stops in axis_positions]
     points = np.stack(np.meshgrid(*node_positions[:2], indexing="ij"), axis=-1).reshape(-1, 2)
     plane = Mesh.create(points, _grid_triangles(len(node_positions[0]), len(node_positions[1])))
     return layer(outline.tagged(plane), height, heights=node_positions[2])
@@ -74,8 +74,8 @@ def graded_layers(
     with nodes_of_solid(num_points, lambda num_requested: round(num_requested / len(layer_heights(num_requested)))):
         if isinstance(outline, Disk) and len(rims):
             offset = rims - np.asarray(outline.centre)
-            on_edge = np.abs(np.hypot(*offset.T) - float(outline.radius)) < _MERGE_DISTANCE * float(outline.radius)
-            angles = np.arctan2(offset[on_edge, 1], offset[on_edge, 0])
+            is_on_edge = np.abs(np.hypot(*offset.T) - float(outline.radius)) < _MERGE_DISTANCE * float(outline.radius)
+            angles = np.arctan2(offset[is_on_edge, 1], offset[is_on_edge, 0])
             plane = outline.mesh(num_points=num_nodes, refine=refine, boundary_points=angles if len(angles) else None)
         else:
             plane = outline.mesh(num_points=num_nodes, refine=refine)
@@ -92,23 +92,25 @@ def _distinct_positions(planes: Float[np.ndarray, " k"], lower_end: float, upper
     return np.array([*distinct_positions, upper_end])
 
 
-def _divide_axis(stops: Float[np.ndarray, " s"], max_size: float) -> Float[np.ndarray, " n"]:
-    """Positions of nodes along an axis: the planes `stops`, and nodes between them at distances that grow away from
+def _divide_axis(positions: Float[np.ndarray, " s"], max_size: float) -> Float[np.ndarray, " n"]:
+    """Positions of nodes along an axis: the planes `positions`, and nodes between them at distances that grow away from
     these planes up to `max_size`, metres."""
-    node_positions = [stops[:1]]
-    for lower, upper in pairwise(stops):
-        # Number of cells between `lower` and each of many positions.
-        samples = np.linspace(lower, upper, 400)
+    node_positions = [positions[:1]]
+    for lower_position, upper_position in pairwise(positions):
+        # Number of cells between `lower_position` and each of many positions.
+        samples = np.linspace(lower_position, upper_position, 400)
         midpoints = (samples[1:] + samples[:-1]) / 2
         widths = np.minimum(
-            max_size, _SMALLEST_CELL * max_size + _CELL_GROWTH * np.minimum(midpoints - lower, upper - midpoints)
+            max_size,
+            _SMALLEST_CELL * max_size
+            + _CELL_GROWTH * np.minimum(midpoints - lower_position, upper_position - midpoints),
         )
         cumulative_count = np.concatenate([[0.0], np.cumsum(np.diff(samples) / widths)])
         num_cells = max(1, round(cumulative_count[-1]))
         node_positions.append(
             np.interp(np.arange(1, num_cells + 1) * (cumulative_count[-1] / num_cells), cumulative_count, samples)
         )
-        node_positions[-1][-1] = upper
+        node_positions[-1][-1] = upper_position
     return np.concatenate(node_positions)
 
 
@@ -125,10 +127,12 @@ def _largest_cell_size(count_nodes: Callable[[float], float], num_points: int, m
 
 def _grid_triangles(rows: int, columns: int) -> Int[np.ndarray, "t 3"]:
     """Triangles of a grid of nodes in row-major order: rectangles divided along alternating diagonals."""
-    i, j = (index.ravel() for index in np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij"))
+    i, j = (
+        grid_indices.ravel() for grid_indices in np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij")
+    )
     a = i * columns + j
     b, c, d = a + columns, a + columns + 1, a + 1
     is_even = ((i + j) % 2 == 0)[:, None]
-    first = np.where(is_even, np.stack([a, b, c], axis=1), np.stack([a, b, d], axis=1))
-    second = np.where(is_even, np.stack([a, c, d], axis=1), np.stack([b, c, d], axis=1))
-    return np.concatenate([first, second])
+    first_triangles = np.where(is_even, np.stack([a, b, c], axis=1), np.stack([a, b, d], axis=1))
+    second_triangles = np.where(is_even, np.stack([a, c, d], axis=1), np.stack([b, c, d], axis=1))
+    return np.concatenate([first_triangles, second_triangles])

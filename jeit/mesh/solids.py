@@ -151,12 +151,12 @@ def stacked_cells(cells: np.ndarray, num_nodes: int, num_layers: int) -> np.ndar
     node, so that the tetrahedra of neighbouring prisms match.
     """
     a, b, c = np.sort(cells.astype(np.int64), axis=1).T
-    num_nodes_up = num_nodes
+    num_layer_nodes = num_nodes
     prism = np.stack(
         [
-            np.stack([a, b, c, c + num_nodes_up], axis=1),
-            np.stack([a, b, b + num_nodes_up, c + num_nodes_up], axis=1),
-            np.stack([a, a + num_nodes_up, b + num_nodes_up, c + num_nodes_up], axis=1),
+            np.stack([a, b, c, c + num_layer_nodes], axis=1),
+            np.stack([a, b, b + num_layer_nodes, c + num_layer_nodes], axis=1),
+            np.stack([a, a + num_layer_nodes, b + num_layer_nodes, c + num_layer_nodes], axis=1),
         ],
         axis=1,
     ).reshape(-1, 4)
@@ -228,13 +228,13 @@ def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLi
         "top": cells + num_layers * num_nodes,
         "side": wall_triangles(facets),
     }
-    for name, index in mesh.tags.items():
+    for name, facet_indices in mesh.tags.items():
         new_name = _RENAMED_TAGS.get(name, name)
         if new_name in tags:
             raise ValueError(
                 f"mesh: its tag {name!r} would be called {new_name!r} in the layer, which is taken. Rename it."
             )
-        tags[new_name] = wall_triangles(facets[np.asarray(index)])
+        tags[new_name] = wall_triangles(facets[np.asarray(facet_indices)])
     with size_checked():
         return Mesh.create(points, tetrahedra, tags=tags)
 

@@ -40,14 +40,14 @@ def match_facets(facets: np.ndarray, num_points: int) -> tuple[np.ndarray, np.nd
     """Pairs of rows of `facets` with the same nodes, as (first, second, crowded): `first` and `second` contain the two
     rows of each pair. If a facet occurs three times, `crowded` contains its three rows, and no pairs are returned."""
     key = facet_keys(facets, num_points)
-    order = np.argsort(key, kind="stable")
-    sorted_keys = key[order]
+    sort_order = np.argsort(key, kind="stable")
+    sorted_keys = key[sort_order]
     is_same = sorted_keys[1:] == sorted_keys[:-1]
     triple_positions = np.flatnonzero(is_same[1:] & is_same[:-1])
     if triple_positions.size:
-        return order[:0], order[:0], order[triple_positions[0] : triple_positions[0] + 3]
+        return sort_order[:0], sort_order[:0], sort_order[triple_positions[0] : triple_positions[0] + 3]
     position = np.flatnonzero(is_same)
-    return order[position], order[position + 1], order[:0]
+    return sort_order[position], sort_order[position + 1], sort_order[:0]
 
 
 def pair_facets(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -58,24 +58,25 @@ def pair_facets(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     facets = cell_facets(cells)
     width = cells.shape[1]
-    first, second, crowded = match_facets(facets, int(cells.max()) + 1)
-    if crowded.size:
+    first_facets, second_facets, overcrowded_facets = match_facets(facets, int(cells.max()) + 1)
+    if overcrowded_facets.size:
         raise ValueError(
-            f"cells: the facet with nodes {np.sort(facets[crowded[0]]).tolist()} belongs to more than two cells "
-            f"(among them {(crowded // width).tolist()}), so the mesh is not manifold. Remove the surplus cells."
+            f"cells: the facet with nodes {np.sort(facets[overcrowded_facets[0]]).tolist()} belongs to more than two "
+            f"cells (among them {(overcrowded_facets // width).tolist()}), so the mesh is not manifold. Remove the "
+            "surplus cells."
         )
     is_odd = odd_permutation(facets)
-    overlapping = np.flatnonzero(is_odd[first] == is_odd[second])
+    overlapping = np.flatnonzero(is_odd[first_facets] == is_odd[second_facets])
     if overlapping.size:
-        pair = np.sort([first[overlapping[0]] // width, second[overlapping[0]] // width]).tolist()
+        pair = np.sort([first_facets[overlapping[0]] // width, second_facets[overlapping[0]] // width]).tolist()
         raise ValueError(
             f"cells: {overlapping.size} pair(s) of neighbouring cells overlap, first {pair}: both lie on the same side "
             "of the facet they share. A node has been moved across a facet (an inverted cell), or the cells "
             "come from two meshes laid over each other. Rebuild the mesh or move the node back."
         )
     is_paired = np.zeros(len(facets), bool)
-    is_paired[first] = is_paired[second] = True
-    return first, second, np.flatnonzero(~is_paired)
+    is_paired[first_facets] = is_paired[second_facets] = True
+    return first_facets, second_facets, np.flatnonzero(~is_paired)
 
 
 def order_loops(facets: np.ndarray, points: np.ndarray | None) -> np.ndarray:
@@ -133,12 +134,12 @@ def check_loop(vertices: ArrayLike, name: str, *, clockwise: bool) -> np.ndarray
             f"{name}: vertex {invalid_vertex} is {loop[invalid_vertex].tolist()}. Every coordinate must be a finite "
             "number."
         )
-    extent = np.ptp(loop, axis=0).max()
+    largest_side = np.ptp(loop, axis=0).max()
     length = np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1)
-    if length.min() <= 1e-9 * extent:
-        first = int(np.argmin(length))
-        hint = " Do not repeat the first vertex at the end." if first == len(loop) - 1 else " Remove one."
-        raise ValueError(f"{name}: vertices {first} and {(first + 1) % len(loop)} coincide.{hint}")
+    if length.min() <= 1e-9 * largest_side:
+        first_index = int(np.argmin(length))
+        vertex_hint = " Do not repeat the first vertex at the end." if first_index == len(loop) - 1 else " Remove one."
+        raise ValueError(f"{name}: vertices {first_index} and {(first_index + 1) % len(loop)} coincide.{vertex_hint}")
     crossing = _first_crossing(loop)
     if crossing is not None:
         raise ValueError(
@@ -150,14 +151,14 @@ def check_loop(vertices: ArrayLike, name: str, *, clockwise: bool) -> np.ndarray
     return loop
 
 
-def check_apart(outer: np.ndarray, holes: Sequence[np.ndarray]) -> None:
+def check_holes(outer_loop: np.ndarray, holes: Sequence[np.ndarray]) -> None:
     """Raise `ValueError` unless every hole lies inside the outline and is separate from the other holes."""
     for k, hole in enumerate(holes):
-        if not is_inside_loops(hole, [outer]).all() or _touches(hole, outer):
+        if not is_inside_loops(hole, [outer_loop]).all() or _are_touching(hole, outer_loop):
             raise ValueError(f"holes[{k}]: does not lie strictly inside the outline. Move or shrink it.")
         for j, other_hole in enumerate(holes[:k]):
             if (
-                _touches(hole, other_hole)
+                _are_touching(hole, other_hole)
                 or is_inside_loops(hole[:1], [other_hole])[0]
                 or is_inside_loops(other_hole[:1], [hole])[0]
             ):
@@ -176,15 +177,17 @@ def is_inside_loops(points: np.ndarray, loops: Sequence[np.ndarray]) -> np.ndarr
     return result
 
 
-def along(points: np.ndarray, loop: np.ndarray) -> np.ndarray:
+def project_to_loop(points: np.ndarray, loop: np.ndarray) -> np.ndarray:
     """Arc length (p,) from the first vertex of a loop to the point of the loop that is nearest to each of `points` (p,
     2)."""
     sides = np.roll(loop, -1, axis=0) - loop
     offset = points[:, None] - loop
     fraction = np.clip((offset * sides).sum(-1) / (sides**2).sum(-1), 0.0, 1.0)
-    nearest = np.argmin(np.linalg.norm(offset - fraction[..., None] * sides, axis=-1), axis=1)
+    nearest_sides = np.argmin(np.linalg.norm(offset - fraction[..., None] * sides, axis=-1), axis=1)
     length = np.linalg.norm(sides, axis=1)
-    return np.cumsum(length)[nearest] - (1 - fraction[np.arange(len(points)), nearest]) * length[nearest]
+    return (
+        np.cumsum(length)[nearest_sides] - (1 - fraction[np.arange(len(points)), nearest_sides]) * length[nearest_sides]
+    )
 
 
 def distance(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -199,14 +202,14 @@ def _signed_area_of_corner(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.nd
     return (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])
 
 
-def _intersecting_sides(first: np.ndarray, second: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
+def _intersecting_sides(first_loop: np.ndarray, second_loop: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
     """Yield, in order and in batches, pairs (p, 2) of a side of the first loop and a side of the second loop that cross
     or come within `tolerance` of each other. Only sides whose bounding boxes overlap are tested."""
-    a, b, c, d = first, np.roll(first, -1, axis=0), second, np.roll(second, -1, axis=0)
+    a, b, c, d = first_loop, np.roll(first_loop, -1, axis=0), second_loop, np.roll(second_loop, -1, axis=0)
     lower_corners, upper_corners = np.minimum(a, b) - tolerance, np.maximum(a, b) + tolerance
     other_lower_corners, other_upper_corners = np.minimum(c, d), np.maximum(c, d)
-    batch_size = max(1, _PAIRS_PER_BATCH // len(second))
-    for start in range(0, len(first), batch_size):
+    batch_size = max(1, _PAIRS_PER_BATCH // len(second_loop))
+    for start in range(0, len(first_loop), batch_size):
         block = slice(start, start + batch_size)
         boxes_overlap = (
             (lower_corners[block, None] <= other_upper_corners) & (other_lower_corners <= upper_corners[block, None])
@@ -254,5 +257,7 @@ def _first_crossing(loop: np.ndarray) -> tuple[int, int] | None:
     return None
 
 
-def _touches(first: np.ndarray, second: np.ndarray) -> bool:
-    return any(len(pairs) for pairs in _intersecting_sides(first, second, 1e-9 * np.ptp(second, axis=0).max()))
+def _are_touching(first_loop: np.ndarray, second_loop: np.ndarray) -> bool:
+    return any(
+        len(pairs) for pairs in _intersecting_sides(first_loop, second_loop, 1e-9 * np.ptp(second_loop, axis=0).max())
+    )

@@ -4,10 +4,10 @@ cells.
 The steps:
 
 1. `outline_nodes`: place nodes along the outline at distances of the cell size;
-2. `fill`: insert circumcentres of cells that are too large, many at a time (Delaunay refinement);
-3. `smooth`: move every free node to the weighted mean of the circumcentres around it (optimal Delaunay
+2. `insert_nodes`: insert circumcentres of cells that are too large, many at a time (Delaunay refinement);
+3. `smooth_nodes`: move every free node to the weighted mean of the circumcentres around it (optimal Delaunay
    triangulation, L. Chen and J. Xu, J. Comput. Math. 22 (2004) 299), triangulating again after each step;
-4. `polish` and `repair` until the smallest angle is large enough.
+4. `improve_worst_cells` and `repair` until the smallest angle is large enough.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.spatial import Delaunay, KDTree
 
-from jeit.mesh.generate.curve import Curve, Size, divide, is_within
+from jeit.mesh.generate.curve import Curve, Size, divide, is_inside_curves
 
 
 @dataclass
@@ -33,8 +33,8 @@ class Front:
     curves: list[Curve]
     stops: list[np.ndarray]
     guards: list[np.ndarray]
-    fixed: np.ndarray
-    free: np.ndarray
+    fixed_nodes: np.ndarray
+    free_nodes: np.ndarray
 
     @property
     def num_outline(self) -> int:
@@ -44,13 +44,13 @@ class Front:
     @property
     def num_immovable_nodes(self) -> int:
         """Number of nodes that may not move: the nodes on the outline and the fixed nodes."""
-        return self.num_outline + len(self.fixed)
+        return self.num_outline + len(self.fixed_nodes)
 
     def points(self) -> np.ndarray:
         """All nodes (n, 2): the nodes of the first curve, of the second curve and so on, then fixed nodes, then free
         nodes."""
-        on_curves = [curve.at(stops) for curve, stops in zip(self.curves, self.stops, strict=True)]
-        return np.concatenate([*on_curves, self.fixed, self.free])
+        on_curves = [curve.points_at(stops) for curve, stops in zip(self.curves, self.stops, strict=True)]
+        return np.concatenate([*on_curves, self.fixed_nodes, self.free_nodes])
 
     def segments(self) -> np.ndarray:
         """Outline segments as pairs of nodes (s, 2), in the order of their first nodes."""
@@ -86,22 +86,22 @@ def triangulate(front: Front, points: np.ndarray) -> np.ndarray:
     outline = points[: front.num_outline]
     # With distant auxiliary nodes, the outline is not part of the convex hull, where collinear nodes would produce
     # slivers.
-    extent = np.ptp(outline, axis=0).max()
+    largest_side = np.ptp(outline, axis=0).max()
     angle = 2 * np.pi * (np.arange(16) + 0.37) / 16
-    auxiliary_nodes = outline.mean(axis=0) + 4 * extent * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    auxiliary_nodes = outline.mean(axis=0) + 4 * largest_side * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     cells = Delaunay(np.concatenate([points, auxiliary_nodes])).simplices
     cells = cells[(cells < len(points)).all(axis=1)]
     # A cell with a node in the interior lies inside; only cells whose nodes are all on the outline need a test.
     outline_cells = np.flatnonzero((cells < front.num_outline).all(axis=1))
     is_inside = np.ones(len(cells), bool)
-    is_inside[outline_cells] = is_within(front.curves, points[cells[outline_cells]].mean(axis=1))
+    is_inside[outline_cells] = is_inside_curves(front.curves, points[cells[outline_cells]].mean(axis=1))
     cells = cells[is_inside]
     is_clockwise = doubled_areas(points, cells) < 0
     cells[is_clockwise] = cells[is_clockwise][:, [0, 2, 1]]
     return cells
 
 
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def cross_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Cross products (…) of plane vectors (…, 2)."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
@@ -109,14 +109,14 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def doubled_areas(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Twice the signed area (m,) of the triangles."""
     corners = points[cells]
-    return cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return cross_product(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def circumcircles(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Centres (m, 2) and radii (m,) of the circumscribed circles."""
     a = points[cells[:, 0]]
     b, c = points[cells[:, 1]] - a, points[cells[:, 2]] - a
-    area = 2 * cross(b, c)
+    area = 2 * cross_product(b, c)
     area = np.where(np.abs(area) < 1e-300, 1e-300, area)
     bb, cc = (b**2).sum(1), (c**2).sum(1)
     centre = np.stack([c[:, 1] * bb - b[:, 1] * cc, b[:, 0] * cc - c[:, 0] * bb], axis=1) / area[:, None]
@@ -127,23 +127,23 @@ def smallest_angles(corners: np.ndarray) -> np.ndarray:
     """Smallest angle (…) of triangles (…, 3, 2), in degrees; negative for clockwise triangles."""
     edges = np.roll(corners, -1, axis=-2) - corners
     length = np.sort(np.sqrt((edges**2).sum(-1)), axis=-1)
-    area = cross(edges[..., 0, :], edges[..., 1, :])
+    area = cross_product(edges[..., 0, :], edges[..., 1, :])
     # Sine of the angle opposite to the shortest side, which is below 90°, so that its arcsine is the angle.
     sine = area / np.maximum(length[..., 1] * length[..., 2], 1e-300)
     return np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0)))
 
 
-def select_apart(points: np.ndarray, radius: np.ndarray, priority: np.ndarray) -> np.ndarray:
+def select_spaced_points(points: np.ndarray, radius: np.ndarray, priority: np.ndarray) -> np.ndarray:
     """Select points greedily in order of decreasing `priority`, skipping points within `radius` of a selected point.
     Returns the indices of the selected points."""
     order = np.argsort(-priority, kind="stable")
     neighbours = KDTree(points[order]).query_ball_point(points[order], radius[order], return_sorted=False)
     is_selected = np.zeros(len(points), bool)
     is_blocked = np.zeros(len(points), bool)
-    for index, others in enumerate(neighbours):
-        if not is_blocked[index]:
-            is_selected[index] = True
-            is_blocked[others] = True
+    for rank, neighbour_indices in enumerate(neighbours):
+        if not is_blocked[rank]:
+            is_selected[rank] = True
+            is_blocked[neighbour_indices] = True
     return order[is_selected]
 
 
@@ -155,19 +155,19 @@ def is_clear_of_outline(front: Front, nodes: np.ndarray, points: np.ndarray, gap
     segments = front.segments()
     start, end = nodes[segments[:, 0]], nodes[segments[:, 1]]
     tree = KDTree(0.5 * (start + end))
-    _, nearest = tree.query(points, k=min(3, len(segments)))
+    _, nearest_segments = tree.query(points, k=min(3, len(segments)))
     distances = np.full(len(points), np.inf)
-    for column in nearest.reshape(len(points), -1).T:
+    for column in nearest_segments.reshape(len(points), -1).T:
         direction, offset = end[column] - start[column], points - start[column]
         fraction = np.clip((offset * direction).sum(1) / (direction**2).sum(1), 0.0, 1.0)
         distances = np.minimum(distances, np.linalg.norm(offset - fraction[:, None] * direction, axis=1))
     is_clear = distances > gap
-    is_clear[is_clear] = is_within(front.curves, points[is_clear])
+    is_clear[is_clear] = is_inside_curves(front.curves, points[is_clear])
     return is_clear
 
 
 # Angles in degrees: the guaranteed minimum angle; the minimum that `repair` aims at, which is slightly larger; and the
-# angle below which `polish` improves a cell. Last, the maximum number of rounds of `repair`.
+# angle below which `improve_worst_cells` improves a cell. Last, the maximum number of rounds of `repair`.
 PROMISED_ANGLE = 25.0
 _REPAIR_ANGLE = 25.5
 _POLISH_ANGLE = 31.0
@@ -193,7 +193,7 @@ def missing_segments(front: Front, cells: np.ndarray, num_points: int) -> np.nda
     return np.flatnonzero(~is_present)
 
 
-def polish(front: Front, passes: int = 4) -> None:
+def improve_worst_cells(front: Front, passes: int = 4) -> None:
     """Move the free nodes of the worst cells so that the smallest angle around each of these nodes grows.
 
     Steps in eight directions are tried for each node, because the smallest angle is not differentiable where two cells
@@ -216,16 +216,16 @@ def polish(front: Front, passes: int = 4) -> None:
             star_corners = order[bounds[node] : bounds[node + 1]]
             corner = star_corners % 3
             star_cells = cells[star_corners // 3]
-            second = points[star_cells[np.arange(len(star_corners)), (corner + 1) % 3]]
-            third = points[star_cells[np.arange(len(star_corners)), (corner + 2) % 3]]
-            mean_length = np.linalg.norm(second - points[node], axis=1).mean()
+            second_corners = points[star_cells[np.arange(len(star_corners)), (corner + 1) % 3]]
+            third_corners = points[star_cells[np.arange(len(star_corners)), (corner + 2) % 3]]
+            mean_length = np.linalg.norm(second_corners - points[node], axis=1).mean()
             trial_points = points[node] + np.concatenate([np.zeros((1, 2)), mean_length * _TRIAL_STEPS])
             shape = (len(trial_points), len(star_corners), 2)
             corners = np.stack(
                 [
                     np.broadcast_to(trial_points[:, None], shape),
-                    np.broadcast_to(second, shape),
-                    np.broadcast_to(third, shape),
+                    np.broadcast_to(second_corners, shape),
+                    np.broadcast_to(third_corners, shape),
                 ],
                 axis=2,
             )
@@ -234,7 +234,7 @@ def polish(front: Front, passes: int = 4) -> None:
             if min_angles[best_index] > min_angles[0] + 1e-3:
                 points[node] = trial_points[best_index]
                 has_moved = True
-        front.free = points[num_immovable_nodes:]
+        front.free_nodes = points[num_immovable_nodes:]
         if not has_moved:
             return
 
@@ -260,13 +260,13 @@ def repair(front: Front) -> bool:
             return True
         _insert_circumcentres(front, points, cells[bad_cells], angle[bad_cells])
         if round_number % 3 == 2:
-            polish(front, passes=2)
+            improve_worst_cells(front, passes=2)
     return False
 
 
 def _diametral_circles(front: Front, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    ends = points[front.segments()]
-    return ends.mean(axis=1), 0.5 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    end_points = points[front.segments()]
+    return end_points.mean(axis=1), 0.5 * np.linalg.norm(end_points[:, 1] - end_points[:, 0], axis=1)
 
 
 def _is_divisible(front: Front) -> np.ndarray:
@@ -278,11 +278,11 @@ def _recover(front: Front, points: np.ndarray, missing_indices: np.ndarray, *, r
     """Make missing outline segments appear as edges of cells: remove the free nodes close to them or, if there are
     none, halve the segments."""
     centres, radii = _diametral_circles(front, points)
-    if remove and len(front.free):
-        neighbours = KDTree(front.free).query_ball_point(centres[missing_indices], radii[missing_indices])
+    if remove and len(front.free_nodes):
+        neighbours = KDTree(front.free_nodes).query_ball_point(centres[missing_indices], radii[missing_indices])
         removed_nodes = np.unique(np.concatenate([np.asarray(indices, dtype=int) for indices in neighbours]))
         if removed_nodes.size:
-            front.free = np.delete(front.free, removed_nodes, axis=0)
+            front.free_nodes = np.delete(front.free_nodes, removed_nodes, axis=0)
             return
     is_divisible = _is_divisible(front)[missing_indices]
     front.divide(missing_indices[is_divisible])
@@ -290,7 +290,7 @@ def _recover(front: Front, points: np.ndarray, missing_indices: np.ndarray, *, r
 
 def _insert_circumcentres(front: Front, points: np.ndarray, bad_cells: np.ndarray, angle: np.ndarray) -> None:
     centre, radius = circumcircles(points, bad_cells)
-    selected = select_apart(centre, radius, -angle)
+    selected = select_spaced_points(centre, radius, -angle)
     centre = centre[selected]
     centres, radii = _diametral_circles(front, points)
     is_divisible = _is_divisible(front)
@@ -300,7 +300,7 @@ def _insert_circumcentres(front: Front, points: np.ndarray, bad_cells: np.ndarra
     is_affected = np.zeros(len(centre), bool)
     for index in np.flatnonzero(is_encroached):
         is_affected[neighbours[index]] = True
-    is_outside = ~is_within(front.curves, centre)
+    is_outside = ~is_inside_curves(front.curves, centre)
     lost_centres = np.flatnonzero(is_outside & ~is_affected)
     if lost_centres.size:
         is_encroached[KDTree(centres).query(centre[lost_centres])[1]] = True
@@ -308,7 +308,7 @@ def _insert_circumcentres(front: Front, points: np.ndarray, bad_cells: np.ndarra
     if len(accepted):
         accepted = accepted[is_clear_of_outline(front, points, accepted, np.zeros(len(accepted)))]
     halved_segments = np.flatnonzero(is_encroached & is_divisible)
-    front.free = np.concatenate([front.free, accepted])
+    front.free_nodes = np.concatenate([front.free_nodes, accepted])
     front.divide(halved_segments)
 
 
@@ -321,11 +321,11 @@ _SHARP_CORNER = np.radians(75.0)
 
 
 def outline_nodes(
-    curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray, size: Size, guard_ratio: float
+    curves: list[Curve], arc_lengths: list[np.ndarray], fixed_nodes: np.ndarray, size: Size, guard_ratio: float
 ) -> Front:
     """Place nodes on the outline and cut off sharp corners at a distance of `guard_ratio` times the local cell size."""
     all_stops, guarded_lengths = [], []
-    for curve, required_stops in zip(curves, stops, strict=True):
+    for curve, required_stops in zip(curves, arc_lengths, strict=True):
         stop_lengths = np.unique(np.concatenate([curve.corners, required_stops % curve.length]))
         sharp_corners = np.flatnonzero(curve.angles < _SHARP_CORNER)
         added_stops = []
@@ -334,15 +334,17 @@ def outline_nodes(
             gap_ahead = np.min((stop_lengths - corner_length - 1e-12 * curve.length) % curve.length)
             gap_behind = np.min((corner_length - stop_lengths - 1e-12 * curve.length) % curve.length)
             cut_length = min(
-                guard_ratio * float(size(curve.at(np.array([corner_length])))[0]), 0.45 * gap_ahead, 0.45 * gap_behind
+                guard_ratio * float(size(curve.points_at(np.array([corner_length])))[0]),
+                0.45 * gap_ahead,
+                0.45 * gap_behind,
             )
             added_stops += [(corner_length + cut_length) % curve.length, (corner_length - cut_length) % curve.length]
         all_stops.append(divide(curve, np.concatenate([stop_lengths, added_stops]), size))
         guarded_lengths.append(curve.corners[sharp_corners])
-    return Front(curves, all_stops, guarded_lengths, fixed, np.zeros((0, 2)))
+    return Front(curves, all_stops, guarded_lengths, fixed_nodes, np.zeros((0, 2)))
 
 
-def fill(front: Front, size: Size) -> None:
+def insert_nodes(front: Front, size: Size) -> None:
     """Insert nodes until no cell is larger than `size` allows."""
     for _ in range(200):
         points = front.points()
@@ -355,13 +357,13 @@ def fill(front: Front, size: Size) -> None:
         if not is_clear.any():
             return
         centre, ratio, sizes = centre[is_clear], ratio[is_clear], sizes[is_clear]
-        front.free = np.concatenate([front.free, centre[select_apart(centre, 0.95 * sizes, ratio)]])
+        front.free_nodes = np.concatenate([front.free_nodes, centre[select_spaced_points(centre, 0.95 * sizes, ratio)]])
 
 
-def smooth(front: Front, size: Size, steps: int = _SMOOTHING_STEPS) -> None:
+def smooth_nodes(front: Front, size: Size, steps: int = _SMOOTHING_STEPS) -> None:
     """Move the free nodes towards the optimal Delaunay triangulation for the requested cell sizes."""
     num_immovable_nodes = front.num_immovable_nodes
-    if not len(front.free):
+    if not len(front.free_nodes):
         return
     for _ in range(steps):
         points = front.points()
@@ -383,31 +385,31 @@ def smooth(front: Front, size: Size, steps: int = _SMOOTHING_STEPS) -> None:
         )[num_immovable_nodes:]
         has_cells = node_sums[:, 2] > 0
         target = np.where(
-            has_cells[:, None], node_sums[:, :2] / np.where(has_cells, node_sums[:, 2], 1.0)[:, None], front.free
+            has_cells[:, None], node_sums[:, :2] / np.where(has_cells, node_sums[:, 2], 1.0)[:, None], front.free_nodes
         )
         is_clear = is_clear_of_outline(front, points, target, 0.45 * size(target))
-        front.free = np.where(is_clear[:, None], target, front.free)
+        front.free_nodes = np.where(is_clear[:, None], target, front.free_nodes)
 
 
 def generate(
-    curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray, size: Size, front: Front | None = None
+    curves: list[Curve], arc_lengths: list[np.ndarray], fixed_nodes: np.ndarray, size: Size, front: Front | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mesh the region inside the first of `curves` and outside the other curves, which are holes: points (n, 2) and
     cells (m, 3).
 
-    Nodes are placed at `stops`, arc lengths on each curve, and at `fixed`, points (f, 2) inside the region. `size`
-    returns the requested edge length at points (p, 2). If `front` is specified, it must already be filled for this
-    size, and the steps `outline_nodes` and `fill` are skipped. Node 0 is the first node of the first curve. Raises
-    `ValueError` if no mesh with the guaranteed minimum angle is found.
+    Nodes are placed at `arc_lengths`, arc lengths on each curve, and at `fixed_nodes`, points (f, 2) inside the region.
+    `size` returns the requested edge length at points (p, 2). If `front` is specified, it must already be filled for
+    this size, and the steps `outline_nodes` and `insert_nodes` are skipped. Node 0 is the first node of the first
+    curve. Raises `ValueError` if no mesh with the guaranteed minimum angle is found.
     """
     for guard_ratio in (1.0, 0.5, 0.25):
         if front is None:
-            front = outline_nodes(curves, stops, fixed, size, guard_ratio)
-            fill(front, size)
-        smooth(front, size)
-        polish(front)
+            front = outline_nodes(curves, arc_lengths, fixed_nodes, size, guard_ratio)
+            insert_nodes(front, size)
+        smooth_nodes(front, size)
+        improve_worst_cells(front)
         is_repaired = repair(front)
-        polish(front, passes=1)
+        improve_worst_cells(front, passes=1)
         points = front.points()
         cells = triangulate(front, points)
         angle = smallest_angles(points[cells])

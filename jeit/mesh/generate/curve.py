@@ -17,15 +17,15 @@ Size = Callable[[np.ndarray], np.ndarray]
 class Curve:
     """A closed curve of `length` metres.
 
-    **Fields**: `at`: function that returns the points (p, 2) at arc lengths (p,); `inside`: function that returns
-    whether the curve encloses points; `distance`: function that returns the distances of points from the curve, metres;
-    `corners`: arc lengths of the corners, which always become nodes; `angles`: interior angles of the domain at the
-    corners, radians.
+    **Fields**: `points_at`: function that returns the points (p, 2) at arc lengths (p,); `contains`: function that
+    returns whether the curve encloses points; `distance`: function that returns the distances of points from the curve,
+    metres; `corners`: arc lengths of the corners, which always become nodes; `angles`: interior angles of the domain at
+    the corners, radians.
     """
 
     length: float
-    at: Callable[[np.ndarray], np.ndarray]
-    inside: Callable[[np.ndarray], np.ndarray]
+    points_at: Callable[[np.ndarray], np.ndarray]
+    contains: Callable[[np.ndarray], np.ndarray]
     distance: Callable[[np.ndarray], np.ndarray]
     corners: np.ndarray
     angles: np.ndarray
@@ -43,31 +43,31 @@ def circle(radius: float, centre: np.ndarray) -> Curve:
 
     return Curve(
         length=2 * np.pi * radius,
-        at=at,
-        inside=lambda points: from_centre(points) < radius,
+        points_at=at,
+        contains=lambda points: from_centre(points) < radius,
         distance=lambda points: np.abs(radius - from_centre(points)),
         corners=np.zeros(0),
         angles=np.zeros(0),
     )
 
 
-def smooth(length: float, at: Callable[[np.ndarray], np.ndarray], num_chords: int = 720) -> Curve:
+def create_smooth_curve(length: float, at: Callable[[np.ndarray], np.ndarray], num_chords: int = 720) -> Curve:
     """A closed curve without corners. `at` returns points (p, 2) at arc lengths (p,); the domain lies to the left.
 
     The functions `inside` and `distance` of the curve use a polygon of `num_chords` chords.
     """
     chords = at(length * np.arange(num_chords) / num_chords)
     inscribed = closed_line(chords)
-    return Curve(length, at, inscribed.inside, inscribed.distance, np.zeros(0), np.zeros(0))
+    return Curve(length, at, inscribed.contains, inscribed.distance, np.zeros(0), np.zeros(0))
 
 
 def closed_line(vertices: np.ndarray) -> Curve:
     """A closed polygon; arc length starts at the first vertex, and the domain lies to the left."""
     closed_vertices = np.concatenate([vertices, vertices[:1]])
-    stops = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed_vertices, axis=0), axis=1))])
+    arc_lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed_vertices, axis=0), axis=1))])
 
     def at(arc_length: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(arc_length, stops, closed_vertices[:, axis]) for axis in range(2)], axis=-1)
+        return np.stack([np.interp(arc_length, arc_lengths, closed_vertices[:, axis]) for axis in range(2)], axis=-1)
 
     def distance(points: np.ndarray) -> np.ndarray:
         result = np.full(len(points), np.inf)
@@ -76,47 +76,48 @@ def closed_line(vertices: np.ndarray) -> Curve:
         return result
 
     forward = np.roll(vertices, -1, axis=0) - vertices
-    backward = np.roll(vertices, 1, axis=0) - vertices
+    previous_sides = np.roll(vertices, 1, axis=0) - vertices
     angles = np.arctan2(
-        forward[:, 0] * backward[:, 1] - forward[:, 1] * backward[:, 0], (forward * backward).sum(axis=1)
+        forward[:, 0] * previous_sides[:, 1] - forward[:, 1] * previous_sides[:, 0],
+        (forward * previous_sides).sum(axis=1),
     )
     return Curve(
-        length=float(stops[-1]),
-        at=at,
-        inside=lambda points: topology.is_inside_loops(points, [vertices]),
+        length=float(arc_lengths[-1]),
+        points_at=at,
+        contains=lambda points: topology.is_inside_loops(points, [vertices]),
         distance=distance,
-        corners=stops[:-1],
+        corners=arc_lengths[:-1],
         angles=np.mod(angles, 2 * np.pi),
     )
 
 
-def is_within(curves: list[Curve], points: np.ndarray) -> np.ndarray:
+def is_inside_curves(curves: list[Curve], points: np.ndarray) -> np.ndarray:
     """Whether points lie inside the first curve and outside all other curves, which are holes."""
     result = np.zeros(len(points), bool)
     for curve in curves:
-        result ^= curve.inside(points)
+        result ^= curve.contains(points)
     return result
 
 
-def divide(curve: Curve, stops: np.ndarray, size: Size) -> np.ndarray:
-    """Arc lengths of nodes along a curve, which include `stops` and are spaced by the cell size that `size`
+def divide(curve: Curve, arc_lengths: np.ndarray, size: Size) -> np.ndarray:
+    """Arc lengths of nodes along a curve, which include `arc_lengths` and are spaced by the cell size that `size`
     requests."""
-    stops = np.unique(stops)
-    if not len(stops):
-        stops = np.zeros(1)
-    samples = np.append(stops, stops[0] + curve.length)
+    arc_lengths = np.unique(arc_lengths)
+    if not len(arc_lengths):
+        arc_lengths = np.zeros(1)
+    samples = np.append(arc_lengths, arc_lengths[0] + curve.length)
     while True:
         midpoints, widths = 0.5 * (samples[1:] + samples[:-1]), np.diff(samples)
-        is_long = widths > 0.5 * size(curve.at(midpoints % curve.length))
+        is_long = widths > 0.5 * size(curve.points_at(midpoints % curve.length))
         if not is_long.any():
             break
         samples = np.sort(np.concatenate([samples, midpoints[is_long]]))
-    density = 1.0 / size(curve.at(0.5 * (samples[1:] + samples[:-1]) % curve.length))
+    density = 1.0 / size(curve.points_at(0.5 * (samples[1:] + samples[:-1]) % curve.length))
     cumulative_count = np.concatenate([[0.0], np.cumsum(np.diff(samples) * density)])
-    stop_counts = np.interp(np.append(stops, stops[0] + curve.length), samples, cumulative_count)
-    min_pieces = max(1, -(-3 // len(stops)))
+    stop_counts = np.interp(np.append(arc_lengths, arc_lengths[0] + curve.length), samples, cumulative_count)
+    min_pieces = max(1, -(-3 // len(arc_lengths)))
     node_lengths = []
-    for start, start_count, end_count in zip(stops, stop_counts[:-1], stop_counts[1:], strict=True):
+    for start, start_count, end_count in zip(arc_lengths, stop_counts[:-1], stop_counts[1:], strict=True):
         num_pieces = max(min_pieces, round(end_count - start_count))
         inner_stops = np.interp(
             start_count + (end_count - start_count) * np.arange(1, num_pieces) / num_pieces, cumulative_count, samples

@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
-from jeit.mesh.generate.curve import Curve, Size, is_within
+from jeit.mesh.generate.curve import Curve, Size, is_inside_curves
 from jeit_solvers.module import Module
 
 # Factor between successive trial numbers of nodes, and maximum number of nodes tried.
@@ -218,13 +218,13 @@ def limit_growth(curves: list[Curve], function: Callable[[np.ndarray], Any], res
     The minimum is computed on a grid by Dijkstra's algorithm; where f(x) itself is smaller than the minimum on the
     grid, f(x) is used. Raises `ValueError` if the function does not return one positive, finite size per point.
     """
-    outline = curves[0].at(np.linspace(0, curves[0].length, 721))
+    outline = curves[0].points_at(np.linspace(0, curves[0].length, 721))
     lower, upper = outline.min(axis=0), outline.max(axis=0)
     step = float((upper - lower).max()) / resolution
     axes = [np.arange(lower[k] - step, upper[k] + 2 * step, step) for k in (0, 1)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     shape, grid_points = grid.shape[:2], grid.reshape(-1, 2)
-    inside_nodes = np.flatnonzero(is_within(curves, grid_points))
+    inside_nodes = np.flatnonzero(is_inside_curves(curves, grid_points))
     values = np.asarray(function(grid_points[inside_nodes]), dtype=float)
     if values.shape != (len(inside_nodes),):
         raise ValueError(

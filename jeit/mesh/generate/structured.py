@@ -18,14 +18,17 @@ from jeit.mesh.generate.refine import TooFewNodes
 _ROW_HEIGHT = 0.93
 
 
-def zip_chains(outer: np.ndarray, inner: np.ndarray, *, is_closed: bool) -> np.ndarray:
-    """Triangles (t, 3) between two chains of nodes that run in the same direction, `inner` to the left of `outer`.
+def triangulate_between_chains(outer_chain: np.ndarray, inner_chain: np.ndarray, *, is_closed: bool) -> np.ndarray:
+    """Triangles (t, 3) between two chains of nodes that run in the same direction, `inner_chain` to the left of
+    `outer_chain`.
 
-    `outer` and `inner` are node indices, evenly spaced along their chains; a closed chain returns to its first node.
-    Each segment of a chain forms a triangle with the node opposite to it on the other chain. The triangles are ordered
-    by the midpoints of their segments.
+    `outer_chain` and `inner_chain` are node indices, evenly spaced along their chains; a closed chain returns to its
+    first node. Each segment of a chain forms a triangle with the node opposite to it on the other chain. The triangles
+    are ordered by the midpoints of their segments.
     """
-    num_outer, num_inner = (len(outer), len(inner)) if is_closed else (len(outer) - 1, len(inner) - 1)
+    num_outer, num_inner = (
+        (len(outer_chain), len(inner_chain)) if is_closed else (len(outer_chain) - 1, len(inner_chain) - 1)
+    )
     # Midpoints multiplied by 2 N_outer N_inner, as integers, so that ties are exact.
     outer_middle = (2 * np.arange(num_outer) + 1) * num_inner
     inner_middle = (2 * np.arange(num_inner) + 1) * num_outer
@@ -33,10 +36,20 @@ def zip_chains(outer: np.ndarray, inner: np.ndarray, *, is_closed: bool) -> np.n
     facing_outer = np.searchsorted(outer_middle, inner_middle, side="right")
     step_outer, step_inner = np.arange(num_outer), np.arange(num_inner)
     lower_triangles = np.stack(
-        [outer[step_outer], outer[(step_outer + 1) % len(outer)], inner[facing_inner % len(inner)]], axis=1
+        [
+            outer_chain[step_outer],
+            outer_chain[(step_outer + 1) % len(outer_chain)],
+            inner_chain[facing_inner % len(inner_chain)],
+        ],
+        axis=1,
     )
     upper_triangles = np.stack(
-        [inner[(step_inner + 1) % len(inner)], inner[step_inner], outer[facing_outer % len(outer)]], axis=1
+        [
+            inner_chain[(step_inner + 1) % len(inner_chain)],
+            inner_chain[step_inner],
+            outer_chain[facing_outer % len(outer_chain)],
+        ],
+        axis=1,
     )
     return np.concatenate([lower_triangles, upper_triangles])[
         np.argsort(np.concatenate([outer_middle, inner_middle]), kind="stable")
@@ -80,7 +93,7 @@ def ring_disk(num_rings: int, num_boundary: int) -> tuple[np.ndarray, np.ndarray
     angle = np.concatenate([2 * np.pi * np.arange(count) / count for count in counts])
     points = np.concatenate([radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1), np.zeros((1, 2))])
     rings = [np.arange(offsets[k], offsets[k + 1]) for k in range(num_rings)]
-    cells = [zip_chains(a, b, is_closed=True) for a, b in pairwise(rings)]
+    cells = [triangulate_between_chains(a, b, is_closed=True) for a, b in pairwise(rings)]
     innermost = rings[-1]
     cells.append(np.stack([innermost, np.roll(innermost, -1), np.full(len(innermost), offsets[-1])], axis=1))
     return points, np.concatenate(cells)
@@ -136,5 +149,5 @@ def row_rectangle(width: float, height: float, num_columns: int, num_rows: int) 
         points.append(np.stack([x, np.full_like(x, height * row / num_rows)], axis=1))
         rows.append(np.arange(offset, offset + columns + 1))
         offset += columns + 1
-    cells = [zip_chains(a, b, is_closed=False) for a, b in pairwise(rows)]
+    cells = [triangulate_between_chains(a, b, is_closed=False) for a, b in pairwise(rows)]
     return np.concatenate(points), np.concatenate(cells)

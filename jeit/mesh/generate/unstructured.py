@@ -17,7 +17,7 @@ from jeit.arguments import check_metres
 from jeit.mesh import topology
 from jeit.mesh.generate import _triangulate
 from jeit.mesh.generate._triangulate import Front, doubled_areas, triangulate
-from jeit.mesh.generate.curve import Curve, Size, is_within
+from jeit.mesh.generate.curve import Curve, Size, is_inside_curves
 from jeit.mesh.generate.refine import Refinement, SizeField, TooFewNodes
 from jeit.mesh.mesh import Mesh
 
@@ -96,12 +96,12 @@ def mesh_within(
     Nodes are placed at `boundary_points`, arc lengths (k,) in metres on the first curve, and at `interior_points` (k,
     2) in metres. Raises `ValueError` for invalid or contradictory arguments.
     """
-    stops = [
+    arc_lengths = [
         _merge_with_corners(curve, required_stops)
         for curve, required_stops in zip(curves, _required_positions(curves, boundary_points), strict=True)
     ]
-    fixed = _check_interior(interior_points, curves)
-    field = SizeField(curves, refine, *_required_spacing(curves, stops, fixed))
+    fixed_nodes = _check_interior(interior_points, curves)
+    field = SizeField(curves, refine, *_required_spacing(curves, arc_lengths, fixed_nodes))
     front = None
     if target.cell_size is not None:
         size = partial(_capped_size_at if field.is_user_function else _size_at, field, target.cell_size)
@@ -110,17 +110,17 @@ def mesh_within(
         size = partial(_size_at, field, 1.0)
         check_total(_estimate_num_nodes(curves, size, area), "refine")
     else:
-        size, front = _fit_cell_size(curves, stops, fixed, field, target.num_points, area)
-    return Mesh.create(*_triangulate.generate(curves, stops, fixed, size, front))
+        size, front = _fit_cell_size(curves, arc_lengths, fixed_nodes, field, target.num_points, area)
+    return Mesh.create(*_triangulate.generate(curves, arc_lengths, fixed_nodes, size, front))
 
 
 def _required_positions(curves: list[Curve], boundary_points: ArrayLike | None) -> list[np.ndarray]:
     """Arc lengths of required nodes on each curve, apart from its corners; a curve without corners has a node at its
     start."""
-    stops = [np.zeros(0 if len(curve.corners) else 1) for curve in curves]
+    arc_lengths = [np.zeros(0 if len(curve.corners) else 1) for curve in curves]
     if boundary_points is not None:
-        stops[0] = np.mod(check_positions("boundary_points", boundary_points), curves[0].length)
-    return stops
+        arc_lengths[0] = np.mod(check_positions("boundary_points", boundary_points), curves[0].length)
+    return arc_lengths
 
 
 def _size_at(field: SizeField, background: float, points: np.ndarray) -> np.ndarray:
@@ -134,20 +134,21 @@ def _capped_size_at(field: SizeField, cap: float, points: np.ndarray) -> np.ndar
 def _merge_with_corners(curve: Curve, positions: np.ndarray) -> np.ndarray:
     """Merge required positions on a curve with its corners. Raises `ValueError` if two positions are too close to each
     other."""
-    stops = np.sort(np.concatenate([curve.corners, np.mod(positions, curve.length)]))
-    if len(stops) < 2:
-        return stops
-    gaps = np.diff(np.append(stops, stops[0] + curve.length)) / curve.length
+    arc_lengths = np.sort(np.concatenate([curve.corners, np.mod(positions, curve.length)]))
+    if len(arc_lengths) < 2:
+        return arc_lengths
+    gaps = np.diff(np.append(arc_lengths, arc_lengths[0] + curve.length)) / curve.length
     is_too_close = (gaps > 1e-9) & (gaps < _MIN_NODE_DISTANCE)
     if is_too_close.any():
-        first = int(np.flatnonzero(is_too_close)[0])
+        first_index = int(np.flatnonzero(is_too_close)[0])
+        first_length, next_length = arc_lengths[first_index], arc_lengths[(first_index + 1) % len(arc_lengths)]
         raise ValueError(
-            f"boundary_points: two nodes at arc lengths {stops[first]:g} and {stops[(first + 1) % len(stops)]:g} m are "
-            "closer than a millionth of the outline (a corner counts). Make them equal or move one."
+            f"boundary_points: two nodes at arc lengths {first_length:g} and {next_length:g} m are closer than a "
+            "millionth of the outline (a corner counts). Make them equal or move one."
         )
     is_distinct = gaps > 1e-9
     # Replace a position that coincides with a corner by the corner, so that corners are not moved.
-    distinct_stops = stops[is_distinct]
+    distinct_stops = arc_lengths[is_distinct]
     if len(curve.corners):
         corner_distances = np.abs(distinct_stops[:, None] - curve.corners)
         corner_distances = np.minimum(corner_distances, curve.length - corner_distances)
@@ -161,29 +162,38 @@ def _merge_with_corners(curve: Curve, positions: np.ndarray) -> np.ndarray:
 def _check_interior(interior_points: ArrayLike | None, curves: list[Curve]) -> np.ndarray:
     if interior_points is None:
         return np.zeros((0, 2))
-    fixed = np.atleast_2d(np.asarray(interior_points, dtype=float))
-    if fixed.ndim != 2 or fixed.shape[1] != 2 or not np.isfinite(fixed).all():
-        raise ValueError(f"interior_points: expected finite coordinates of shape (k, 2), got shape {fixed.shape}.")
-    distances = np.min([curve.distance(fixed) for curve in curves], axis=0)
-    outside_points = np.flatnonzero(~is_within(curves, fixed) | (distances < _MIN_NODE_DISTANCE * curves[0].length))
+    fixed_nodes = np.atleast_2d(np.asarray(interior_points, dtype=float))
+    if fixed_nodes.ndim != 2 or fixed_nodes.shape[1] != 2 or not np.isfinite(fixed_nodes).all():
+        raise ValueError(
+            f"interior_points: expected finite coordinates of shape (k, 2), got shape {fixed_nodes.shape}."
+        )
+    distances = np.min([curve.distance(fixed_nodes) for curve in curves], axis=0)
+    outside_points = np.flatnonzero(
+        ~is_inside_curves(curves, fixed_nodes) | (distances < _MIN_NODE_DISTANCE * curves[0].length)
+    )
     if outside_points.size:
         raise ValueError(
-            f"interior_points: point {outside_points[0]} at {fixed[outside_points[0]].tolist()} does not lie inside "
-            "the outline. Use boundary_points for nodes on it."
+            f"interior_points: point {outside_points[0]} at {fixed_nodes[outside_points[0]].tolist()} does not lie "
+            "inside the outline. Use boundary_points for nodes on it."
         )
-    if len(fixed) > 1 and KDTree(fixed).query(fixed, k=2)[0][:, 1].min() < _MIN_NODE_DISTANCE * curves[0].length:
+    if (
+        len(fixed_nodes) > 1
+        and KDTree(fixed_nodes).query(fixed_nodes, k=2)[0][:, 1].min() < _MIN_NODE_DISTANCE * curves[0].length
+    ):
         raise ValueError("interior_points: two points coincide or nearly so. Keep one of them.")
-    return fixed
+    return fixed_nodes
 
 
-def _required_spacing(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _required_spacing(
+    curves: list[Curve], arc_lengths: list[np.ndarray], fixed_nodes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Positions (k, 2) of required nodes, and the distance (k,) of each required node to the nearest other required
     node, or to the nearest side that the node does not lie on, whichever is smaller."""
-    chains = [curve.at(stop) for curve, stop in zip(curves, stops, strict=True)]
-    required_nodes = np.concatenate([*chains, fixed])
+    chains = [curve.points_at(curve_arc_lengths) for curve, curve_arc_lengths in zip(curves, arc_lengths, strict=True)]
+    required_nodes = np.concatenate([*chains, fixed_nodes])
     if len(required_nodes) < 2:
-        distances = np.array([curves[0].distance(point[None])[0] for point in fixed])
-        return (required_nodes, distances) if len(fixed) else (np.zeros((0, 2)), np.zeros(0))
+        distances = np.array([curves[0].distance(point[None])[0] for point in fixed_nodes])
+        return (required_nodes, distances) if len(fixed_nodes) else (np.zeros((0, 2)), np.zeros(0))
     spacing = KDTree(required_nodes).query(required_nodes, k=2)[0][:, 1]
     offset = 0
     for chain in chains:
@@ -196,17 +206,17 @@ def _required_spacing(curves: list[Curve], stops: list[np.ndarray], fixed: np.nd
             spacing = np.minimum(spacing, np.where(distances > 0, distances, np.inf))
         offset += num_nodes
     for curve in curves:
-        if len(fixed):
-            spacing[offset:] = np.minimum(spacing[offset:], curve.distance(fixed))
+        if len(fixed_nodes):
+            spacing[offset:] = np.minimum(spacing[offset:], curve.distance(fixed_nodes))
     return required_nodes, spacing
 
 
 def _interior_samples(curves: list[Curve]) -> np.ndarray:
     """Points of a regular grid that lie inside the domain."""
-    outline = curves[0].at(np.linspace(0, curves[0].length, 400))
+    outline = curves[0].points_at(np.linspace(0, curves[0].length, 400))
     axes = [np.linspace(outline[:, k].min(), outline[:, k].max(), 60) for k in (0, 1)]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    return grid[is_within(curves, grid)]
+    return grid[is_inside_curves(curves, grid)]
 
 
 def _estimate_num_nodes(curves: list[Curve], size: Size, area: float) -> float:
@@ -214,14 +224,14 @@ def _estimate_num_nodes(curves: list[Curve], size: Size, area: float) -> float:
     inside the domain and along its outline."""
     num_nodes = area * float(np.mean(1.0 / size(_interior_samples(curves)) ** 2))
     for curve in curves:
-        num_nodes += curve.length * float(np.mean(1.0 / size(curve.at(np.linspace(0, curve.length, 400)))))
+        num_nodes += curve.length * float(np.mean(1.0 / size(curve.points_at(np.linspace(0, curve.length, 400)))))
     return num_nodes
 
 
 def _fit_cell_size(
     curves: list[Curve],
-    stops: list[np.ndarray],
-    fixed: np.ndarray,
+    arc_lengths: list[np.ndarray],
+    fixed_nodes: np.ndarray,
     field: SizeField,
     num_points: int,
     area: float,
@@ -239,32 +249,33 @@ def _fit_cell_size(
     best_fit: tuple[float, Size, Front] | None = None
     for _ in range(6):
         size = partial(_size_at, field, background)
-        front = _triangulate.outline_nodes(curves, stops, fixed, size, 1.0)
-        _triangulate.fill(front, size)
+        front = _triangulate.outline_nodes(curves, arc_lengths, fixed_nodes, size, 1.0)
+        _triangulate.insert_nodes(front, size)
         points = front.points()
-        surplus = len(points) / num_points - 1.0
-        if best_fit is None or abs(surplus) < best_fit[0]:
-            best_fit = (abs(surplus), size, front)
-        if abs(surplus) < _NODE_COUNT_TOLERANCE:
+        relative_excess = len(points) / num_points - 1.0
+        if best_fit is None or abs(relative_excess) < best_fit[0]:
+            best_fit = (abs(relative_excess), size, front)
+        if abs(relative_excess) < _NODE_COUNT_TOLERANCE:
             break
         cells = triangulate(front, points)
         background = _correct_background(
-            field.at(points[cells].mean(axis=1)), doubled_areas(points, cells), background, surplus, num_points
+            field.at(points[cells].mean(axis=1)), doubled_areas(points, cells), background, relative_excess, num_points
         )
     assert best_fit is not None
     return best_fit[1], best_fit[2]
 
 
 def _correct_background(
-    size: Callable[[float], np.ndarray], weight: np.ndarray, background: float, surplus: float, num_points: int
+    size: Callable[[float], np.ndarray], weight: np.ndarray, background: float, relative_excess: float, num_points: int
 ) -> float:
-    """Background cell size for which ∫ 1/h², h being the cell size at a point, is smaller by the factor 1 + `surplus`
-    than for the background cell size `background`; `surplus` is the relative surplus of nodes."""
+    """Background cell size for which ∫ 1/h², h being the cell size at a point, is smaller by the factor 1 +
+    `relative_excess` than for the background cell size `background`; `relative_excess` is the relative surplus of
+    nodes."""
 
-    def density_integral(trial: float) -> float:
-        return float(np.sum(weight / size(trial) ** 2))
+    def density_integral(trial_size: float) -> float:
+        return float(np.sum(weight / size(trial_size) ** 2))
 
-    target_total = density_integral(background) / (1.0 + surplus)
+    target_total = density_integral(background) / (1.0 + relative_excess)
     if density_integral(1e3 * background) > 1.1 * target_total:
         min_points = round(num_points * density_integral(1e3 * background) / target_total)
         raise TooFewNodes(
@@ -275,10 +286,12 @@ def _correct_background(
             "{asked} asked. Ask for more.",
         )
     # Search for a factor of `background`, so that the mesh of a body twice as large is exactly twice as large.
-    lower, upper = -np.log(1e3), np.log(1e3)
+    lower_bound, upper_bound = -np.log(1e3), np.log(1e3)
     for _ in range(30):
-        middle = 0.5 * (lower + upper)
-        lower, upper = (
-            (middle, upper) if density_integral(background * float(np.exp(middle))) > target_total else (lower, middle)
+        midpoint = 0.5 * (lower_bound + upper_bound)
+        lower_bound, upper_bound = (
+            (midpoint, upper_bound)
+            if density_integral(background * float(np.exp(midpoint))) > target_total
+            else (lower_bound, midpoint)
         )
-    return background * float(np.exp(0.5 * (lower + upper)))
+    return background * float(np.exp(0.5 * (lower_bound + upper_bound)))

@@ -80,9 +80,9 @@ class Geodesics(Module):
         cells, points = triangles.cells, triangles.points
         node, start, end = (np.roll(cells, -shift, axis=1).ravel() for shift in range(3))
         corner_coordinates = _triangle_coordinates(points[start], points[end], points[node])
-        ends = np.concatenate([start, end])
-        order = np.argsort(ends, kind="stable")
-        first = np.concatenate([[0], np.cumsum(np.bincount(ends, minlength=len(points)))])
+        end_nodes = np.concatenate([start, end])
+        order = np.argsort(end_nodes, kind="stable")
+        first = np.concatenate([[0], np.cumsum(np.bincount(end_nodes, minlength=len(points)))])
         corners = _Corners(node, start, end, *corner_coordinates)
         return cls(triangles, corners, _gaussian_curvature(triangles, corners), first, order % len(node))
 
@@ -126,8 +126,8 @@ class Geodesics(Module):
         """Nearest points on the surface. Raises `ValueError` with the argument's `name` for points that are too far
         from the surface."""
         projected = self.surface.nearest(places)
-        extent = float(np.ptp(self.surface.points, axis=0).max())
-        off_surface = np.flatnonzero(~(projected.away <= _MAX_OFF_SURFACE * extent))
+        largest_side = float(np.ptp(self.surface.points, axis=0).max())
+        off_surface = np.flatnonzero(~(projected.away <= _MAX_OFF_SURFACE * largest_side))
         if off_surface.size:
             raise ValueError(
                 f"{name}: {off_surface.size} of {len(projected.away)} lie off the surface, the first, at "
@@ -138,8 +138,8 @@ class Geodesics(Module):
 
     def between(self, places: ArrayLike) -> Float[np.ndarray, "p p"]:
         """Geodesic distances (p, p) between all pairs of points (p, 3), metres: symmetric, with a zero diagonal."""
-        at = self.surface.nearest(places)
-        lengths = self.distances(at, at)
+        surface_points = self.surface.nearest(places)
+        lengths = self.distances(surface_points, surface_points)
         lengths = (lengths + lengths.T) / 2
         np.fill_diagonal(lengths, 0)
         return lengths
@@ -156,16 +156,16 @@ class Geodesics(Module):
         while changed_nodes.size:
             _, corner = self._opposite_corners(changed_nodes, np.zeros_like(changed_nodes))
             start, end, node = self.corners.start[corner], self.corners.end[corner], self.corners.node[corner]
-            local = (coordinates[corner] for coordinates in self.corners[3:])
-            new_lengths, by_start = _distances_across(
-                lengths[start], lengths[end], *local, same_source=owner[start] == owner[end]
+            local_coordinates = (coordinates[corner] for coordinates in self.corners[3:])
+            new_lengths, is_by_start = _distances_across(
+                lengths[start], lengths[end], *local_coordinates, same_source=owner[start] == owner[end]
             )
             changed_nodes = _lower_distances(
-                lengths, owner, node, new_lengths, np.where(by_start, owner[start], owner[end])
+                lengths, owner, node, new_lengths, np.where(is_by_start, owner[start], owner[end])
             )
         return owner, lengths
 
-    def _distances_to_nodes(self, sources: SurfacePlaces, limit: float):
+    def _distances_to_nodes(self, sources: SurfacePlaces, max_distance: float):
         """Distances (s, n) from the sources to all nodes, and mean curvatures (s, n) along the paths."""
         num_nodes = len(self.surface.points)
         lengths = np.full(len(sources.triangle) * num_nodes, np.inf)
@@ -179,14 +179,16 @@ class Geodesics(Module):
                 changed_entries % num_nodes, changed_entries - changed_entries % num_nodes
             )
             start, end = source + self.corners.start[corner], source + self.corners.end[corner]
-            local = (coordinates[corner] for coordinates in self.corners[3:])
+            local_coordinates = (coordinates[corner] for coordinates in self.corners[3:])
             mean_curvature = (curvatures[start] + curvatures[end]) / 2
-            new_lengths, by_start = _distances_across(lengths[start], lengths[end], *local, curvature=mean_curvature)
+            new_lengths, is_by_start = _distances_across(
+                lengths[start], lengths[end], *local_coordinates, curvature=mean_curvature
+            )
             node = self.corners.node[corner]
             entries = source + node
-            is_lower = (new_lengths < (1 - _MIN_DECREASE) * lengths[entries]) & (new_lengths <= 2 * limit)
+            is_lower = (new_lengths < (1 - _MIN_DECREASE) * lengths[entries]) & (new_lengths <= 2 * max_distance)
             entries, new_lengths, node = entries[is_lower], new_lengths[is_lower], node[is_lower]
-            previous_lengths = np.where(by_start, lengths[start], lengths[end])[is_lower]
+            previous_lengths = np.where(is_by_start, lengths[start], lengths[end])[is_lower]
             np.minimum.at(lengths, entries, new_lengths)
             with np.errstate(invalid="ignore"):
                 fraction = np.where(new_lengths > 0, np.clip(previous_lengths / new_lengths, 0, 1), 0.0)
@@ -195,15 +197,15 @@ class Geodesics(Module):
                 fraction * mean_curvature[is_lower] + (1 - fraction) * self.curvature[node]
             )[is_smallest]
             # Nodes beyond the limit are not propagated.
-            changed_entries = np.unique(entries[lengths[entries] <= limit])
+            changed_entries = np.unique(entries[lengths[entries] <= max_distance])
         return lengths.reshape(-1, num_nodes), curvatures.reshape(-1, num_nodes)
 
     def _opposite_corners(self, nodes, values):
         """Find, for each of `nodes`, the corners of triangles whose opposite side ends at the node. Returns, for each
         of these corners, the node's entry of `values`, and the index of the corner."""
         num_corners = self.first[nodes + 1] - self.first[nodes]
-        ends = np.cumsum(num_corners)
-        offset = np.arange(ends[-1]) - np.repeat(ends - num_corners, num_corners)
+        end_indices = np.cumsum(num_corners)
+        offset = np.arange(end_indices[-1]) - np.repeat(end_indices - num_corners, num_corners)
         return np.repeat(values, num_corners), self.touching[np.repeat(self.first[nodes], num_corners) + offset]
 
     def near(self, sources: ArrayLike, targets: SurfacePlaces, limit: float) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -227,9 +229,11 @@ class Geodesics(Module):
             target_indices = np.concatenate(close_targets) if close_targets else np.zeros(0, int)
             target_places = SurfacePlaces(*(getattr(targets, name)[target_indices] for name in _PLACE_FIELDS))
             target_lengths = self._distances_in_triangles(batch, lengths, curvatures, target_places, source)
-            ends = np.cumsum([len(indices) for indices in close_targets])[:-1]
-            for index, is_target in zip(np.split(target_indices, ends), np.split(target_lengths, ends), strict=True):
-                neighbours.append((index[is_target < limit], is_target[is_target < limit]))
+            split_indices = np.cumsum([len(indices) for indices in close_targets])[:-1]
+            for target_rows, is_target in zip(
+                np.split(target_indices, split_indices), np.split(target_lengths, split_indices), strict=True
+            ):
+                neighbours.append((target_rows[is_target < limit], is_target[is_target < limit]))
         return neighbours
 
     def _distances_in_triangles(
@@ -284,18 +288,26 @@ def _distances_across(start, end, side, x, y, *, same_source: Any = True, curvat
         through_start = np.sqrt(x**2 + y**2) + start
         through_end = np.sqrt((side - x) ** 2 + y**2) + end
         source_x, source_depth, squared_depth = _virtual_source(start, end, side)
-        crossing = (source_x * y + x * source_depth) / np.where(source_depth + y > 0, source_depth + y, 1.0)
+        crossing_position = (source_x * y + x * source_depth) / np.where(source_depth + y > 0, source_depth + y, 1.0)
         crosses_side = (
-            (squared_depth >= 0) & (crossing >= 0) & (crossing <= side) & same_source & (source_depth + y > 0)
+            (squared_depth >= 0)
+            & (crossing_position >= 0)
+            & (crossing_position <= side)
+            & same_source
+            & (source_depth + y > 0)
         )
         length = np.sqrt((x - source_x) ** 2 + (y + source_depth) ** 2)
         # Sagitta of the wave front at the crossing, minus the sagitta of a wave front in the plane.
-        squared_length = (crossing - source_x) ** 2 + squared_depth
+        squared_length = (crossing_position - source_x) ** 2 + squared_depth
         front_curvature = np.where(
             squared_length > 0, squared_depth / np.where(squared_length > 0, squared_length, 1.0), 0.0
         )
         length += (
-            0.5 * _front_flattening(curvature, np.sqrt(squared_length)) * front_curvature * crossing * (side - crossing)
+            0.5
+            * _front_flattening(curvature, np.sqrt(squared_length))
+            * front_curvature
+            * crossing_position
+            * (side - crossing_position)
         )
     return np.where(crosses_side, length, np.minimum(through_start, through_end)), through_start <= through_end
 

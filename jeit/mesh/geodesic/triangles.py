@@ -101,15 +101,17 @@ class Triangles(Module):
     def node_normals(self) -> Float[np.ndarray, "n 3"]:
         """Outward unit normals at the nodes: area-weighted means of the normals of the triangles."""
         products = np.repeat(self._edge_cross_products, 3, axis=0)
-        summed = np.stack([np.bincount(self.cells.ravel(), one, len(self.points)) for one in products.T], axis=1)
-        return summed / np.linalg.norm(summed, axis=1, keepdims=True)
+        summed_normals = np.stack(
+            [np.bincount(self.cells.ravel(), component, len(self.points)) for component in products.T], axis=1
+        )
+        return summed_normals / np.linalg.norm(summed_normals, axis=1, keepdims=True)
 
     @property
     def border(self) -> Int[np.ndarray, "b 2"]:
         """Edges (b, 2) that belong to one triangle only; a closed surface has none."""
         edges = self.cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-        _, first, counts = np.unique(self._edge_numbers(edges), return_index=True, return_counts=True)
-        return edges[first[counts == 1]]
+        _, first_indices, counts = np.unique(self._edge_numbers(edges), return_index=True, return_counts=True)
+        return edges[first_indices[counts == 1]]
 
     def _edge_numbers(self, edges: Int[np.ndarray, "e 2"]) -> Int[np.ndarray, " e"]:
         """A number for each edge, equal for both directions and in the order of the smaller, then the larger node:
@@ -161,19 +163,19 @@ class Triangles(Module):
     def finer(self) -> "Triangles":
         """Divide each triangle into four at the midpoints of its sides."""
         edges = self.cells[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2)
-        _, first, edge_index = np.unique(self._edge_numbers(edges), return_index=True, return_inverse=True)
+        _, first_indices, edge_index = np.unique(self._edge_numbers(edges), return_index=True, return_inverse=True)
         a, b, c = self.cells.T
         p, q, r = (edge_index.reshape(-1, 3) + len(self.points)).T
         cells = np.concatenate([np.stack(nodes, axis=1) for nodes in ((a, r, q), (r, b, p), (q, p, c), (p, q, r))])
-        return Triangles(np.concatenate([self.points, self.points[edges[first]].mean(axis=1)]), cells)
+        return Triangles(np.concatenate([self.points, self.points[edges[first_indices]].mean(axis=1)]), cells)
 
 
 def _nearest_in_triangles(corners: Float[np.ndarray, "... 3 3"], points: Float[np.ndarray, "... 3"]) -> np.ndarray:
     """Barycentric coordinates (…, 3) of the point of each triangle that is nearest to `points`."""
-    first, second = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
+    first_sides, second_sides = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
     offset = points - corners[..., 0, :]
-    aa, bb, ab = (first**2).sum(-1), (second**2).sum(-1), (first * second).sum(-1)
-    a, b = (offset * first).sum(-1), (offset * second).sum(-1)
+    aa, bb, ab = (first_sides**2).sum(-1), (second_sides**2).sum(-1), (first_sides * second_sides).sum(-1)
+    a, b = (offset * first_sides).sum(-1), (offset * second_sides).sum(-1)
     area = aa * bb - ab**2
     u, v = (bb * a - ab * b) / area, (aa * b - ab * a) / area
     weights_in_plane = np.stack([1 - u - v, u, v], axis=-1)

@@ -79,27 +79,31 @@ def unfold(mesh: Mesh, places: Float[Array, "L 3"], max_distance: Float[Array, "
     """
     xp = namespace(mesh, places)
     corners = xp.asarray(mesh.points[mesh.cells])
-    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    first_axis = first / xp.sqrt((first**2).sum(axis=1, keepdims=True))
-    normal = xp.cross(first, second)
+    first_sides, second_sides = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    first_axis = first_sides / xp.sqrt((first_sides**2).sum(axis=1, keepdims=True))
+    normal = xp.cross(first_sides, second_sides)
     normal = normal / xp.sqrt((normal**2).sum(axis=1, keepdims=True))
     axes = xp.stack([first_axis, xp.cross(normal, first_axis)], axis=1)
     plane_corners = xp.einsum("mid,mad->mia", corners - corners[:, :1], axes)
     frames = corners[:, 0], axes, normal
-    root = _containing_triangles(undifferentiated(places), *undifferentiated((frames, plane_corners)))
+    root_triangles = _containing_triangles(undifferentiated(places), *undifferentiated((frames, plane_corners)))
     squared_distance = undifferentiated(((places[:, None] - corners.mean(axis=1)) ** 2).sum(axis=-1))
     # If the values are known, compute on the host: XLA would take seconds to evaluate a sort of constants.
-    opposite, cell = xp.asarray(_opposite_sides(on_host(mesh.cells))), xp.arange(len(corners))
-    reached, side = _connect(opposite // 3, squared_distance <= undifferentiated(max_distance) ** 2, root)
+    opposite_side_indices, cell = xp.asarray(_opposite_sides(on_host(mesh.cells))), xp.arange(len(corners))
+    reached, side = _find_connected_triangles(
+        opposite_side_indices // 3, squared_distance <= undifferentiated(max_distance) ** 2, root_triangles
+    )
     side_index = 3 * cell + side
-    previous = xp.where(side < 0, cell, opposite[side_index] // 3)
-    turn, shift = (transform[side_index] for transform in _transforms_across_sides(plane_corners, opposite))
+    previous = xp.where(side < 0, cell, opposite_side_indices[side_index] // 3)
+    turn, shift = (
+        transform[side_index] for transform in _transforms_across_sides(plane_corners, opposite_side_indices)
+    )
     has_previous = (side >= 0)[..., None]
     turn, shift = xp.where(has_previous, turn, xp.array([1.0, 0.0])), xp.where(has_previous, shift, 0.0)
     turn, shift, end_triangle = _compose_transforms(previous, turn, shift)
-    place = xp.einsum("ld,lad->la", places - corners[root, 0], axes[root])
-    is_curved = _is_curved(undifferentiated(plane_corners), mesh.cells, opposite, mesh.num_points)
-    is_invalid = reached & (is_curved | (end_triangle != root[:, None]))
+    place = xp.einsum("ld,lad->la", places - corners[root_triangles, 0], axes[root_triangles])
+    is_curved = _is_curved(undifferentiated(plane_corners), mesh.cells, opposite_side_indices, mesh.num_points)
+    is_invalid = reached & (is_curved | (end_triangle != root_triangles[:, None]))
     return Unfolding(plane_corners, turn, shift, place, reached, ~is_invalid.any(axis=1))
 
 
@@ -117,10 +121,11 @@ def _containing_triangles(positions, frames, plane_corners) -> Int[Array, " L"]:
     origin, axes, normal = frames
     offset = positions[:, None] - origin
     x, y = xp.moveaxis(xp.einsum("lmd,mad->lma", offset, axes), -1, 0)
-    third = y / plane_corners[:, 2, 1]
-    second = (x - third * plane_corners[:, 2, 0]) / plane_corners[:, 1, 0]
+    third_weights = y / plane_corners[:, 2, 1]
+    second_weights = (x - third_weights * plane_corners[:, 2, 0]) / plane_corners[:, 1, 0]
     distance_outside = (
-        xp.maximum(-xp.minimum(xp.minimum(second, third), 1 - second - third), 0) * plane_corners[:, 1, 0]
+        xp.maximum(-xp.minimum(xp.minimum(second_weights, third_weights), 1 - second_weights - third_weights), 0)
+        * plane_corners[:, 1, 0]
     )
     return ((offset * normal).sum(axis=-1) ** 2 + distance_outside**2).argmin(axis=1)
 
@@ -141,38 +146,40 @@ def _opposite_sides(cells) -> Int[Array, " h"]:
     return opposite[xp.argsort(order)]
 
 
-def _connect(neighbour, is_near: Bool[Array, "L m"], root):
-    """Find the triangles near each point (`is_near`) that are connected to the triangle `root` (L,) across sides.
-    Returns whether each triangle (L, m) is connected, and the number (L, m) of the side across which the path to the
-    root leads; −1 for the root itself and for triangles that are not connected."""
+def _find_connected_triangles(neighbour, is_near: Bool[Array, "L m"], root_triangles):
+    """Find the triangles near each point (`is_near`) that are connected to the triangles `root_triangles` (L,) across
+    sides. Returns whether each triangle (L, m) is connected, and the number (L, m) of the side across which the path to
+    the root leads; −1 for the root itself and for triangles that are not connected."""
     xp = namespace(neighbour, is_near)
     cell = xp.arange(is_near.shape[1])
     neighbour = neighbour.reshape(-1, 3)
-    is_root = cell == root[:, None]
+    is_root = cell == root_triangles[:, None]
 
-    def grow(state):
+    def add_neighbours(state):
         reached, side, _ = state
         is_reached_across = reached[:, neighbour]
         is_new = is_near & ~reached & is_reached_across.any(axis=-1)
         return reached | is_new, xp.where(is_new, is_reached_across.argmax(axis=-1).astype(int), side), is_new.any()
 
     has_changed = xp.ones((), bool)
-    reached, side, _ = while_loop(lambda state: state[2], grow, (is_root, xp.full(is_near.shape, -1, int), has_changed))
+    reached, side, _ = while_loop(
+        lambda state: state[2], add_neighbours, (is_root, xp.full(is_near.shape, -1, int), has_changed)
+    )
     return reached, side
 
 
-def _transforms_across_sides(plane_corners, opposite):
+def _transforms_across_sides(plane_corners, opposite_side_indices):
     """Rotation (h, 2), as cosine and sine, and translation (h, 2) for each half-edge (a side of one triangle), from the
     plane of its triangle into the plane of the neighbouring triangle."""
     xp = namespace(plane_corners)
     start, end = plane_corners.reshape(-1, 2), xp.roll(plane_corners, -1, axis=1).reshape(-1, 2)
-    side, opposite_side = end - start, start[opposite] - end[opposite]
+    side, opposite_side = end - start, start[opposite_side_indices] - end[opposite_side_indices]
     turn = xp.stack(
         [(side * opposite_side).sum(axis=1), side[:, 0] * opposite_side[:, 1] - side[:, 1] * opposite_side[:, 0]],
         axis=1,
     )
     turn = turn / xp.sqrt((turn**2).sum(axis=1, keepdims=True))
-    return turn, end[opposite] - _rotate(turn, start)
+    return turn, end[opposite_side_indices] - _rotate(turn, start)
 
 
 def _compose_transforms(previous, turn, shift):
@@ -190,7 +197,7 @@ def _compose_transforms(previous, turn, shift):
     return turn, shift, previous
 
 
-def _is_curved(plane_corners, cells, opposite, num_nodes: int) -> Bool[Array, " m"]:
+def _is_curved(plane_corners, cells, opposite_side_indices, num_nodes: int) -> Bool[Array, " m"]:
     """For each triangle, whether the angles around one of its corners inside the surface do not sum to a full turn."""
     xp = namespace(plane_corners, cells)
     next_edges, previous_edges = (
@@ -202,7 +209,7 @@ def _is_curved(plane_corners, cells, opposite, num_nodes: int) -> Bool[Array, " 
         (next_edges * previous_edges).sum(axis=-1),
     )
     angle_sums = sum_into((num_nodes,), (cells,), angle)
-    is_border_side = (opposite == xp.arange(len(opposite))).reshape(-1, 3)
+    is_border_side = (opposite_side_indices == xp.arange(len(opposite_side_indices))).reshape(-1, 3)
     num_border_sides = sum_into((num_nodes,), (cells,), 1.0 * (is_border_side | xp.roll(is_border_side, 1, axis=1)))
     is_curved_node = (abs(angle_sums - 2 * np.pi) > _ANGLE_TOLERANCE) & (num_border_sides == 0)
     return is_curved_node[cells].any(axis=1)

@@ -62,19 +62,19 @@ class Unrolled(Module):
     @property
     def seam(self) -> Float[np.ndarray, "s 2 2"]:
         """Segments (s, 2, 2) of the flat outline that arose from the cut; there are none for an open sheet."""
-        ends, is_cut = self._edges
-        return self.points[ends[is_cut]]
+        end_nodes, is_cut = self._edges
+        return self.points[end_nodes[is_cut]]
 
     @property
     def edge(self) -> Float[np.ndarray, "s 2 2"]:
         """Segments (s, 2, 2) of the flat outline that are edges of the original surface."""
-        ends, is_cut = self._edges
-        return self.points[ends[~is_cut]]
+        end_nodes, is_cut = self._edges
+        return self.points[end_nodes[~is_cut]]
 
     @property
     def _edges(self):
-        ends = _border_edges(self.cells)
-        return ends, ~_is_among(np.sort(self.nodes[ends], axis=1), np.sort(self.surface.border, axis=1))
+        end_nodes = _border_edges(self.cells)
+        return end_nodes, ~_is_among(np.sort(self.nodes[end_nodes], axis=1), np.sort(self.surface.border, axis=1))
 
     def flat(self, places: ArrayLike | SurfacePlaces) -> Float[np.ndarray, "p 2"]:
         """Positions (p, 2) on the flat surface, metres, of points (p, 3) on the surface, metres."""
@@ -128,7 +128,7 @@ def _edges(triangles: Float[np.ndarray, "m 3 2"]) -> Float[np.ndarray, "m 2 2"]:
 def _conformal_map(cells, plane_corners, num_nodes: int) -> np.ndarray:
     """Least-squares conformal map, which preserves angles as well as possible; two nodes far from each other are
     fixed."""
-    held_nodes = _farthest_nodes(cells, plane_corners, num_nodes)
+    fixed_nodes = _farthest_nodes(cells, plane_corners, num_nodes)
     side_vectors = np.stack(
         [
             plane_corners[:, 2] - plane_corners[:, 1],
@@ -144,8 +144,10 @@ def _conformal_map(cells, plane_corners, num_nodes: int) -> np.ndarray:
         for component in (side_vectors[..., 0], side_vectors[..., 1])
     )
     matrix = scipy.sparse.block_array([[real, -imaginary], [imaginary, real]]).tocsc()
-    fixed_coordinates = np.array([held_nodes[0], held_nodes[1], held_nodes[0] + num_nodes, held_nodes[1] + num_nodes])
-    values = np.array([0.0, held_nodes[2], 0.0, 0.0])
+    fixed_coordinates = np.array(
+        [fixed_nodes[0], fixed_nodes[1], fixed_nodes[0] + num_nodes, fixed_nodes[1] + num_nodes]
+    )
+    values = np.array([0.0, fixed_nodes[2], 0.0, 0.0])
     free_coordinates = np.setdiff1d(np.arange(2 * num_nodes), fixed_coordinates)
     free_columns, right_side = matrix[:, free_coordinates], -(matrix[:, fixed_coordinates] @ values)
     coordinates = np.zeros(2 * num_nodes)
@@ -161,9 +163,9 @@ def _farthest_nodes(cells, plane_corners, num_nodes: int):
     length = np.linalg.norm(plane_corners[:, [1, 2, 0]] - plane_corners, axis=2)
     start, end = cells.ravel(), cells[:, [1, 2, 0]].ravel()
     graph = scipy.sparse.csr_array((length.ravel(), (start, end)), shape=(num_nodes, num_nodes))
-    first = int(np.argmax(dijkstra(graph, directed=False, indices=0)))
-    lengths = dijkstra(graph, directed=False, indices=first)
-    return first, int(np.argmax(lengths)), float(lengths.max())
+    first_node = int(np.argmax(dijkstra(graph, directed=False, indices=0)))
+    lengths = dijkstra(graph, directed=False, indices=first_node)
+    return first_node, int(np.argmax(lengths)), float(lengths.max())
 
 
 def _flatten_rigidly(cells, plane_corners, points: np.ndarray) -> np.ndarray:
@@ -176,8 +178,8 @@ def _flatten_rigidly(cells, plane_corners, points: np.ndarray) -> np.ndarray:
         plane_corners - plane_corners[:, previous_corner],
         plane_corners[:, next_corner] - plane_corners[:, previous_corner],
     )
-    cross = first_leg[..., 0] * second_leg[..., 1] - first_leg[..., 1] * second_leg[..., 0]
-    weight = (first_leg * second_leg).sum(-1) / cross / 2  # half the cotangent of the angle opposite to side k
+    cross_products = first_leg[..., 0] * second_leg[..., 1] - first_leg[..., 1] * second_leg[..., 0]
+    weight = (first_leg * second_leg).sum(-1) / cross_products / 2  # half the cotangent of the angle opposite to side k
     start, end = cells, cells[:, next_corner]
     rows = np.concatenate([start.ravel(), end.ravel(), start.ravel(), end.ravel()])
     columns = np.concatenate([start.ravel(), end.ravel(), end.ravel(), start.ravel()])
@@ -220,8 +222,8 @@ def _turn_upright(points: np.ndarray, space: np.ndarray) -> np.ndarray:
 
 def _border_edges(cells) -> np.ndarray:
     edges = cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    _, first, counts = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
-    return edges[first[counts == 1]]
+    _, first_indices, counts = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
+    return edges[first_indices[counts == 1]]
 
 
 def _is_among(edges, reference_edges) -> np.ndarray:
@@ -229,7 +231,7 @@ def _is_among(edges, reference_edges) -> np.ndarray:
     return np.isin(edges[:, 0] * size + edges[:, 1], reference_edges[:, 0] * size + reference_edges[:, 1])
 
 
-def _cut_to_disk(surface: Triangles, cut) -> tuple[np.ndarray, np.ndarray]:
+def _cut_to_disk(surface: Triangles, is_cut_edge) -> tuple[np.ndarray, np.ndarray]:
     """Cut a surface so that it becomes topologically a disk. Returns the triangles after the cut, and for each new node
     the original node."""
     cells, num_nodes = surface.cells, len(surface.points)
@@ -253,7 +255,7 @@ def _cut_to_disk(surface: Triangles, cut) -> tuple[np.ndarray, np.ndarray]:
     else:
         axis = int(np.argmax(np.ptp(points, axis=0)))
         ends = np.array([points[:, axis].argmin()]), np.array([points[:, axis].argmax()])
-    path = _path_along_edges(points, edges, ends, cut, border)
+    path = _path_along_edges(points, edges, ends, is_cut_edge, border)
     return _split_along_path(cells, path, num_nodes, is_closed=num_loops == 0)
 
 
@@ -272,18 +274,18 @@ def _path_along_edges(points, edges, ends, cut, border) -> list[int]:
     border."""
     centre = points.mean(axis=0)
     cut_position = np.asarray(cut, float) if cut is not None else None
-    spread = np.ptp(points, axis=0).max()
+    largest_side = np.ptp(points, axis=0).max()
     midpoints = points[edges].mean(axis=1)
     if cut_position is None:
         # Edges away from the side of the smallest x cost more, which yields a straight line along that side.
-        x_offsets = (midpoints[:, 0] - points[:, 0].min()) / spread
-        y_offsets = np.abs(midpoints[:, 1] - centre[1]) / spread
+        x_offsets = (midpoints[:, 0] - points[:, 0].min()) / largest_side
+        y_offsets = np.abs(midpoints[:, 1] - centre[1]) / largest_side
         cost = 1 + 20 * (x_offsets + y_offsets)
     else:
         axis = points[ends[1]].mean(axis=0) - points[ends[0]].mean(axis=0)
         axis = axis / np.linalg.norm(axis)
         offsets = midpoints - cut_position
-        cost = 1 + 20 * np.linalg.norm(offsets - (offsets @ axis)[:, None] * axis, axis=1) / spread
+        cost = 1 + 20 * np.linalg.norm(offsets - (offsets @ axis)[:, None] * axis, axis=1) / largest_side
     length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1) * cost
     if len(border):
         length = np.where(_is_among(edges, np.sort(border, axis=1)), 1e3 * length, length)
@@ -312,9 +314,9 @@ def _split_along_path(cells, path: list[int], num_nodes: int, *, is_closed: bool
     for node in doubled_nodes:
         # The triangles around the node, joined across edges that are not on the path, form two parts; one side is the
         # part that contains a triangle traversing the path forwards.
-        star = triangles_at[node]
+        surrounding_triangles = triangles_at[node]
         side_triangles = set()
-        for triangle in star:
+        for triangle in surrounding_triangles:
             corners = original[triangle].tolist()
             sides = zip(corners, corners[1:] + corners[:1], strict=True)
             if any(edge in path_edges and node in edge for edge in sides):
@@ -322,7 +324,7 @@ def _split_along_path(cells, path: list[int], num_nodes: int, *, is_closed: bool
         has_grown = True
         while has_grown:
             has_grown = False
-            for triangle in star:
+            for triangle in surrounding_triangles:
                 if triangle in side_triangles:
                     continue
                 for side_triangle in tuple(side_triangles):

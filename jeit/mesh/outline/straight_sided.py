@@ -61,12 +61,12 @@ class Polygon(Domain):
             self.vertices = jnp.asarray(vertices)
             self.holes = tuple(jnp.asarray(hole) for hole in holes)
             return
-        outer = topology.check_loop(vertices, "vertices", clockwise=False)
+        outer_loop = topology.check_loop(vertices, "vertices", clockwise=False)
         inner = [topology.check_loop(hole, f"holes[{k}]", clockwise=True) for k, hole in enumerate(holes)]
-        topology.check_apart(outer, inner)
-        check_near_origin("vertices", outer, np.ptp(outer, axis=0).max())
-        warn_large(float(np.ptp(outer, axis=0).max()), "vertices")
-        self.vertices = as_array(outer)
+        topology.check_holes(outer_loop, inner)
+        check_near_origin("vertices", outer_loop, np.ptp(outer_loop, axis=0).max())
+        warn_large(float(np.ptp(outer_loop, axis=0).max()), "vertices")
+        self.vertices = as_array(outer_loop)
         self.holes = tuple(as_array(hole) for hole in inner)
 
     @property
@@ -90,7 +90,7 @@ class Polygon(Domain):
 
     def boundary(self, arc_length: ArrayLike) -> Float[Array, "... 2"]:
         """Points (…, 2) on the outer outline at `arc_length` (…) in metres from the first vertex."""
-        return along_loop(self.vertices, arc_length)
+        return points_on_loop(self.vertices, arc_length)
 
     def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
         """Vertices of the outline and of every hole."""
@@ -187,7 +187,7 @@ class Rectangle(Domain):
 
     def boundary(self, arc_length: ArrayLike) -> Float[Array, "... 2"]:
         """Points (…, 2) on the outline at `arc_length` (…) in metres, counter-clockwise from the lower left."""
-        return along_loop(self.vertices, arc_length)
+        return points_on_loop(self.vertices, arc_length)
 
     def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
         """Vertices of the rectangle."""
@@ -198,8 +198,8 @@ class Rectangle(Domain):
         """Whether each of `points` (…, 2), in metres, lies in the rectangle or on its edge."""
         xp = namespace(self, points)
         offset = abs(xp.asarray(points) - xp.asarray(self.centre))
-        half = 0.5 * xp.asarray([self.width, self.height])
-        return (offset <= half * (1 + 1e-12)).all(axis=-1)
+        half_sides = 0.5 * xp.asarray([self.width, self.height])
+        return (offset <= half_sides * (1 + 1e-12)).all(axis=-1)
 
     def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
         """Distance (p,) of `points` (p, 2) from the nearest side in metres, negative outside."""
@@ -252,11 +252,11 @@ class Rectangle(Domain):
     def _side_facets(self, mesh: Mesh) -> dict:
         """Indices of the facets on each side, by the name of the side."""
         left, right, bottom, top = self.extent
-        ends = np.asarray(mesh.points)[np.asarray(mesh.facets)]
+        end_points = np.asarray(mesh.points)[np.asarray(mesh.facets)]
         tolerance = 1e-9 * max(self.width, self.height)
         sides = {"left": (0, left), "right": (0, right), "bottom": (1, bottom), "top": (1, top)}
         return {
-            name: as_array(np.flatnonzero((np.abs(ends[:, :, axis] - value) < tolerance).all(axis=1)), np.int32)
+            name: as_array(np.flatnonzero((np.abs(end_points[:, :, axis] - value) < tolerance).all(axis=1)), np.int32)
             for name, (axis, value) in sides.items()
         }
 
@@ -268,19 +268,19 @@ def loop_length(loop: Loop) -> Float[Array, ""]:
 
 def area_of_loops(loops: Sequence[Loop]) -> Float[Array, ""]:
     """Area inside the first loop minus the area of the holes, m² (shoelace formula)."""
-    outer, *holes = (_shoelace(loop) for loop in on_host(loops))
-    return as_array(sum(holes, outer))
+    outer_loop, *holes = (_shoelace(loop) for loop in on_host(loops))
+    return as_array(sum(holes, outer_loop))
 
 
 @either_engine
-def along_loop(loop: Loop, arc_length: ArrayLike) -> Float[Array, "... 2"]:
+def points_on_loop(loop: Loop, arc_length: ArrayLike) -> Float[Array, "... 2"]:
     """Points (…, 2) on a loop at `arc_length` (…) in metres from its first vertex, taken modulo the length of the
     loop."""
     xp = namespace(loop)
     closed_loop = xp.concatenate([loop, loop[:1]])
-    stops = xp.concatenate([xp.zeros(1), xp.cumsum(_side_lengths(loop))])
-    wrapped_length = xp.mod(xp.asarray(arc_length, dtype=stops.dtype), stops[-1])
-    return xp.stack([xp.interp(wrapped_length, stops, closed_loop[:, axis]) for axis in range(2)], axis=-1)
+    cumulative_lengths = xp.concatenate([xp.zeros(1), xp.cumsum(_side_lengths(loop))])
+    wrapped_length = xp.mod(xp.asarray(arc_length, dtype=cumulative_lengths.dtype), cumulative_lengths[-1])
+    return xp.stack([xp.interp(wrapped_length, cumulative_lengths, closed_loop[:, axis]) for axis in range(2)], axis=-1)
 
 
 @either_engine
@@ -320,9 +320,9 @@ def _project_onto_loops(xp: Any, loops: Sequence[Loop], points: ArrayLike) -> tu
     sides = xp.concatenate([xp.roll(loop, -1, axis=0) for loop in chains]) - start
     offset = point_array[:, None] - start
     fraction = xp.clip((offset * sides).sum(axis=-1) / (sides**2).sum(axis=-1), 0, 1)
-    on_sides = start + fraction[..., None] * sides  # (p, s, 2)
-    closest_side = xp.argmin(((point_array[:, None] - on_sides) ** 2).sum(axis=-1), axis=1)
-    nearest_points = xp.take_along_axis(on_sides, closest_side[:, None, None], axis=1)[:, 0]
+    points_on_sides = start + fraction[..., None] * sides  # (p, s, 2)
+    closest_side = xp.argmin(((point_array[:, None] - points_on_sides) ** 2).sum(axis=-1), axis=1)
+    nearest_points = xp.take_along_axis(points_on_sides, closest_side[:, None, None], axis=1)[:, 0]
     is_inside = (
         topology.is_inside_loops(point_array, chains)
         if xp is np

@@ -170,7 +170,7 @@ def bend(mesh: Mesh, radius: float, *, axis: str = "y", num_folds: int | None = 
     bent_axis = 0 if axis == "y" else 1
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
     folds = _fold_positions(points[:, bent_axis], points[cells], bent_axis, num_folds)
-    edges = {name: np.asarray(mesh.facets)[np.asarray(index)] for name, index in mesh.tags.items()}
+    edges = {name: np.asarray(mesh.facets)[np.asarray(facet_indices)] for name, facet_indices in mesh.tags.items()}
     for line in folds[1:-1]:
         points, cells, edges = _cut_cells(points, cells, edges, points[:, bent_axis] - line)
     horizontal, vertical = _roll_coordinates(points[:, bent_axis], folds, float(radius))
@@ -193,9 +193,9 @@ def _fold_positions(positions: np.ndarray, corners: np.ndarray, bent_axis: int, 
         return rows
     mean_edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean()
     lines = np.linspace(rows[0], rows[-1], 1 + (num_folds or max(1, round(width / mean_edge))))
-    nearest = sorted_positions[np.abs(sorted_positions - lines[:, None]).argmin(axis=1)]
-    is_near = np.abs(nearest - lines) < _FOLD_SNAP_DISTANCE * (lines[1] - lines[0])
-    return np.where(is_near, nearest, lines)
+    nearest_positions = sorted_positions[np.abs(sorted_positions - lines[:, None]).argmin(axis=1)]
+    is_near = np.abs(nearest_positions - lines) < _FOLD_SNAP_DISTANCE * (lines[1] - lines[0])
+    return np.where(is_near, nearest_positions, lines)
 
 
 def _cut_cells(
@@ -210,11 +210,11 @@ def _cut_cells(
     pairs = np.sort(cells[is_crossed][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     pairs = np.unique(pairs[side[pairs].prod(axis=1) < 0], axis=0)
     fraction = (height[pairs[:, 0]] / (height[pairs[:, 0]] - height[pairs[:, 1]]))[:, None]
-    middles = {(a, b): len(points) + k for k, (a, b) in enumerate(map(tuple, pairs.tolist()))}
+    midpoint_nodes = {(a, b): len(points) + k for k, (a, b) in enumerate(map(tuple, pairs.tolist()))}
     points = np.concatenate([points, (1 - fraction) * points[pairs[:, 0]] + fraction * points[pairs[:, 1]]])
 
-    def middle(a: int, b: int) -> int:
-        return middles[min(a, b), max(a, b)]
+    def midpoint_node(a: int, b: int) -> int:
+        return midpoint_nodes[min(a, b), max(a, b)]
 
     new_cells = []
     for corners in cells[is_crossed].tolist():
@@ -222,12 +222,12 @@ def _cut_cells(
         if 0 in signs:
             k = signs.index(0)
             a, b, c = corners[k:] + corners[:k]
-            first_new = middle(b, c)
+            first_new = midpoint_node(b, c)
             new_cells += [(a, b, first_new), (a, first_new, c)]
         else:
             k = signs.index(-sum(signs))
             a, b, c = corners[k:] + corners[:k]
-            first_new, second_new = middle(a, b), middle(a, c)
+            first_new, second_new = midpoint_node(a, b), midpoint_node(a, c)
             new_cells.append((a, first_new, second_new))
             shorter = np.linalg.norm(points[first_new] - points[c]) < np.linalg.norm(points[b] - points[second_new])
             new_cells += (
@@ -236,10 +236,12 @@ def _cut_cells(
                 else [(first_new, b, second_new), (b, c, second_new)]
             )
     named_edges = {}
-    for name, ends in edges.items():
-        is_crossed_edge = side[ends].prod(axis=1) < 0
-        halves = [[(a, middle(a, b)), (middle(a, b), b)] for a, b in ends[is_crossed_edge].tolist()]
-        named_edges[name] = np.concatenate([ends[~is_crossed_edge], np.array(halves, int).reshape(-1, 2)])
+    for name, edge_ends in edges.items():
+        is_crossed_edge = side[edge_ends].prod(axis=1) < 0
+        edge_halves = [
+            [(a, midpoint_node(a, b)), (midpoint_node(a, b), b)] for a, b in edge_ends[is_crossed_edge].tolist()
+        ]
+        named_edges[name] = np.concatenate([edge_ends[~is_crossed_edge], np.array(edge_halves, int).reshape(-1, 2)])
     return points, np.concatenate([cells[~is_crossed], np.array(new_cells)]), named_edges
 
 
@@ -327,12 +329,12 @@ def shell(
         tags = {"outer": tags["inner"], "inner": tags["outer"]}
     if len(facets):
         tags["side"] = stacked_wall(facets, num_nodes, num_layers)
-    for name, index in surface.tags.items():
+    for name, facet_indices in surface.tags.items():
         if name in _SHELL_TAGS:
             raise ValueError(f"surface: its tag {name!r} is taken in a shell. Rename it.")
-        tags[name] = stacked_wall(facets[np.asarray(index)], num_nodes, num_layers)
+        tags[name] = stacked_wall(facets[np.asarray(facet_indices)], num_nodes, num_layers)
     mesh = Mesh.create(layer_points(thickness), tetrahedra, tags=tags)
-    _check_apart(mesh, thickness)
+    _check_no_self_contact(mesh, thickness)
     return mesh
 
 
@@ -362,15 +364,17 @@ def _check_upright(
             f"thickness is millimetres, give {1e-3 * thickness:.4g}; if the surface came from a file of another unit, "
             "read it with that: jeit.mesh.read(..., scale=1e-3) for millimetres, 0.0254 for inches, 1 for metres."
         )
-    lower, upper = 0.0, thickness
+    lower_thickness, upper_thickness = 0.0, thickness
     for _ in range(_BISECTION_STEPS):
-        middle = (lower + upper) / 2
-        is_upright = _volumes(layer_points(middle), tetrahedra, tetrahedron_signs).min() > 0
-        lower, upper = (middle, upper) if is_upright else (lower, middle)
-    worst_tetrahedron = int(np.argmin(_volumes(layer_points(upper), tetrahedra, tetrahedron_signs)))
+        middle_thickness = (lower_thickness + upper_thickness) / 2
+        is_upright = _volumes(layer_points(middle_thickness), tetrahedra, tetrahedron_signs).min() > 0
+        lower_thickness, upper_thickness = (
+            (middle_thickness, upper_thickness) if is_upright else (lower_thickness, middle_thickness)
+        )
+    worst_tetrahedron = int(np.argmin(_volumes(layer_points(upper_thickness), tetrahedra, tetrahedron_signs)))
     triangle = worst_tetrahedron // 3 % num_triangles
     position = layer_points(0.0)[tetrahedra[worst_tetrahedron, 0]].round(6).tolist()
-    max_thickness = (1 - 5e-4) * lower  # does not exceed `lower` after rounding to four digits
+    max_thickness = (1 - 5e-4) * lower_thickness  # does not exceed `lower_thickness` after rounding to four digits
     raise ValueError(
         f"thickness: {thickness:.4g} m is more than the radius of curvature of the surface at triangle {triangle}, "
         f"near {position} m: the skin turns inside out there. It can be {max_thickness:.4g} m thick at most; or let it "
@@ -378,7 +382,7 @@ def _check_upright(
     )
 
 
-def _check_apart(mesh: Mesh, thickness: float) -> None:
+def _check_no_self_contact(mesh: Mesh, thickness: float) -> None:
     points, boundary = np.asarray(mesh.points), np.asarray(mesh.facets)
     if (pair := first_crossing(points, boundary)) is not None:
         position = points[boundary[pair[0]]].mean(axis=0).round(6).tolist()

@@ -139,11 +139,11 @@ def _sleeve_mesh(height: float, semi_axes: np.ndarray, num_per_ring: int) -> Mes
     """Mesh a sleeve from rows of nodes on ellipses with `semi_axes` (r + 1, 2), evenly spaced along each ellipse."""
     rings = []
     for row, (a, b) in enumerate(semi_axes):
-        turns = (np.arange(num_per_ring) + row % 2 / 2) / num_per_ring
-        angle = 2 * np.pi * turns
+        relative_angles = (np.arange(num_per_ring) + row % 2 / 2) / num_per_ring
+        angle = 2 * np.pi * relative_angles
         if a != b:
             length = _arc_lengths(a, b)
-            angle = np.interp(turns * length[-1], length, np.linspace(0, 2 * np.pi, _ELLIPSE_SAMPLES + 1))
+            angle = np.interp(relative_angles * length[-1], length, np.linspace(0, 2 * np.pi, _ELLIPSE_SAMPLES + 1))
         rings.append(np.stack([a * np.cos(angle), b * np.sin(angle), np.full(num_per_ring, height * row)], axis=1))
     points = np.concatenate(rings)
     points[:, 2] /= len(semi_axes) - 1
