@@ -86,14 +86,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for output in (sys.stdout, sys.stderr):
         if isinstance(output, io.TextIOWrapper):
             output.reconfigure(errors="replace")  # avoids errors on terminals without Greek letters
-    arguments_given = sys.argv[1:] if arguments is None else list(arguments)
-    command = as_command(arguments_given)
+    command_arguments = sys.argv[1:] if arguments is None else list(arguments)
+    command = run_as_command(command_arguments)
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _create_warning_printer()
             if arguments is None:
-                _set_up_process(compile_quickly=not " ".join(arguments_given[:2]).startswith(_FULLY_OPTIMISED))
-            status = command.main(args=arguments_given, prog_name="jeit", standalone_mode=False)
+                _set_up_process(compile_quickly=not " ".join(command_arguments[:2]).startswith(_FULLY_OPTIMISED))
+            status = command.main(args=command_arguments, prog_name="jeit", standalone_mode=False)
     except (KeyboardInterrupt, StoppedError) as stop:
         remove_empty_folders()
         return _print_error(str(stop) or "stopped.", 130)
@@ -105,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return status if isinstance(status, int) else 0
 
 
-def as_command(arguments: Sequence[str] = ()):
+def run_as_command(arguments: Sequence[str] = ()):
     """Create the application as a click command whose error messages name options instead of Python arguments.
 
     If the first of the `arguments` is the name of a command, only that command is imported.
@@ -157,11 +157,11 @@ def _report_error(error: Exception) -> int:
 
 
 def _print_error(message: str, status: int) -> int:
-    print(f"jeit: {_one_line(message)}", file=sys.stderr)
+    print(f"jeit: {_join_lines(message)}", file=sys.stderr)
     return status
 
 
-def _one_line(message: str) -> str:
+def _join_lines(message: str) -> str:
     """Convert an error message to one line of printable characters, shortened in the middle if it is too long."""
     line = "".join(letter if letter.isprintable() else "�" for letter in " ".join(message.split()))
     half_length = (_MAX_MESSAGE - 3) // 2
@@ -172,15 +172,15 @@ def _create_warning_printer() -> Callable[..., None]:
     """Create a function that prints each warning only once, because the same objects are often created repeatedly."""
     printed_texts: set[str] = set()
 
-    def show(message, category, filename, lineno, file=None, line=None) -> None:
+    def show_warning(message, category, filename, lineno, file=None, line=None) -> None:
         text = str(message)
         if issubclass(category, _DEVELOPER_WARNINGS) and not os.environ.get("JEIT_DEBUG"):
             return
         if text not in printed_texts and not discarded_damaged(text):
             printed_texts.add(text)
-            print(f"jeit: warning: {_one_line(text)}", file=sys.stderr)
+            print(f"jeit: warning: {_join_lines(text)}", file=sys.stderr)
 
-    return show
+    return show_warning
 
 
 def _set_up_process(*, compile_quickly: bool) -> None:

@@ -67,9 +67,9 @@ class Steps:
         the remaining time."""
         if self._status is not None:
             match = _PROGRESS.search(detail)
-            num_done, num_parts = (int(digits.replace(",", "")) for digits in match.groups()) if match else (0, 0)
+            num_finished, num_parts = (int(digits.replace(",", "")) for digits in match.groups()) if match else (0, 0)
             now = time.perf_counter()
-            self._status.update(_StepLine(f"{self._step} … {detail}", self._start, num_done, num_parts, now))
+            self._status.update(_StepLine(f"{self._step} … {detail}", self._start, num_finished, num_parts, now))
 
     def __enter__(self) -> "Steps":
         return self
@@ -126,28 +126,28 @@ def name_value_table(title: str, rows: list[tuple[str, str]]) -> Table:
     return table
 
 
-def say_written(console: Console, first: Path, *others: str) -> None:
-    """Print the names of the written files: the `first` with its folder, the `others` without the folder."""
-    console.print(Text("Written:", "dim"), ", ".join([str(first), *others]), soft_wrap=True)
+def say_written(console: Console, first_path: Path, *other_names: str) -> None:
+    """Print the names of the written files: the `first_path` with its folder, the `other_names` without the folder."""
+    console.print(Text("Written:", "dim"), ", ".join([str(first_path), *other_names]), soft_wrap=True)
 
 
-def with_unit(value: float | None, unit: str) -> str:
+def format_with_unit(value: float | None, unit: str) -> str:
     """Format a value with three digits and an SI prefix, such as "1.32 mS" for 0.00132 S."""
     if value is None:
         return "not known"
     value = float(f"{value:.3g}")  # 999.6 µS is 1 mS
-    for exponent, prefix in _PREFIXES:
+    for exponent, si_prefix in _PREFIXES:
         if abs(value) >= 10.0**exponent:
-            return f"{value / 10.0**exponent:.3g} {prefix}{unit}"
+            return f"{value / 10.0**exponent:.3g} {si_prefix}{unit}"
     return f"{value:.3g} {unit}"
 
 
-def in_one_unit(values: list[float], unit: str) -> tuple[str, list[str]]:
+def format_in_one_unit(values: list[float], unit: str) -> tuple[str, list[str]]:
     """Format the values of a table column in one unit, with the SI prefix that suits the largest value; return the unit
     and the formatted values."""
-    largest = float(f"{max((abs(value) for value in values), default=0.0):.3g}")
-    exponent, prefix = next((pair for pair in _PREFIXES if largest >= 10.0 ** pair[0]), _PREFIXES[0])
-    return f"{prefix}{unit}", [f"{value / 10.0**exponent:.3g}" for value in values]
+    max_value = float(f"{max((abs(value) for value in values), default=0.0):.3g}")
+    exponent, si_prefix = next((pair for pair in _PREFIXES if max_value >= 10.0 ** pair[0]), _PREFIXES[0])
+    return f"{si_prefix}{unit}", [f"{value / 10.0**exponent:.3g}" for value in values]
 
 
 def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str, *, background: float | None = None) -> Table:
@@ -155,14 +155,16 @@ def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str, *, background:
 
     `unit`: unit of conductivity. `background`: conductivity of the reference, if known.
     """
-    unit, peaks = in_one_unit([inclusion.peak for inclusion in inclusions], unit)
+    unit, peaks = format_in_one_unit([inclusion.peak for inclusion in inclusions], unit)
     noun, size_unit, digits = _size_format(inclusions)
     share_columns = ["of back-\nground"] if background else []
     rows = []
     for inclusion, peak in zip(inclusions, peaks, strict=True):
         share_cells = [percent(inclusion.peak / background)] if background else []
         rows.append([f"{1e6 * inclusion.area:.{digits}f}", peak, *share_cells])
-    return _inclusion_table_with(inclusions, [f"{noun}\n/ {size_unit}", f"peak change\n/ {unit}", *share_columns], rows)
+    return _create_inclusion_table(
+        inclusions, [f"{noun}\n/ {size_unit}", f"peak change\n/ {unit}", *share_columns], rows
+    )
 
 
 def quantity_table(inclusions: "Sequence[Inclusion]", background: float) -> Table:
@@ -175,16 +177,16 @@ def quantity_table(inclusions: "Sequence[Inclusion]", background: float) -> Tabl
     noun, unit, _ = _size_format(inclusions)
     rows = []
     for inclusion in inclusions:
-        size = with_interval(inclusion.area, inclusion.area_interval, lambda value: _three_digits(1e6 * value))
+        size = format_with_interval(inclusion.area, inclusion.area_interval, lambda value: _three_digits(1e6 * value))
         relative_change = inclusion.peak / background
-        change = with_interval(
+        change = format_with_interval(
             relative_change, inclusion.contrast_interval, lambda value: _three_digits(100 * value, "+")
         )
-        strength = with_interval(
+        strength = format_with_interval(
             inclusion.strength, inclusion.strength_interval, lambda value: _three_digits(1e6 * value)
         )
         rows.append([size, change, strength])
-    table = _inclusion_table_with(inclusions, [f"{noun}\n/ {unit}", "change\n/ %", f"strength\n/ {unit}"], rows)
+    table = _create_inclusion_table(inclusions, [f"{noun}\n/ {unit}", "change\n/ %", f"strength\n/ {unit}"], rows)
     table.caption = "below: the 68 % radius of the place, and 68 % intervals"
     table.caption_justify = "left"
     return table
@@ -195,7 +197,7 @@ def _three_digits(value: float, sign: str = "") -> str:
     return f"{float(f'{value:.3g}'):{sign}g}"
 
 
-def with_interval(value: float | None, interval: Interval | None, format_value: Callable[[float], str]) -> str:
+def format_with_interval(value: float | None, interval: Interval | None, format_value: Callable[[float], str]) -> str:
     """Text of a value with its interval on the next line; only the interval if the data do not determine both of its
     limits."""
     if value is None or interval is None:
@@ -210,12 +212,12 @@ def _size_format(inclusions: "Sequence[Inclusion]") -> tuple[str, str, int]:
     return ("volume", "cm³", 2) if any(inclusion.is_solid for inclusion in inclusions) else ("area", "mm²", 0)
 
 
-def _inclusion_table_with(inclusions: "Sequence[Inclusion]", columns: list[str], rows: list[list[str]]) -> Table:
+def _create_inclusion_table(inclusions: "Sequence[Inclusion]", columns: list[str], rows: list[list[str]]) -> Table:
     """Create a table of inclusions with their kind and position, and further `columns`, at most 80 characters wide."""
     dimension = max((len(inclusion.centroid) for inclusion in inclusions), default=2)
     table_style = {"box": None, "padding": (0, 2), "collapse_padding": True}
 
-    def table_of(separator: str) -> Table:
+    def create_table(separator: str) -> Table:
         """Create the table; `separator` separates the kind of a body from the word "column"."""
         table = Table("inclusion", *(f"{axis} / mm" for axis in "xyz"[:dimension]), *columns, **table_style)
         table.columns[0].min_width = max((len(inclusion.kind) for inclusion in inclusions), default=0)
@@ -229,9 +231,9 @@ def _inclusion_table_with(inclusions: "Sequence[Inclusion]", columns: list[str],
             table.add_row(kind, *place, *row)
         return table
 
-    table_on_one_line = table_of(" ")
+    table_on_one_line = create_table(" ")
     return (
         table_on_one_line
         if Console(width=_MAX_TABLE_WIDTH + 1).measure(table_on_one_line).maximum <= _MAX_TABLE_WIDTH
-        else table_of("\n")
+        else create_table("\n")
     )

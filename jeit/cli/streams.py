@@ -47,7 +47,7 @@ class LiveFrames:
         self.first_time, self.num_returned = 0.0, 0
 
     @property
-    def rate_seen(self) -> float:
+    def measured_rate(self) -> float:
         """Frame rate in frames/s: the specified rate, else the mean rate of the frames read so far, else the usual
         rate."""
         if self.rate is not None:
@@ -55,16 +55,16 @@ class LiveFrames:
         seconds = [second for second, _ in self.read_frames]
         return (len(seconds) - 1) / seconds[-1] if len(seconds) > 1 and seconds[-1] > 0 else self.usual_rate
 
-    def initial_frames(self, span: float) -> Float[np.ndarray, "u M"]:
-        """Read the frames (frames, channels) of the first `span` seconds; iteration returns these frames again. Raises
-        `ValueError` if there are none."""
+    def initial_frames(self, duration: float) -> Float[np.ndarray, "u M"]:
+        """Read the frames (frames, channels) of the first `duration` seconds; iteration returns these frames again.
+        Raises `ValueError` if there are none."""
         self._catch_up()
-        while not self.read_frames or self.read_frames[-1][0] < span:
+        while not self.read_frames or self.read_frames[-1][0] < duration:
             frame = self._next()
             if frame is None:
                 break
-            self.read_frames.append((self._second(), frame))
-        rows = [frame for second, frame in self.read_frames if isinstance(frame, list) and second <= span]
+            self.read_frames.append((self._current_time(), frame))
+        rows = [frame for second, frame in self.read_frames if isinstance(frame, list) and second <= duration]
         if not rows:
             raise ValueError("standard input: there was no frame of numbers in it.")
         frame_lengths = [len(row) for row in rows]
@@ -75,7 +75,7 @@ class LiveFrames:
         self._catch_up()
         yield from self.read_frames
         while (frame := self._next()) is not None:
-            yield self._second(), frame
+            yield self._current_time(), frame
 
     def _catch_up(self) -> None:
         """Skip frames that arrived before reading began. If the input ends among these frames, none is skipped, and
@@ -87,25 +87,25 @@ class LiveFrames:
             wait_start = time.monotonic()
             frame = self._next()
             if frame is None:
-                self.rate = self.rate_seen
+                self.rate = self.measured_rate
                 self.num_returned = len(self.read_frames)
                 self.by_clock = False
-                self.read_frames += [(self._second(), skipped) for skipped in skipped_frames]
+                self.read_frames += [(self._current_time(), skipped) for skipped in skipped_frames]
                 return
             num_consecutive = (
                 num_consecutive + 1 if time.monotonic() - wait_start > _MIN_WAIT_SHARE / self.usual_rate else 0
             )
             if num_consecutive == _NUM_LIVE_FRAMES:
                 self.left_out += len(skipped_frames)
-                self.read_frames.append((self._second(), frame))
+                self.read_frames.append((self._current_time(), frame))
                 return
             skipped_frames.append(frame)
         self.left_out += len(skipped_frames)
 
-    def _second(self) -> float:
+    def _current_time(self) -> float:
         now = time.monotonic()
         self.first_time = now if self.num_returned == 0 else self.first_time
-        second = now - self.first_time if self.by_clock else self.num_returned / self.rate_seen
+        second = now - self.first_time if self.by_clock else self.num_returned / self.measured_rate
         self.num_returned += 1
         return max(second, self.read_frames[-1][0] if self.read_frames else 0.0)
 
@@ -167,17 +167,17 @@ class Stopping:
         contain them, and exits the command."""
         try:
             yield
-            hint = f"; {' and '.join(files)} have them"
+            files_hint = f"; {' and '.join(files)} have them"
         except (_StoppedError, ValueError) as error:
             if self.signal is None:
                 raise
-            hint = f"; {' and '.join(files)} have them" if isinstance(error, _StoppedError) else ""
+            files_hint = f"; {' and '.join(files)} have them" if isinstance(error, _StoppedError) else ""
         except KeyboardInterrupt:
             if self.signal is None or frame_counter.number:
                 raise
-            hint = ""  # stopped during compilation, before the first frame
+            files_hint = ""  # stopped during compilation, before the first frame
         if self.signal is not None:
-            self._end(f" after {counted(frame_counter.number, 'frame')}{hint}")
+            self._end(f" after {counted(frame_counter.number, 'frame')}{files_hint}")
 
     def _end(self, detail: str) -> NoReturn:
         remove_empty_folders()
@@ -201,9 +201,9 @@ class Stopping:
             self._end("")
 
     def _stop(self, signal_number: int, _) -> None:
-        at_once = self.signal is not None or self._waiting or not self._streaming
+        stops_at_once = self.signal is not None or self._waiting or not self._streaming
         self.signal = signal_number
-        if at_once:
+        if stops_at_once:
             raise KeyboardInterrupt
 
 
@@ -215,7 +215,7 @@ class FrameCounter:
         self._step, self._total_text = step, "" if num_frames is None else f" of {num_frames:,}"
         self.number, self._last_report = 0, 0.0
 
-    def one_more(self) -> None:
+    def count_frame(self) -> None:
         """Count a frame."""
         self.number += 1
         now = time.monotonic()

@@ -253,7 +253,9 @@ def _check_band(frequency) -> tuple[float, float]:
     """The lowest and the highest frequency in hertz, which are equal if `frequency` is a number."""
     band = (frequency, frequency) if is_number(frequency) else frequency
     if not (
-        isinstance(band, tuple | list) and len(band) == 2 and all(is_number(limit) and limit > 0 for limit in band)
+        isinstance(band, tuple | list)
+        and len(band) == 2
+        and all(is_number(band_limit) and band_limit > 0 for band_limit in band)
     ):
         raise ValueError(f"frequency must be positive hertz, or a band (lowest, highest); it is {describe(frequency)}.")
     if band[0] > band[1]:

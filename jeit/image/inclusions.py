@@ -191,8 +191,8 @@ class StrongestRegion:
     def __init__(self, mesh: Mesh):
         shared = np.asarray(mesh.cells if mesh.dimension == 3 else shared_facets(mesh))
         rows, columns = np.nonzero(shared >= 0)  # facets of the boundary are not shared
-        entries = np.ones(len(rows), np.float32), (rows, shared[rows, columns])
-        self._incidence = sparse.csr_array(entries, shape=(len(shared), int(shared.max()) + 1))
+        matrix_entries = np.ones(len(rows), np.float32), (rows, shared[rows, columns])
+        self._incidence = sparse.csr_array(matrix_entries, shape=(len(shared), int(shared.max()) + 1))
         self._transposed = sparse.csr_array(self._incidence.T)
         self._measures, self._centroids = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
 

@@ -50,8 +50,8 @@ class CutPieces(NamedTuple):
     def at_corners(self, values: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "p c ..."]:
         """Values at the corners of the pieces, interpolated linearly from `values` at the nodes, such as positions (n,
         d)."""
-        share = self.share.reshape(*self.share.shape, *[1] * (values.ndim - 1))
-        return (1 - share) * values[self.ends[..., 0]] + share * values[self.ends[..., 1]]
+        edge_fraction = self.share.reshape(*self.share.shape, *[1] * (values.ndim - 1))
+        return (1 - edge_fraction) * values[self.ends[..., 0]] + edge_fraction * values[self.ends[..., 1]]
 
 
 def crossed_cells(cells: Int[np.ndarray, "m 4"], values: Float[np.ndarray, " n"], level: float = 0.0) -> CutPieces:
@@ -61,7 +61,9 @@ def crossed_cells(cells: Int[np.ndarray, "m 4"], values: Float[np.ndarray, " n"]
     return _cut_cells(cells, values, level, _CROSSED_EDGES)
 
 
-def part_above(triangles: Int[np.ndarray, "b 3"], values: Float[np.ndarray, " n"], level: float = 0.0) -> CutPieces:
+def cut_above_level(
+    triangles: Int[np.ndarray, "b 3"], values: Float[np.ndarray, " n"], level: float = 0.0
+) -> CutPieces:
     """The part of a surface of triangles on which the field with the `values` (n,) at the nodes is at or above
     `level`."""
     return _cut_cells(triangles, values, level, _CORNERS_ABOVE)
@@ -73,18 +75,18 @@ def crossed_edges(triangles: Int[np.ndarray, "b 3"], values: Float[np.ndarray, "
     return _cut_cells(triangles, values, level, {1: _CROSSED_SIDES, 2: [[0, 2], [1, 2]]})
 
 
-def _cut_cells(cells, values, level: float, cases: dict[int, list[list[int]]]) -> CutPieces:
-    num_above = (values[cells] >= level).sum(axis=1)
-    pieces = []
-    for above, corners in cases.items():
-        cell = np.flatnonzero(num_above == above)
+def _cut_cells(cells, values, level: float, corners_by_number: dict[int, list[list[int]]]) -> CutPieces:
+    num_nodes_above = (values[cells] >= level).sum(axis=1)
+    piece_arrays = []
+    for num_corners_above, corners in corners_by_number.items():
+        cell = np.flatnonzero(num_nodes_above == num_corners_above)
         order = np.argsort(-values[cells[cell]], axis=1, kind="stable")
-        ends = np.take_along_axis(cells[cell], order, axis=1)[:, np.array(corners)]
-        high, low = values[ends[..., 0]], values[ends[..., 1]]
+        end_nodes = np.take_along_axis(cells[cell], order, axis=1)[:, np.array(corners)]
+        high, low = values[end_nodes[..., 0]], values[end_nodes[..., 1]]
         with np.errstate(invalid="ignore"):
-            share = np.where(high > low, (high - level) / np.where(high > low, high - low, 1), 0)
-        pieces.append((ends, share, cell))
-    return CutPieces(*(np.concatenate(arrays) for arrays in zip(*pieces, strict=True)))
+            edge_fractions = np.where(high > low, (high - level) / np.where(high > low, high - low, 1), 0)
+        piece_arrays.append((end_nodes, edge_fractions, cell))
+    return CutPieces(*(np.concatenate(arrays) for arrays in zip(*piece_arrays, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -174,26 +176,34 @@ def isosurface_of(mesh: Mesh, values: Float[np.ndarray, "..."], level: float) ->
     sign = 1.0 if level > 0 else -1.0
     height = sign * node_values(mesh, values) - abs(level)
     points = np.asarray(mesh.points)
-    inner, wall = crossed_cells(np.asarray(mesh.cells), height), part_above(np.asarray(mesh.facets), height)
-    ends, share = np.concatenate([inner.ends, wall.ends]), np.concatenate([inner.share, wall.share])
+    inner, wall = crossed_cells(np.asarray(mesh.cells), height), cut_above_level(np.asarray(mesh.facets), height)
+    end_nodes, edge_fractions = np.concatenate([inner.ends, wall.ends]), np.concatenate([inner.share, wall.share])
     # One point for each crossed edge and each node of the wall, shared between cells.
-    ends = np.where(
-        ((share == 0) | (share == 1))[..., None], np.where(share == 1, ends[..., 1], ends[..., 0])[..., None], ends
+    end_nodes = np.where(
+        ((edge_fractions == 0) | (edge_fractions == 1))[..., None],
+        np.where(edge_fractions == 1, end_nodes[..., 1], end_nodes[..., 0])[..., None],
+        end_nodes,
     )
-    share = np.where(ends[..., 0] == ends[..., 1], 0.0, share)
-    low = ends.min(axis=-1).astype(np.int64)
-    key = low * len(points) + ends.max(axis=-1)
-    _, first, number = np.unique(key, return_index=True, return_inverse=True)
-    ends, share, number = ends.reshape(-1, 2)[first], share.reshape(-1)[first], number.reshape(-1, 4)
-    places = (1 - share)[:, None] * points[ends[:, 0]] + share[:, None] * points[ends[:, 1]]
+    edge_fractions = np.where(end_nodes[..., 0] == end_nodes[..., 1], 0.0, edge_fractions)
+    low = end_nodes.min(axis=-1).astype(np.int64)
+    key = low * len(points) + end_nodes.max(axis=-1)
+    _, first_indices, number = np.unique(key, return_index=True, return_inverse=True)
+    end_nodes, edge_fractions, number = (
+        end_nodes.reshape(-1, 2)[first_indices],
+        edge_fractions.reshape(-1)[first_indices],
+        number.reshape(-1, 4),
+    )
+    points_on_edges = (1 - edge_fractions)[:, None] * points[end_nodes[:, 0]] + edge_fractions[:, None] * points[
+        end_nodes[:, 1]
+    ]
     # Normals point from values above the level to values below; facets of the wall have outward normals already.
-    inside = points[inner.ends[..., 1]].sum(axis=1) - points[inner.ends[..., 0]].sum(axis=1)
-    outward = np.concatenate([inside, _normals(points[np.asarray(mesh.facets)[wall.cell]])])
+    inward_directions = points[inner.ends[..., 1]].sum(axis=1) - points[inner.ends[..., 0]].sum(axis=1)
+    outward = np.concatenate([inward_directions, _normals(points[np.asarray(mesh.facets)[wall.cell]])])
     triangles = np.concatenate([number[:, [0, 1, 2]], number[:, [0, 2, 3]]])
-    turned = np.sum(_normals(places[triangles]) * np.concatenate([outward, outward]), axis=1) < 0
-    triangles[turned] = triangles[turned][:, ::-1]
+    is_inverted = np.sum(_normals(points_on_edges[triangles]) * np.concatenate([outward, outward]), axis=1) < 0
+    triangles[is_inverted] = triangles[is_inverted][:, ::-1]
     a, b, c = triangles.T
-    return TriangleSurface(places, triangles[(a != b) & (b != c) & (a != c)])
+    return TriangleSurface(points_on_edges, triangles[(a != b) & (b != c) & (a != c)])
 
 
 def _normals(corners: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3"]:
@@ -258,10 +268,12 @@ class Plane:
         length = float(np.linalg.norm(normal_array))
         if length == 0:
             raise ValueError("normal is zero; give the direction in which the plane is looked at, such as (0, 0, 1).")
-        toward = normal_array / length
+        unit_normal = normal_array / length
         point_text = ", ".join(_millimetres(value) for value in point_array)
-        normal_text = ", ".join(f"{value:.2g}" for value in toward).replace("-", "−")
-        return cls(point_array, toward, *_page_axes(toward), f"through ({point_text}) mm across ({normal_text})")
+        normal_text = ", ".join(f"{value:.2g}" for value in unit_normal).replace("-", "−")
+        return cls(
+            point_array, unit_normal, *_page_axes(unit_normal), f"through ({point_text}) mm across ({normal_text})"
+        )
 
     def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Distance of points (n, 3) from the plane in metres, positive towards the viewer."""
@@ -326,15 +338,15 @@ def cut_by_plane(mesh: Mesh, plane: Plane) -> Cut:
     height = plane.distance(points)
     size = float(np.ptp(points, axis=0).max())
     height = np.where(np.abs(height) < _IN_PLANE_TOLERANCE * size, 0.0, height)
-    pieces, edges = crossed_cells(cells, height), crossed_edges(facets, height)
-    if len(pieces.cell) == 0:
-        pieces, edges = crossed_cells(cells, -height), crossed_edges(facets, -height)
-    if len(pieces.cell) == 0:
+    cut_pieces, edges = crossed_cells(cells, height), crossed_edges(facets, height)
+    if len(cut_pieces.cell) == 0:
+        cut_pieces, edges = crossed_cells(cells, -height), crossed_edges(facets, -height)
+    if len(cut_pieces.cell) == 0:
         min_height, max_height = (1e3 * value for value in (height.min(), height.max()))
         distance_text = f"{min_height:.3g} mm before" if min_height > 0 else f"{-max_height:.3g} mm behind"
         raise ValueError(f"plane {plane.name} misses the body, which lies {distance_text} it; are both in metres?")
-    polygons, outline = plane.on_page(pieces.at_corners(points)), plane.on_page(edges.at_corners(points))
-    return Cut(polygons, pieces.cell, outline[np.ptp(outline, axis=1).max(axis=1) > 0])
+    polygons, outline = plane.on_page(cut_pieces.at_corners(points)), plane.on_page(edges.at_corners(points))
+    return Cut(polygons, cut_pieces.cell, outline[np.ptp(outline, axis=1).max(axis=1) > 0])
 
 
 def check_solid(mesh: Mesh) -> None:
@@ -344,14 +356,16 @@ def check_solid(mesh: Mesh) -> None:
         raise ValueError("mesh: this is for solids of tetrahedra; draw a plane mesh with plot_image.")
 
 
-def _page_axes(toward) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors to the right and up on the page, for a plane viewed from the direction `toward`."""
+def _page_axes(view_direction) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors to the right and up on the page, for a plane viewed from the direction `view_direction`."""
     reference = (
-        np.array([0.0, 0.0, 1.0]) if abs(toward[2]) < 1 - 1e-9 else np.array([0.0, math.copysign(1, toward[2]), 0.0])
+        np.array([0.0, 0.0, 1.0])
+        if abs(view_direction[2]) < 1 - 1e-9
+        else np.array([0.0, math.copysign(1, view_direction[2]), 0.0])
     )
-    page_up = reference - (reference @ toward) * toward
-    page_up /= np.linalg.norm(page_up)
-    return np.cross(page_up, toward) + 0.0, page_up + 0.0
+    upward_axis = reference - (reference @ view_direction) * view_direction
+    upward_axis /= np.linalg.norm(upward_axis)
+    return np.cross(upward_axis, view_direction) + 0.0, upward_axis + 0.0
 
 
 def _millimetres(value: float) -> str:

@@ -55,8 +55,8 @@ class Raster(Module):
         points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
         low, high = points.min(axis=0), points.max(axis=0)
         if extent is None:
-            centre, half = (low + high)[:2] / 2, (high - low)[:2].max() / 2
-            extent = (centre[0] - half, centre[0] + half, centre[1] - half, centre[1] + half)
+            centre, half_side = (low + high)[:2] / 2, (high - low)[:2].max() / 2
+            extent = (centre[0] - half_side, centre[0] + half_side, centre[1] - half_side, centre[1] + half_side)
         x_min, x_max, y_min, y_max = (float(value) for value in extent)
         if not (x_max > x_min and y_max > y_min) or min(shape) < 1:
             raise ValueError(f"extent {extent} must be (x_min, x_max, y_min, y_max) in metres, and shape positive.")
@@ -110,9 +110,11 @@ def _cells_of_pixels(points, cells, x, y, height: float | None) -> Int[np.ndarra
     num_pixels = num_rows * num_columns
     if height is not None:
         num_pixels[(low[:, 2] > height + tolerance) | (high[:, 2] < height - tolerance)] = 0
-    tested = np.flatnonzero(num_pixels)
+    cells_with_pixels = np.flatnonzero(num_pixels)
     inverse, centroid = np.zeros((len(cells), *corners[0, 1:].shape)), corners.mean(axis=1)
-    inverse[tested] = np.linalg.inv(np.swapaxes(corners[tested, 1:] - corners[tested, :1], 1, 2))
+    inverse[cells_with_pixels] = np.linalg.inv(
+        np.swapaxes(corners[cells_with_pixels, 1:] - corners[cells_with_pixels, :1], 1, 2)
+    )
     cell = np.repeat(np.arange(len(cells)), num_pixels)
     pixel = np.arange(len(cell)) - np.repeat(np.cumsum(num_pixels) - num_pixels, num_pixels)
     row, column = np.divmod(pixel, num_columns[cell])
@@ -175,15 +177,15 @@ class FiguresOfMerit(Module):
     body_radius: Float[Array, "*targets"]
 
     def __repr__(self) -> str:
-        return object_text(self._in_words, self)
+        return object_text(self._summary_text, self)
 
-    def _in_words(self) -> str:
-        middle = {name: float(np.median(np.asarray(value))) for name, value in vars(self).items()}
+    def _summary_text(self) -> str:
+        medians = {name: float(np.median(np.asarray(value))) for name, value in vars(self).items()}
         targets = f"medians of {np.size(self.distance)} targets: " if np.ndim(self.distance) else ""
         return (
-            f"FiguresOfMerit({targets}amplitude response {middle['amplitude_response']:.3g}, position error "
-            f"{1e3 * middle['position_error']:.3g} mm,\n  resolution {middle['resolution']:.3g}, shape deformation "
-            f"{middle['shape_deformation']:.3g}, ringing {middle['ringing']:.3g})"
+            f"FiguresOfMerit({targets}amplitude response {medians['amplitude_response']:.3g}, position error "
+            f"{1e3 * medians['position_error']:.3g} mm,\n  resolution {medians['resolution']:.3g}, shape deformation "
+            f"{medians['shape_deformation']:.3g}, ringing {medians['ringing']:.3g})"
         )
 
     def _repr_png_(self) -> bytes | None:
@@ -266,10 +268,10 @@ def _figures_of_one_image(raster, extent, position, area, change):
     )
 
 
-def _centre_of_gravity(inside, x, y):
-    """Centre of gravity of the pixels in the mask `inside`; NaN for an empty mask."""
-    size = jnp.sum(inside)
-    return jnp.stack([jnp.sum(jnp.where(inside, x, 0)), jnp.sum(jnp.where(inside, y, 0))]) / size
+def _centre_of_gravity(is_inside, x, y):
+    """Centre of gravity of the pixels in the mask `is_inside`; NaN for an empty mask."""
+    size = jnp.sum(is_inside)
+    return jnp.stack([jnp.sum(jnp.where(is_inside, x, 0)), jnp.sum(jnp.where(is_inside, y, 0))]) / size
 
 
 def _check_arguments(raster, extent, position, area, change) -> None:
@@ -336,12 +338,14 @@ def challenge_score(labels: Int[np.ndarray, "256 256"], truth: Int[np.ndarray, "
     return float(np.mean([_structural_similarity(labels == kind, truth == kind) for kind in (CONDUCTIVE, RESISTIVE)]))
 
 
-def _structural_similarity(first: np.ndarray, second: np.ndarray) -> float:
+def _structural_similarity(first_image: np.ndarray, second_image: np.ndarray) -> float:
     """Structural similarity (SSIM) of two masks, averaged over the pixels. Wang et al., IEEE Trans. Image Process. 13
     (2004)."""
-    window = _gaussian_window(first.shape[0])
+    window = _gaussian_window(first_image.shape[0])
     # A mask equals its own square.
-    a, b, product = (window @ image.astype(float) @ window.T for image in (first, second, first & second))
+    a, b, product = (
+        window @ image.astype(float) @ window.T for image in (first_image, second_image, first_image & second_image)
+    )
     variance_a, variance_b, covariance = a - a**2, b - b**2, product - a * b
     luminance = (2 * a * b + _C1) / (a**2 + b**2 + _C1)
     return float(np.mean(luminance * (2 * covariance + _C2) / (variance_a + variance_b + _C2)))

@@ -33,7 +33,7 @@ def ball_region(mesh: Mesh, centre: ArrayLike, radius: float) -> Bool[np.ndarray
     """
     if not (is_number(radius) and radius > 0):
         raise ValueError(f"radius must be a positive number of metres; it is {describe(radius)}.")
-    distance = np.linalg.norm(_centroids_from(mesh, centre, "centre"), axis=1)
+    distance = np.linalg.norm(_offsets_from_point(mesh, centre, "centre"), axis=1)
     return _check_not_empty(mesh, distance <= radius, "no centroid of a cell is so near to centre; make radius larger")
 
 
@@ -54,11 +54,14 @@ def box_region(mesh: Mesh, lower: ArrayLike, upper: ArrayLike) -> Bool[np.ndarra
     region = box_region(mesh, [0.0, -0.05], [0.05, 0.05])
     ```
     """
-    above, below = _centroids_from(mesh, lower, "lower"), _centroids_from(mesh, upper, "upper")
+    offsets_from_lower, offsets_from_upper = (
+        _offsets_from_point(mesh, lower, "lower"),
+        _offsets_from_point(mesh, upper, "upper"),
+    )
     if not (np.asarray(lower, float) < np.asarray(upper, float)).all():
         raise ValueError("upper must be larger than lower in every coordinate.")
-    between = (above >= 0).all(axis=1) & (below <= 0).all(axis=1)
-    return _check_not_empty(mesh, between, "no centroid of a cell lies between lower and upper")
+    is_between = (offsets_from_lower >= 0).all(axis=1) & (offsets_from_upper <= 0).all(axis=1)
+    return _check_not_empty(mesh, is_between, "no centroid of a cell lies between lower and upper")
 
 
 def half_region(mesh: Mesh, direction: ArrayLike, point: ArrayLike | None = None) -> Bool[np.ndarray, " m"]:
@@ -84,11 +87,11 @@ def half_region(mesh: Mesh, direction: ArrayLike, point: ArrayLike | None = None
     cell_sizes = np.asarray(measures(mesh))
     origin = cell_sizes @ np.asarray(centroids(mesh)) / cell_sizes.sum() if point is None else point
     return _check_not_empty(
-        mesh, _centroids_from(mesh, origin, "point") @ normal > 0, "no cell lies in direction of point"
+        mesh, _offsets_from_point(mesh, origin, "point") @ normal > 0, "no cell lies in direction of point"
     )
 
 
-def _centroids_from(mesh: Mesh, point: ArrayLike, name: str) -> Float[np.ndarray, "m d"]:
+def _offsets_from_point(mesh: Mesh, point: ArrayLike, name: str) -> Float[np.ndarray, "m d"]:
     """Vectors (m, d) from a `point` to the centroids of the cells. Raises `ValueError` for a point with the wrong
     number of coordinates."""
     coordinates = np.asarray(point, float)
@@ -137,22 +140,22 @@ def basins(
     label_of_place: dict[int, int] = {}
     merged_labels: dict[int, int] = {}
 
-    def root(label: int) -> int:
+    def find_root(label: int) -> int:
         while label in merged_labels:
             label = merged_labels[label]
         return label
 
     cells = np.flatnonzero(change > floor)
     for cell in cells[np.argsort(-change[cells], kind="stable")].tolist():
-        shared_places = [place for place in shared[cell].tolist() if place >= 0]
-        labels = {root(label_of_place[place]) for place in shared_places if place in label_of_place}
+        shared_places = [neighbour for neighbour in shared[cell].tolist() if neighbour >= 0]
+        labels = {find_root(label_of_place[neighbour]) for neighbour in shared_places if neighbour in label_of_place}
         highest = max(labels, key=lambda label: change[label], default=cell)
         for label in labels - {highest}:
             if change[label] - change[cell] < least_prominence * change[label]:
                 merged_labels[label] = highest
         peak[cell] = highest
         label_of_place.update(dict.fromkeys(shared_places, highest))
-    peak[cells] = [root(label) for label in peak[cells].tolist()]
+    peak[cells] = [find_root(label) for label in peak[cells].tolist()]
     return peak
 
 

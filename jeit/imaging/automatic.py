@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Inexact
 
 from jeit.arguments import percent
-from jeit.imaging.method import METHODS, Imaged, MethodOptions, of_shapes, shapes_in
+from jeit.imaging.method import METHODS, Imaged, MethodOptions, image_of_shapes, shapes_in
 from jeit.imaging.preparation import PreparedDifference
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
@@ -58,7 +58,7 @@ def image_automatically(prepared: PreparedDifference, options: MethodOptions, se
     default λ, not the requested λ. If the image is to be `segmented` and no shapes were fitted, total variation is
     used.
     """
-    imaged = _image_by("one-step", prepared, options)
+    imaged = _image_with_method("one-step", prepared, options)
     if np.iscomplexobj(prepared.difference):
         return ChosenMethod("one-step", "images of complex voltages are linear.", imaged)
     fault, uses_own_prior = (
@@ -73,20 +73,20 @@ def image_automatically(prepared: PreparedDifference, options: MethodOptions, se
         assert isinstance(gauss_newton[0], Reconstruction)
         shapes, outline_note = (None, "") if uses_own_prior else _shapes(prepared, gauss_newton[0], options)
         if shapes is not None or not segmented:
-            return _with_bodies(
+            return _add_bodies(
                 prepared, f"{fault}: solved for conductivity itself{outline_note}.", gauss_newton, shapes
             )
     elif not (segmented or uses_own_prior) and (bodies := _bodies_in_solid(prepared, options, imaged[1])):
         return bodies
     if segmented:
         reason = f"{fault or 'bodies are weak'}: cut up an image of few pieces."
-        return ChosenMethod("total-variation", reason, _image_by("total-variation", prepared, options))
+        return ChosenMethod("total-variation", reason, _image_with_method("total-variation", prepared, options))
     return ChosenMethod(
         "one-step", "the linear image is sound: changes are small, and it explains the voltages.", imaged
     )
 
 
-def _image_by(name: str, prepared: PreparedDifference, options: MethodOptions) -> Imaged:
+def _image_with_method(name: str, prepared: PreparedDifference, options: MethodOptions) -> Imaged:
     """Image a difference by the method `name` with the method's default λ."""
     method = METHODS[name]
     return method.image(prepared, options._replace(hyperparameter=method.hyperparameter))
@@ -96,8 +96,8 @@ def _image_for_bodies(prepared: PreparedDifference, options: MethodOptions) -> I
     """Gauss-Newton image, from which bodies are fitted. In a solid, the accuracy of the difference, which their fit
     needs, is computed at the same time."""
     if prepared.mesh.dimension < 3:
-        return _image_by("gauss-newton", prepared, options)
-    jobs = [lambda: _image_by("gauss-newton", prepared, options), lambda: prepared.accuracy]
+        return _image_with_method("gauss-newton", prepared, options)
+    jobs = [lambda: _image_with_method("gauss-newton", prepared, options), lambda: prepared.accuracy]
     return results_on_cores(lambda job: job(), jobs)[0]
 
 
@@ -115,24 +115,24 @@ def _bodies_in_solid(
     ):
         return None
     try:
-        smooth = _image_for_bodies(prepared, options)
+        smooth_image = _image_for_bodies(prepared, options)
     except ValueError:
         return None
-    assert isinstance(smooth[0], Reconstruction)
-    shapes, _ = _shapes(prepared, smooth[0], options)
+    assert isinstance(smooth_image[0], Reconstruction)
+    shapes, _ = _shapes(prepared, smooth_image[0], options)
     reason = f"the voltages show bodies, which a linear image of a solid blurs: their {_edges(prepared)} were fitted."
-    return shapes and _with_bodies(prepared, reason, smooth, shapes)
+    return shapes and _add_bodies(prepared, reason, smooth_image, shapes)
 
 
-def _with_bodies(
-    prepared: PreparedDifference, reason: str, smooth: Imaged, shapes: ShapeReconstruction | None
+def _add_bodies(
+    prepared: PreparedDifference, reason: str, smooth_image: Imaged, shapes: ShapeReconstruction | None
 ) -> ChosenMethod:
     """Result with fitted bodies: for a sheet, the smooth image and the outlines; for a solid, the image of the bodies
     and of the smooth field around them. In a solid, a smooth image alone shows strong bodies at a tenth of their
     contrast, with artefacts about as strong."""
     if shapes is None or prepared.mesh.dimension < 3:
-        return ChosenMethod("gauss-newton", reason, smooth, shapes)
-    return ChosenMethod("shapes", reason, of_shapes(prepared, shapes), shapes)
+        return ChosenMethod("gauss-newton", reason, smooth_image, shapes)
+    return ChosenMethod("shapes", reason, image_of_shapes(prepared, shapes), shapes)
 
 
 def _edges(prepared: PreparedDifference) -> str:
@@ -141,16 +141,16 @@ def _edges(prepared: PreparedDifference) -> str:
 
 
 def _shapes(
-    prepared: PreparedDifference, smooth: Reconstruction, options: MethodOptions
+    prepared: PreparedDifference, smooth_image: Reconstruction, options: MethodOptions
 ) -> tuple[ShapeReconstruction | None, str]:
     """Fit the bodies of a smooth image as shapes. Returns the shapes and a clause for the message. Returns None and the
     reason if no bodies are found, or if the misfit of the shapes exceeds both one standard deviation of
     `PreparedDifference.sharp_noise` and `_MAX_SHAPES_RATIO` times the misfit of the smooth image."""
-    shapes, edges = shapes_in(prepared, smooth, options), _edges(prepared)
+    shapes, edges = shapes_in(prepared, smooth_image, options), _edges(prepared)
     if not shapes.bodies:
         return None, f"; no body's {edges[:-1]} explains the voltages better than errors of the model do"
     # Where the noise is not known, it is estimated so that the smooth image has a misfit of at most 1.
-    smooth_misfit = float(smooth.misfit) if prepared.noise is not None else min(float(smooth.misfit), 1.0)
+    smooth_misfit = float(smooth_image.misfit) if prepared.noise is not None else min(float(smooth_image.misfit), 1.0)
     if (misfit := float(shapes.misfit)) > (max_misfit := max(1.0, _MAX_SHAPES_RATIO * smooth_misfit)):
         return (
             None,
@@ -164,12 +164,12 @@ def linear_image_fault(prepared: PreparedDifference, change: Float[Array, " m"])
     has no fault."""
     background, relative_change = float(prepared.calibration.conductivity), np.asarray(change)
     relative_change = relative_change / background
-    lowest, highest = float(relative_change.min()), float(relative_change.max())
-    if lowest < -1:
-        return f"the linear image falls to {percent(lowest)} of the background, below -100 %"
+    min_change, max_change = float(relative_change.min()), float(relative_change.max())
+    if min_change < -1:
+        return f"the linear image falls to {percent(min_change)} of the background, below -100 %"
     is_noisy = (quality := prepared.quality.difference_noise) is not None and quality.relative > _NOISY_SHARE
-    if max(-lowest, highest) > (_STRONG_NOISY_CHANGE if is_noisy else _STRONG_CHANGE):
-        extreme_change = lowest if -lowest > highest else highest
+    if max(-min_change, max_change) > (_STRONG_NOISY_CHANGE if is_noisy else _STRONG_CHANGE):
+        extreme_change = min_change if -min_change > max_change else max_change
         return (
             f"the linear image reaches {percent(extreme_change)} of the background, where voltages are no longer linear"
         )
@@ -184,7 +184,7 @@ def linear_image_fault(prepared: PreparedDifference, change: Float[Array, " m"])
     return ""
 
 
-def with_unexplained_noise(
+def estimate_unexplained_noise(
     prepared: PreparedDifference, reconstruction: LinearReconstruction, change: Float[Array, " m"]
 ) -> PreparedDifference:
     """Copy of the difference whose noise, if it is not known, is estimated from what its linear image, the `change` of
@@ -196,12 +196,12 @@ def with_unexplained_noise(
     if prepared.noise is not None:
         return prepared
     background, relative_noise = float(prepared.calibration.conductivity), np.asarray(prepared.relative_noise)
-    used, difference = np.asarray(prepared.mask), np.asarray(prepared.difference)
+    is_used, difference = np.asarray(prepared.mask), np.asarray(prepared.difference)
     size, rest, modelled = (
-        float(np.sqrt(np.mean((np.asarray(volts) / relative_noise)[used] ** 2)))
+        float(np.sqrt(np.mean((np.asarray(volts) / relative_noise)[is_used] ** 2)))
         for volts in (difference, difference - prepared.common_change, prepared.modelled_noise)
     )
-    random = np.where(used, size * relative_noise * np.random.default_rng(0).standard_normal(used.size), 0)
+    random = np.where(is_used, size * relative_noise * np.random.default_rng(0).standard_normal(is_used.size), 0)
     unexplained, unexplained_noise = (
         _unexplained_share(pair, background, np.asarray(image) / background, _DERIVATIVE_STEP)
         for pair, image in (
@@ -218,18 +218,18 @@ def change_and_noise(
     """Values per cell (m,) of a linear image in which inclusions are found, and their noise, S/m (2-D: S): the real
     part of the `change` of conductivity without a change common to all voltages."""
     noise = reconstruction.image_noise(np.where(prepared.mask, prepared.modelled_noise, 0))
-    departure = np.real(change)
+    conductivity_change = np.real(change)
     if not np.iscomplexobj(change):
-        departure = departure - np.asarray(reconstruction.image(prepared.common_change))
-    return as_array(departure), as_array(noise)
+        conductivity_change = conductivity_change - np.asarray(reconstruction.image(prepared.common_change))
+    return as_array(conductivity_change), as_array(noise)
 
 
 def _unexplained_share(prepared: PreparedDifference, background: float, change: np.ndarray, step: float) -> float:
     """Share of the measured voltage difference that the model leaves unexplained: what remains after the derivative of
     the modelled voltages in the direction of the `change` is subtracted, with the derivative computed as a
     difference quotient of width `step`. Channels are divided by their noise."""
-    model, used = prepared.model, np.asarray(prepared.mask)
+    model, is_used = prepared.model, np.asarray(prepared.mask)
     conductivity = background * np.maximum(1 + step * change, _MIN_CONDUCTIVITY)
     predicted = (np.asarray(model.voltages(conductivity)) - np.asarray(model.voltages(background))) / step
-    noise, difference = np.asarray(prepared.relative_noise)[used], np.asarray(prepared.difference)[used]
-    return float(np.linalg.norm((predicted[used] - difference) / noise) / np.linalg.norm(difference / noise))
+    noise, difference = np.asarray(prepared.relative_noise)[is_used], np.asarray(prepared.difference)[is_used]
+    return float(np.linalg.norm((predicted[is_used] - difference) / noise) / np.linalg.norm(difference / noise))

@@ -44,28 +44,36 @@ def keep_last_result(function: Callable[_Arguments, _Result]) -> Callable[_Argum
     For frames that are imaged one after the other, mesh and calibration are thus computed once per reference. Arguments
     are compared by value, with copies of arrays of NumPy, which the caller may modify.
     """
-    last: tuple | None = None
+    last_call: tuple | None = None
 
     @functools.wraps(function)
-    def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        nonlocal last
+    def call_or_reuse(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        nonlocal last_call
         leaves, structure = jax.tree.flatten((args, kwargs))
-        kept = last
-        if kept is None or kept[1] != structure or not all(map(_are_equal_arguments, kept[0], leaves)):
+        stored_call = last_call
+        if (
+            stored_call is None
+            or stored_call[1] != structure
+            or not all(map(_are_equal_arguments, stored_call[0], leaves))
+        ):
             copies = [leaf.copy() if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
-            last = kept = copies, structure, function(*args, **kwargs)
-        return kept[2]
+            last_call = stored_call = copies, structure, function(*args, **kwargs)
+        return stored_call[2]
 
-    return call
+    return call_or_reuse
 
 
-def _are_equal_arguments(first, second) -> bool:
+def _are_equal_arguments(first_argument, second_argument) -> bool:
     """Whether two leaves of arguments are the same object, or arrays or numbers of equal types and values."""
-    if first is second:
+    if first_argument is second_argument:
         return True
-    same_type = type(first) is type(second) and getattr(first, "dtype", None) == getattr(second, "dtype", None)
+    same_type = type(first_argument) is type(second_argument) and getattr(first_argument, "dtype", None) == getattr(
+        second_argument, "dtype", None
+    )
     # Masked voltages may be NaN.
-    return same_type and np.array_equal(first, second, equal_nan=np.asarray(first).dtype.kind in "fc")
+    return same_type and np.array_equal(
+        first_argument, second_argument, equal_nan=np.asarray(first_argument).dtype.kind in "fc"
+    )
 
 
 class Clock:
@@ -156,7 +164,7 @@ def _calibrate(model: ForwardModel, base: Measurement, contact: str | None) -> t
         contact_method = "common"  # the data do not determine one impedance per electrode
         calibration = calibrate(model, voltages, mask=mask, contact=contact_method)
     position = (base.uncertainty or Uncertainty()).position_on(model.mesh)
-    calibration = _with_estimated_positions(calibration, model, voltages, mask, position)
+    calibration = _estimate_positions(calibration, model, voltages, mask, position)
     calibration = jax.block_until_ready(calibration)
     if not np.isfinite(calibration.misfit):
         raise ValueError(
@@ -166,9 +174,7 @@ def _calibrate(model: ForwardModel, base: Measurement, contact: str | None) -> t
     return calibration, contact_method
 
 
-def _with_estimated_positions(
-    calibration: Calibration, model: ForwardModel, voltages, mask, deviation: float
-) -> Calibration:
+def _estimate_positions(calibration: Calibration, model: ForwardModel, voltages, mask, deviation: float) -> Calibration:
     """The calibration with estimated electrode positions, if these positions explain the reference frame far better.
 
     The described positions are used if they explain the reference, or if the misfit has other causes: for example,

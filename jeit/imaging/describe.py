@@ -31,7 +31,7 @@ from jeit.imaging.possible_protocols import (
     FileNumbers,
     channel_counts,
     fitting_candidates,
-    spread_of,
+    relative_deviation,
 )
 from jeit.imaging.wiring import find_wiring, uniform_impedances
 from jeit.mesh import Solid
@@ -73,21 +73,22 @@ class Findings:
         """Reason why the best protocol explains the file too poorly to be used; empty if it explains the file well
         enough."""
         best = self.candidates[0]
-        limit = _MAX_UNEXPLAINED_KNOWN if self.known or best.ordered else _MAX_UNEXPLAINED
-        if best.unexplained < limit and best.spread < _MAX_SPREAD:
+        max_unexplained = _MAX_UNEXPLAINED_KNOWN if self.known or best.ordered else _MAX_UNEXPLAINED
+        if best.unexplained < max_unexplained and best.spread < _MAX_SPREAD:
             return ""
         if best.spread >= _MAX_SPREAD:
-            advice = " If its two columns are real and imaginary parts, keep one of them." if best.frames == 2 else ""
+            remedy = " If its two columns are real and imaginary parts, keep one of them." if best.frames == 2 else ""
             return (
                 f"the best explanation, {best.name}, makes frames of the empty body differ by {percent(best.spread)}: "
                 "that is not good enough to go on. Are there columns of other things than voltages, or is the "
-                f"reference one of another sensor? Name the protocol if you know it.{advice}"
+                f"reference one of another sensor? Name the protocol if you know it.{remedy}"
             )
-        remark = "" if best.reciprocity is None else f" and breaks reciprocity by {percent(best.reciprocity)}"
-        hint = best.wiring.explanation if best.wiring is not None else ""
+        reciprocity_text = "" if best.reciprocity is None else f" and breaks reciprocity by {percent(best.reciprocity)}"
+        wiring_hint = best.wiring.explanation if best.wiring is not None else ""
+        remedy = wiring_hint or "Are body and electrodes as given? Name the protocol if you know it."
         return (
-            f"the best explanation, {best.name}, misses {percent(best.misfit)} of the empty body{remark}: that is not "
-            f"good enough to go on. {hint or 'Are body and electrodes as given? Name the protocol if you know it.'}"
+            f"the best explanation, {best.name}, misses {percent(best.misfit)} of the empty body{reciprocity_text}: "
+            f"that is not good enough to go on. {remedy}"
         )
 
 
@@ -154,19 +155,24 @@ def find_description(
     for candidate in candidates[:_MAX_COMPARED]:
         rival_limit = min((_rival_limit(item) for item in compared), default=np.inf)
         is_ruled_out = candidate.least_unexplained >= rival_limit
-        compared.append(candidate if is_ruled_out else _with_misfit(candidate, models))
+        compared.append(candidate if is_ruled_out else _compute_misfit(candidate, models))
     compared.sort(key=lambda item: (round(item.unexplained, 3), len(item.protocol)))
-    winner = compared[0]
-    rivals = [item for item in compared[1:] if item.unexplained < _rival_limit(winner)]
-    if not winner.is_cut_off:
-        rivals = [item for item in rivals if not item.is_cut_off]
-    winner = _with_gains(winner, models)
-    compared[0] = winner
-    contact = {"contact_impedance": _contact_impedance(winner, models[winner.protocol["number"]][0])}
-    tables = {"geometry": geometry, "electrodes": {**contact, **electrodes, "number": winner.protocol["number"]}}
-    tables["protocol"] = {**winner.protocol, "current": current}
-    text = _text(path, numbers.shape, numbers.data, winner, rivals, tables)
-    return Findings((*compared, *candidates[_MAX_COMPARED:]), tuple(rivals), text, known="kind" in (known or {}))
+    best_candidate = compared[0]
+    rival_candidates = [item for item in compared[1:] if item.unexplained < _rival_limit(best_candidate)]
+    if not best_candidate.is_cut_off:
+        rival_candidates = [item for item in rival_candidates if not item.is_cut_off]
+    best_candidate = _fit_gains(best_candidate, models)
+    compared[0] = best_candidate
+    contact = {"contact_impedance": _contact_impedance(best_candidate, models[best_candidate.protocol["number"]][0])}
+    tables = {
+        "geometry": geometry,
+        "electrodes": {**contact, **electrodes, "number": best_candidate.protocol["number"]},
+    }
+    tables["protocol"] = {**best_candidate.protocol, "current": current}
+    text = _text(path, numbers.shape, numbers.data, best_candidate, rival_candidates, tables)
+    return Findings(
+        (*compared, *candidates[_MAX_COMPARED:]), tuple(rival_candidates), text, known="kind" in (known or {})
+    )
 
 
 def _rival_limit(candidate: Candidate) -> float:
@@ -190,26 +196,26 @@ def _described_body(
             f"number: {path.name} is of format '{format}', and states its protocol, of {number} electrodes: leave out "
             "what is said of it."
         )
-    placements, entries = {**electrodes, "number": number}, {**electrodes, "number": number}
+    placements, electrode_entries = {**electrodes, "number": number}, {**electrodes, "number": number}
     if format == "quadrupoles" and (places := quadrupoles.electrode_positions(path)) is not None:
         sizes = {key: value for key, value in electrodes.items() if key not in ("layout", "levels")}
-        placements, entries = {**sizes, "positions": places.tolist()}, sizes
+        placements, electrode_entries = {**sizes, "positions": places.tolist()}, sizes
     tables = {"geometry": geometry, "electrodes": {"contact_impedance": 1.0, **placements}}
     description = parse_description(tables, "the description")
     empty_frame = replace(base.mean_frame(), domain=description.domain, electrodes=description.electrodes)
     empty_frame = correct_signs(replace(empty_frame, voltages=np.real(np.asarray(empty_frame.voltages))))
-    spread = spread_of(np.real(np.asarray(base.filled())))
+    deviation_of_frames = relative_deviation(np.real(np.asarray(base.filled())))
     models: _Models = {}
     protocol = {"kind": format, "number": number}
-    candidate = Candidate(protocol, data.num_frames, spread, reciprocity_error(empty_frame), empty_frame)
-    candidate = _with_misfit(candidate, models)
+    candidate = Candidate(protocol, data.num_frames, deviation_of_frames, reciprocity_error(empty_frame), empty_frame)
+    candidate = _compute_misfit(candidate, models)
     contact = {"contact_impedance": _contact_impedance(candidate, models[number][0])}
     shape = f"{counted(data.num_frames, 'frame')} of {data.num_channels}"
-    text = _text(path, shape, {}, candidate, (), {"geometry": geometry, "electrodes": {**contact, **entries}})
+    text = _text(path, shape, {}, candidate, (), {"geometry": geometry, "electrodes": {**contact, **electrode_entries}})
     return Findings((candidate,), (), text, known=True)
 
 
-def _with_misfit(candidate: Candidate, models: _Models) -> Candidate:
+def _compute_misfit(candidate: Candidate, models: _Models) -> Candidate:
     """The candidate with the wiring that explains the empty body best. Candidates with equally many electrodes share a
     mesh and its impedances."""
     number, empty_frame = candidate.protocol["number"], candidate.measurement
@@ -225,7 +231,7 @@ def _with_misfit(candidate: Candidate, models: _Models) -> Candidate:
     return replace(candidate, wiring=wiring)
 
 
-def _with_gains(candidate: Candidate, models: _Models) -> Candidate:
+def _fit_gains(candidate: Candidate, models: _Models) -> Candidate:
     """The candidate with gains of its measurement patterns, if they explain most of the reciprocity error."""
     if candidate.reciprocity is None or candidate.reciprocity < _MIN_GAIN_ERROR:
         return candidate
@@ -238,19 +244,22 @@ def _with_gains(candidate: Candidate, models: _Models) -> Candidate:
     corrected = replace(
         candidate, measurement=replace(candidate.measurement, voltages=values), reciprocity=error, gains=gains
     )
-    return _with_misfit(corrected, models)
+    return _compute_misfit(corrected, models)
 
 
-def _contact_impedance(winner: Candidate, model: ForwardModel) -> float:
+def _contact_impedance(best_candidate: Candidate, model: ForwardModel) -> float:
     """Initial contact impedance: a hundredth of the size of the body, divided by the conductivity that explains the
     empty body."""
     size = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
-    winner_model = model.with_protocol(winner.measurement.protocol)
-    contacts = np.full(winner.protocol["number"], _RELATIVE_CONTACT * size)
+    winner_model = model.with_protocol(best_candidate.measurement.protocol)
+    contacts = np.full(best_candidate.protocol["number"], _RELATIVE_CONTACT * size)
     winner_model = winner_model.with_electrodes(winner_model.electrodes.with_contact_impedance(contacts))
-    used = np.asarray(winner.measurement.mask)[0]
-    expected, measured = np.asarray(winner_model.voltages(1.0))[used], np.asarray(winner.measurement.voltages)[0][used]
-    resistivity = abs(np.vdot(expected, measured)) / np.vdot(expected, expected).real
+    is_used = np.asarray(best_candidate.measurement.mask)[0]
+    expected_voltages, measured = (
+        np.asarray(winner_model.voltages(1.0))[is_used],
+        np.asarray(best_candidate.measurement.voltages)[0][is_used],
+    )
+    resistivity = abs(np.vdot(expected_voltages, measured)) / np.vdot(expected_voltages, expected_voltages).real
     return float(f"{_RELATIVE_CONTACT * size * resistivity:.2g}")
 
 
@@ -259,19 +268,21 @@ def _text(
     shape: str,
     data: dict[str, Any],
     best: Candidate,
-    rivals: Sequence[Candidate],
+    rival_candidates: Sequence[Candidate],
     tables: dict[str, dict[str, Any]],
 ) -> str:
     """The file's description in TOML, with the evidence as comments. `shape`: shape of the numbers in words; `data`:
     entries of the table `[data]`, which describe the arrangement of the numbers."""
     notes = [note for note in best.measurement.notes if not note.startswith("[protocol]")]
     reversed_signs = best.reversed_signs or any("polarity" in note for note in notes)
-    remark = "no two channels are reciprocal" if best.reciprocity is None else f"broken by {percent(best.reciprocity)}"
+    reciprocity_text = (
+        "no two channels are reciprocal" if best.reciprocity is None else f"broken by {percent(best.reciprocity)}"
+    )
     explanation = best.wiring.explanation if best.wiring is not None and not best.reversed_signs else ""
     lines = [
         f"Written by `jeit describe {path.name}` ({shape} numbers). Lengths in metres, currents in amperes.",
-        f"{best.name}: a uniform body misses {percent(best.misfit)} of the empty one; reciprocity: {remark}.",
-        *(f"It may as well be {rival.name}: {percent(rival.misfit)}." for rival in rivals),
+        f"{best.name}: a uniform body misses {percent(best.misfit)} of the empty one; reciprocity: {reciprocity_text}.",
+        *(f"It may as well be {candidate.name}: {percent(candidate.misfit)}." for candidate in rival_candidates),
         *notes,
         *([explanation] if explanation else []),
     ]
@@ -279,14 +290,16 @@ def _text(
     if best.gains is not None:
         lines.append(f"Gains of the measurements differ by {percent(float(np.std(best.gains)))}, found by reciprocity.")
         data["gains"] = [round(float(gain), 4) for gain in best.gains]
-    places = "Electrodes are where the file places them."
+    placement_text = "Electrodes are where the file places them."
     if "layout" in tables["electrodes"]:
-        places = "No voltage says where electrode 1 is, nor which way round: taken at 12 o'clock, counter-clockwise."
+        placement_text = (
+            "No voltage says where electrode 1 is, nor which way round: taken at 12 o'clock, counter-clockwise."
+        )
     scale = "The current, and the unit of voltages, scale conductivities alone."
     sections = [
         [f"# {line}" for line in lines],
         ["[geometry]", *assignments(tables["geometry"])],
-        [f"# {places}", "[electrodes]", *assignments(tables["electrodes"])],
+        [f"# {placement_text}", "[electrodes]", *assignments(tables["electrodes"])],
         *([[f"# {scale}", "[protocol]", *assignments(tables["protocol"])]] if "protocol" in tables else []),
         *([["[data]", *assignments(data)]] if data else []),
     ]

@@ -20,7 +20,7 @@ from jeit.forward import ForwardModel
 from jeit.image import Inclusion, Raster, SolidForm
 from jeit.image.inclusions import inclusion_regions
 from jeit.image.rasters import CONDUCTIVE, RESISTIVE
-from jeit.imaging.automatic import change_and_noise, image_automatically, with_unexplained_noise
+from jeit.imaging.automatic import change_and_noise, estimate_unexplained_noise, image_automatically
 from jeit.imaging.calibration import Clock
 from jeit.imaging.doubts import doubts_of_data
 from jeit.imaging.electrode_changes import ElectrodeChange
@@ -140,12 +140,12 @@ class ImagedDifference:
     @property
     def mesh(self) -> Mesh:
         """Mesh of the image; with bodies in a solid, a mesh that is refined at their surfaces."""
-        return _imaged_on(self.reconstruction, self.calibration).mesh
+        return _model_of_reconstruction(self.reconstruction, self.calibration).mesh
 
     @property
     def electrodes(self) -> AbstractElectrodes:
         """Electrodes on the mesh of the image."""
-        return _imaged_on(self.reconstruction, self.calibration).electrodes
+        return _model_of_reconstruction(self.reconstruction, self.calibration).electrodes
 
     @property
     def chosen_by(self) -> str:
@@ -163,21 +163,21 @@ class ImagedDifference:
         that did not converge, voltages not explained by the image, or bodies whose kind the data do not determine."""
         reconstruction = self.reconstruction
         data = self.measurement, self.reference, self.calibration, self.quality
-        doubts = doubts_of_data(*data, self.electrode_change)
+        warnings = doubts_of_data(*data, self.electrode_change)
         if isinstance(reconstruction, LinearReconstruction):
             if self.lowest < -1:
-                doubts.append(
+                warnings.append(
                     f"the linear image falls to {percent(self.lowest)} of the background, below -100 %: bodies may be "
                     "out of place, missing, or shown where none are; leave out --method, or take gauss-newton."
                 )
-            return tuple(doubts)
+            return tuple(warnings)
         if isinstance(reconstruction, Reconstruction) and reconstruction.status != Status.CONVERGED:
-            doubts.append(
+            warnings.append(
                 f"the iteration did not converge ({reconstruction.status}): neither peaks nor places are to be "
                 "trusted. Take the default hyperparameter, or a larger one."
             )
         if (misfit := float(reconstruction.misfit)) > _MISFIT:
-            doubts.append(
+            warnings.append(
                 f"its voltages miss the data by {misfit:.2g} standard deviations: bodies may be missing, or shown "
                 "where none are."
             )
@@ -185,12 +185,12 @@ class ImagedDifference:
             if body is not None:
                 x, y = 1e3 * body.centroid[:2]
                 kind = "a column through the whole height" if body.column else "no column but an ellipsoid"
-                doubts.append(
+                warnings.append(
                     f"the body at x {x:.0f} mm, y {y:.0f} mm may as well be {kind}, of "
                     f"{np.exp(body.sign * body.contrast):.2g} times the background and {1e6 * body.volume:.3g} cm³: "
                     "these electrodes do not determine which. If you know, bodies (--bodies) says so."
                 )
-        return tuple(doubts)
+        return tuple(warnings)
 
     @property
     def level(self) -> float:
@@ -217,7 +217,7 @@ class ImagedDifference:
         return as_array(np.log1p(np.asarray(self.change) / float(self.calibration.conductivity)))
 
 
-def _imaged_on(reconstruction, calibration: Calibration) -> ForwardModel:
+def _model_of_reconstruction(reconstruction, calibration: Calibration) -> ForwardModel:
     """Forward model on the mesh of a reconstruction."""
     finer_image = reconstruction.finer if isinstance(reconstruction, ShapeReconstruction) else None
     return calibration.model if finer_image is None else finer_image.model
@@ -285,9 +285,9 @@ def image_difference(
                 "another, or a rule."
             )
         if isinstance(reconstruction, LinearReconstruction) and not np.iscomplexobj(change):
-            prepared = with_unexplained_noise(prepared, reconstruction, change)
+            prepared = estimate_unexplained_noise(prepared, reconstruction, change)
     with clock("raster and inclusions"):
-        grid = Raster.create(_imaged_on(reconstruction, calibration).mesh, shape=settings.raster_shape)
+        grid = Raster.create(_model_of_reconstruction(reconstruction, calibration).mesh, shape=settings.raster_shape)
         imaged = ImagedDifference(
             measurement=prepared.measurement,
             reference=prepared.reference,
@@ -323,13 +323,15 @@ def _inclusions(
         bodies = imaged.shapes.bodies
         labels = _labels(imaged.mesh, bodies, grid) if settings.segment else None
         return [_body_inclusion(body, float(background)) for body in bodies], labels
-    departure, noise = as_array(np.real(imaged.departure)), None
+    conductivity_change, noise = as_array(np.real(imaged.departure)), None
     if isinstance(reconstruction, Reconstruction) and reconstruction.inversion.penalty.is_standard_normal:
         noise = as_array(image_noise(reconstruction))
     elif isinstance(reconstruction, LinearReconstruction):
-        departure, noise = change_and_noise(prepared, reconstruction, imaged.change)
-    regions = inclusion_regions(imaged.mesh, departure, level=imaged.level, least_peak=settings.least_peak, noise=noise)
-    inclusions = [_with_change(inclusion, background) if imaged.iterative else inclusion for inclusion, _ in regions]
+        conductivity_change, noise = change_and_noise(prepared, reconstruction, imaged.change)
+    regions = inclusion_regions(
+        imaged.mesh, conductivity_change, level=imaged.level, least_peak=settings.least_peak, noise=noise
+    )
+    inclusions = [_convert_peak(inclusion, background) if imaged.iterative else inclusion for inclusion, _ in regions]
     return inclusions, _region_labels(regions, grid) if settings.segment else None
 
 
@@ -350,7 +352,7 @@ def _body_inclusion(body: Star | Ellipsoid, background: float) -> Inclusion:
             centroid_radius=quantities.centroid_radius,
         )
     inclusion = Inclusion(body.sign, centroid, body.measure, body.sign * body.contrast, form=_solid_form(body))
-    return _with_change(inclusion, background)
+    return _convert_peak(inclusion, background)
 
 
 def _solid_form(body: Star | Ellipsoid) -> SolidForm | None:
@@ -373,13 +375,13 @@ def _region_labels(regions, grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
 def _labels(mesh: Mesh, bodies: Sequence[Star | Ellipsoid], grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
     """Label the pixels in resistive and conductive bodies, in a solid at half its height. Where bodies overlap, the
     first body of the list determines the label."""
-    centres, inside = grid.pixel_centres(), np.asarray(grid.cell) >= 0
+    centres, is_inside = grid.pixel_centres(), np.asarray(grid.cell) >= 0
     if mesh.dimension == 3:
         z = np.asarray(mesh.points)[:, 2]
-        centres = np.concatenate([centres, np.full((*inside.shape, 1), (z.min() + z.max()) / 2)], axis=-1)
-    labels = np.zeros(inside.shape, np.uint8)
+        centres = np.concatenate([centres, np.full((*is_inside.shape, 1), (z.min() + z.max()) / 2)], axis=-1)
+    labels = np.zeros(is_inside.shape, np.uint8)
     for body in reversed(bodies):
-        labels[inside & body.holds(centres)] = CONDUCTIVE if body.sign > 0 else RESISTIVE
+        labels[is_inside & body.holds(centres)] = CONDUCTIVE if body.sign > 0 else RESISTIVE
     return labels
 
 
@@ -391,7 +393,7 @@ def _sample_on_raster(grid: Raster, change) -> Inexact[Array, "rows columns"]:
     return as_array(rasters[0] + 1j * rasters[1])
 
 
-def _with_change(inclusion: Inclusion, background) -> Inclusion:
+def _convert_peak(inclusion: Inclusion, background) -> Inclusion:
     """Convert the peak of an inclusion from a change of log conductivity to a change of conductivity."""
     peak = float(background * np.expm1(inclusion.peak))
     return replace(inclusion, peak=peak)

@@ -37,17 +37,17 @@ def doubts_of_data(
 ) -> list[str]:
     """Reasons to doubt the data: few usable voltages, an implausible level of the voltages, implausible lengths, a
     frame that may be the reference, an `electrode_change`, or, with the frame's `quality`, noise."""
-    used, doubts = np.asarray(measurement.mask)[0], []
-    if (usable_share := np.mean(used)) < _MIN_USABLE_SHARE:
-        doubts.append(
-            f"only {used.sum()} of {used.size} voltages are left ({percent(float(usable_share))}): they determine "
-            "little of what is where."
+    is_used, warnings = np.asarray(measurement.mask)[0], []
+    if (usable_share := np.mean(is_used)) < _MIN_USABLE_SHARE:
+        warnings.append(
+            f"only {is_used.sum()} of {is_used.size} voltages are left ({percent(float(usable_share))}): they "
+            "determine little of what is where."
         )
     level, lengths = _doubt_of_units(measurement, reference, calibration), _doubt_of_lengths(measurement)
-    order = _doubt_of_order(measurement, reference, calibration)
+    order_warning = _doubt_of_order(measurement, reference, calibration)
     movement = "" if electrode_change is None else electrode_change.doubt
     noise = "" if quality is None else quality.doubt
-    return [*doubts, *filter(None, (level, lengths, order, movement, noise))]
+    return [*warnings, *filter(None, (level, lengths, order_warning, movement, noise))]
 
 
 def _doubt_of_lengths(measurement: Measurement) -> str:
@@ -74,15 +74,15 @@ def _doubt_of_order(measurement: Measurement, reference: Measurement, calibratio
         return ""
     predicted = np.asarray(calibration.voltages)[usable]
 
-    def misfit_of(measured: Measurement) -> float:
+    def compute_misfit(measured: Measurement) -> float:
         voltages = np.asarray(measured.voltages)[0][usable]
         scale = np.vdot(predicted, voltages) / np.vdot(predicted, predicted)
         return float(np.linalg.norm(voltages - scale * predicted) / np.linalg.norm(voltages))
 
-    misfit = misfit_of(reference)
+    misfit = compute_misfit(reference)
     if misfit <= _MIN_SUSPICIOUS_MISFIT:
         return ""
-    frame_misfit = misfit_of(measurement)
+    frame_misfit = compute_misfit(measurement)
     if frame_misfit > _MAX_EXCHANGED_MISFIT * misfit:
         return ""
     return (
@@ -94,29 +94,34 @@ def _doubt_of_order(measurement: Measurement, reference: Measurement, calibratio
 def _doubt_of_units(measurement: Measurement, reference: Measurement, calibration: Calibration) -> str:
     """Return a sentence that suggests a unit if the level of the voltages is implausible. Returns an empty string
     otherwise, and if notes of the measurement or its reference say that the scale is not known."""
-    lower, upper = _CONDUCTIVITIES[calibration.model.mesh.dimension]
+    min_conductivity, max_conductivity = _CONDUCTIVITIES[calibration.model.mesh.dimension]
     background = abs(complex(calibration.conductivity))
     frames = [np.abs(np.asarray(frame.voltages)[np.asarray(frame.mask)]) for frame in (measurement, reference)]
     max_voltage = max(float(voltages.max(initial=0)) for voltages in frames)
     is_scale_unknown = any("trust relative changes" in note for note in (*measurement.notes, *reference.notes))
-    if is_scale_unknown or (lower < background < upper and max_voltage < _MAX_VOLTS):
+    if is_scale_unknown or (min_conductivity < background < max_conductivity and max_voltage < _MAX_VOLTS):
         return ""
     is_solid = calibration.model.mesh.dimension == 3
     unit, comparison = ("S/m", "no water's, gel's or tissue's") if is_solid else ("S", "no sheet's or shallow tank's")
-    if not lower < background < upper:
-        fault = f"a background of {background:.3g} {unit} is {comparison}, which conduct {lower:g} to {upper:g} {unit}"
+    if not min_conductivity < background < max_conductivity:
+        fault = (
+            f"a background of {background:.3g} {unit} is {comparison}, which conduct {min_conductivity:g} to "
+            f"{max_conductivity:g} {unit}"
+        )
     else:
         fault = f"voltages of up to {max_voltage:.3g} V are beyond what instruments read"
-    if background < upper:
+    if background < max_conductivity:
         likely_units = [
             f'"{name}" (a background of {background * factor:.3g} {unit})'
             for name, factor in _SMALLER_UNITS
-            if lower < background * factor < upper and max_voltage < _MAX_VOLTS * factor
+            if min_conductivity < background * factor < max_conductivity and max_voltage < _MAX_VOLTS * factor
         ]
         key = "[data] unit"
     else:
         likely_units = [
-            f'"{name}"' for name, factor in (("mA", 1e3), ("uA", 1e6)) if lower < background / factor < upper
+            f'"{name}"'
+            for name, factor in (("mA", 1e3), ("uA", 1e6))
+            if min_conductivity < background / factor < max_conductivity
         ]
         key = "[protocol] current_unit"
     likely_units = [f"{key} = {' or '.join(likely_units)}?"] if likely_units else []

@@ -17,9 +17,9 @@ from jeit.arguments import check_name
 from jeit.data import Measurement
 from jeit.image import Inclusion
 from jeit.image.inclusions import inclusion_regions
-from jeit.imaging.automatic import change_and_noise, with_unexplained_noise
+from jeit.imaging.automatic import change_and_noise, estimate_unexplained_noise
 from jeit.imaging.calibration import Clock
-from jeit.imaging.method import ImagingSettings, as_settings, prior_for, rule_for
+from jeit.imaging.method import ImagingSettings, as_settings, choose_rule, prior_for
 from jeit.imaging.preparation import PreparedDifference, check_real, prepare_difference
 from jeit.inverse import RULES
 from jeit.inverse.hyperparameter.choice import DEFAULT_RULE, Choice
@@ -93,8 +93,8 @@ def compare_on_data(
     """Image the change between a reference frame and a frame of `measurement` with the hyperparameter that each rule
     chooses.
 
-    The images are computed by one-step imaging. A rule that cannot be applied to the data is listed in `refused`, or
-    raises `ValueError` if it is the only rule requested.
+    The images are computed by one-step imaging. A rule that cannot be applied to the data is listed in
+    `refused`, or raises `ValueError` if it is the only rule requested.
 
     **Arguments:**
 
@@ -138,26 +138,26 @@ def compare_on_data(
         )
         data = linearisation.whiten(prepared.difference)
         jax.block_until_ready(linearisation.spectrum)
-    outcomes, refused, prepared_with_noise = {}, {}, prepared
+    outcomes, refusal_reasons, prepared_with_noise = {}, {}, prepared
     with clock("choose"):
         noise_figure_choice = choose(linearisation.spectrum, "noise-figure", data, mesh)
         for name in names:
             try:
-                rule = noise_figure_choice if name == noise_figure_choice.rule else rule_for(name, prepared)
+                rule = noise_figure_choice if name == noise_figure_choice.rule else choose_rule(name, prepared)
                 choice = choose(linearisation.spectrum, rule, data, mesh)
             except ValueError as error:
                 if len(names) == 1:
                     raise
-                refused[name] = str(error)
+                refusal_reasons[name] = str(error)
                 continue
             factors = linearisation.factors(choice.hyperparameter)
             fields = choice.hyperparameter, choice.rule, "one-step", choice
             reconstruction = LinearReconstruction.of_factors(prepared.model, factors, *fields)
             change = reconstruction.image(prepared.difference)
-            with_noise = with_unexplained_noise(prepared, reconstruction, change)
-            departure, noise = change_and_noise(with_noise, reconstruction, change)
+            prepared_with_estimated_noise = estimate_unexplained_noise(prepared, reconstruction, change)
+            conductivity_change, noise = change_and_noise(prepared_with_estimated_noise, reconstruction, change)
             regions = inclusion_regions(
-                mesh, departure, level=settings.level, least_peak=settings.least_peak, noise=noise
+                mesh, conductivity_change, level=settings.level, least_peak=settings.least_peak, noise=noise
             )
             outcomes[name] = RuleOutcome(
                 choice,
@@ -167,5 +167,5 @@ def compare_on_data(
                 tuple(inclusion for inclusion, _ in regions),
             )
             if name == DEFAULT_RULE or len(outcomes) == 1:
-                prepared_with_noise = with_noise
-    return ComparedRules(prepared_with_noise, settings, outcomes, refused)
+                prepared_with_noise = prepared_with_estimated_noise
+    return ComparedRules(prepared_with_noise, settings, outcomes, refusal_reasons)

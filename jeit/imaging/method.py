@@ -190,7 +190,7 @@ def prior_for(prior: NamedPrior, domain: Body) -> AbstractPrior:
     return PRIORS[prior](max(x_max - x_min, y_max - y_min))
 
 
-def rule_for(name: str, prepared: PreparedDifference) -> Rule:
+def choose_rule(name: str, prepared: PreparedDifference) -> Rule:
     """Return the rule `name`, which chooses the hyperparameter, with the noise of the data if the rule needs it. Raises
     `ValueError` if the rule needs noise that is not known."""
     if name != "discrepancy":
@@ -207,7 +207,7 @@ def rule_for(name: str, prepared: PreparedDifference) -> Rule:
 def _number_or_rule(prepared: PreparedDifference, hyperparameter: NamedWeight) -> float | Rule:
     """Return λ as a number, or the rule that chooses it."""
     assert hyperparameter is not None
-    return rule_for(hyperparameter, prepared) if isinstance(hyperparameter, str) else hyperparameter
+    return choose_rule(hyperparameter, prepared) if isinstance(hyperparameter, str) else hyperparameter
 
 
 def _one_step(prepared: PreparedDifference, options: MethodOptions) -> Imaged:
@@ -266,7 +266,9 @@ def _iterative_image(
     return reconstruction, reconstruction.conductivity - background
 
 
-def shapes_in(prepared: PreparedDifference, smooth: Reconstruction, options: MethodOptions) -> ShapeReconstruction:
+def shapes_in(
+    prepared: PreparedDifference, smooth_image: Reconstruction, options: MethodOptions
+) -> ShapeReconstruction:
     """Fit bodies that explain a difference, starting from the inclusions of its smooth image.
 
     The result contains a body only if the objective of the fit without it is larger by the factor `least_rise` and the
@@ -274,11 +276,11 @@ def shapes_in(prepared: PreparedDifference, smooth: Reconstruction, options: Met
     the variance of the noise. If the noise of the voltages is not known, it is estimated from what the smooth image
     leaves unexplained.
     """
-    prepared = prepared.with_noise_from(float(smooth.misfit))
+    prepared = prepared.with_noise_from(float(smooth_image.misfit))
     model, background = prepared.model, prepared.calibration.conductivity
     is_solid = prepared.mesh.dimension == 3
-    departure = as_array(np.log(np.asarray(smooth.conductivity) / float(background)))
-    inclusions = find_inclusions(prepared.mesh, departure, level=0.5, least_peak=_MIN_PEAK, least_area=_MIN_AREA)
+    log_change = as_array(np.log(np.asarray(smooth_image.conductivity) / float(background)))
+    inclusions = find_inclusions(prepared.mesh, log_change, level=0.5, least_peak=_MIN_PEAK, least_area=_MIN_AREA)
     return reconstruct_shapes(
         model,
         host.add(model.voltages(background), prepared.difference),
@@ -289,21 +291,21 @@ def shapes_in(prepared: PreparedDifference, smooth: Reconstruction, options: Met
         prior=EllipsoidPrior(kinds=options.kinds) if is_solid else None,
         # In a solid, model errors are represented by a smooth field instead.
         least_rise=1 if is_solid else 1 + (LEAST_RISE - 1) * prepared.modelled_share,
-        smooth=smooth if is_solid else None,
+        smooth=smooth_image if is_solid else None,
         accuracy=prepared.accuracy,
         progress=options.progress,
     )
 
 
 def _shapes(prepared: PreparedDifference, options: MethodOptions) -> Imaged:
-    smooth, _ = _iterative_image(
+    smooth_image, _ = _iterative_image(
         prepared, MethodOptions(MEASURED_DATA_PRIOR, GAUSS_NEWTON_HYPERPARAMETER), solver=_GAUSS_NEWTON
     )
-    assert isinstance(smooth, Reconstruction)
-    return of_shapes(prepared, shapes_in(prepared, smooth, options))
+    assert isinstance(smooth_image, Reconstruction)
+    return image_of_shapes(prepared, shapes_in(prepared, smooth_image, options))
 
 
-def of_shapes(prepared: PreparedDifference, shapes: ShapeReconstruction) -> Imaged:
+def image_of_shapes(prepared: PreparedDifference, shapes: ShapeReconstruction) -> Imaged:
     """Return the shapes and their change of conductivity per cell; for a solid, per cell of the refined mesh."""
     image = shapes if shapes.finer is None else shapes.finer
     return shapes, image.conductivity - prepared.calibration.conductivity

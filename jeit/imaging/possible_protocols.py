@@ -91,17 +91,17 @@ class Candidate:
     @property
     def num_unread(self) -> int:
         """Number of channels that are zero in every frame or masked, apart from channels on driven electrodes."""
-        on_driven = np.asarray(self.measurement.protocol.channels_on_driven_electrodes())
+        is_on_driven_electrodes = np.asarray(self.measurement.protocol.channels_on_driven_electrodes())
         voltages, mask = np.asarray(self.measurement.voltages), np.asarray(self.measurement.mask)
-        return int((~mask | (voltages == 0))[..., ~on_driven].sum())
+        return int((~mask | (voltages == 0))[..., ~is_on_driven_electrodes].sum())
 
     @property
     def explains_zeros(self) -> bool:
         """Whether all channels on driven electrodes, and no others, are zero in every frame or masked: the device does
         not measure there, and fills in zeros."""
-        on_driven = np.asarray(self.measurement.protocol.channels_on_driven_electrodes())
-        is_measured = np.asarray(self.measurement.mask)[..., on_driven]
-        return bool(on_driven.any()) and not is_measured.any() and self.num_unread == 0
+        is_on_driven_electrodes = np.asarray(self.measurement.protocol.channels_on_driven_electrodes())
+        is_measured = np.asarray(self.measurement.mask)[..., is_on_driven_electrodes]
+        return bool(is_on_driven_electrodes.any()) and not is_measured.any() and self.num_unread == 0
 
     @property
     def name(self) -> str:
@@ -157,13 +157,13 @@ class FileNumbers:
             wrapped = {size for size in wrapped if size % part_size == 0}
         sizes = tuple({length, length - 1, lines, *wrapped})
         # Of one frame of reciprocal voltages, a symmetric matrix, rows and columns resemble each other alike.
-        if lines == length == len(table) and 2 * spread_of(table.T) < spread_of(table):
+        if lines == length == len(table) and 2 * relative_deviation(table.T) < relative_deviation(table):
             data = {"frames_in": "columns"}
             return cls(path, lambda counts: frames_in_table(table.T, counts, _UNKNOWN_LAYOUT), shape, sizes, data)
         return cls(path, lambda counts: frames_in_text(text, counts, _UNKNOWN_LAYOUT, path.name), shape, sizes)
 
 
-def spread_of(rows: np.ndarray) -> float:
+def relative_deviation(rows: np.ndarray) -> float:
     """Norm of the deviations of rows from their mean, divided by the norm of the rows."""
     values = np.where(np.isfinite(rows), rows, 0)
     norm = float(np.linalg.norm(values))
@@ -220,17 +220,17 @@ def fitting_candidates(
     for number in [known["number"]] if "number" in known else range(MIN_ELECTRODES, MAX_ELECTRODES + 1):
         if not any(number * (number - 4) / 4 <= count <= number**2 for count in counts):
             continue
-        description, unfitting = None, set()
+        description, unsuitable_counts = None, set()
         for table in _protocols(number):
             if any(table.get(key, value) != value for key, value in known.items()):
                 continue
             options_of_count = tuple((key, value) for key, value in table.items() if key != "order")
-            if options_of_count in unfitting:
+            if options_of_count in unsuitable_counts:
                 continue
             protocol = _protocol({**table, "current": current}, numbers.path)
             count = 0 if protocol is None else protocol.num_measurements
             if protocol is None or count not in counts or count < _MIN_CHANNELS * number:
-                unfitting.add(options_of_count)
+                unsuitable_counts.add(options_of_count)
                 continue
             patterns = (np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement))
             protocol_key = number, *(pattern.tobytes() for pattern in patterns)
@@ -238,12 +238,14 @@ def fitting_candidates(
                 continue
             found_protocols.add(protocol_key)
             description = description or _describe_body(geometry, electrodes, table, current)
-            num_frames, measurement = _measurement_of(numbers, description, protocol)
-            base = measurement if base_numbers is numbers else _measurement_of(base_numbers, description, protocol)[1]
+            num_frames, measurement = _create_measurement(numbers, description, protocol)
+            base = (
+                measurement if base_numbers is numbers else _create_measurement(base_numbers, description, protocol)[1]
+            )
             if measurement is not None and base is not None:
                 empty_frame = base.mean_frame()
-                spread = spread_of(np.asarray(base.filled()))
-                yield Candidate(table, num_frames, spread, reciprocity_error(empty_frame), empty_frame)
+                deviation_of_rows = relative_deviation(np.asarray(base.filled()))
+                yield Candidate(table, num_frames, deviation_of_rows, reciprocity_error(empty_frame), empty_frame)
 
 
 def channel_counts(known: dict) -> list[int]:
@@ -268,7 +270,7 @@ def _protocol(table: dict, path: Path) -> Protocol | None:
         return None
 
 
-def _measurement_of(
+def _create_measurement(
     numbers: FileNumbers, description: Description, protocol: Protocol
 ) -> tuple[int, Measurement | None]:
     """Number of frames of a file with `protocol`, and at most `_MAX_FRAMES` of them as a measurement; None if the
@@ -279,7 +281,7 @@ def _measurement_of(
             return 0, None
         num_frames = len(frames.table)
         chosen = np.unique(np.linspace(0, num_frames - 1, _MAX_FRAMES).round().astype(int))
-        some_frames = frames._replace(table=frames.table[chosen], times=None)
-        return num_frames, create_measurement_of_frames(numbers.path, description, some_frames, [(protocol, "")])
+        selected_frames = frames._replace(table=frames.table[chosen], times=None)
+        return num_frames, create_measurement_of_frames(numbers.path, description, selected_frames, [(protocol, "")])
     except ValueError:
         return 0, None

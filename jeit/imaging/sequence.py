@@ -81,12 +81,12 @@ class ImagedSequence:
     def doubts(self) -> tuple[str, ...]:
         """Reasons to doubt the images, in sentences, from the frame for which λ was chosen: the one that differs most
         from the reference; and the number of frames with moved electrodes."""
-        doubts = replace(self.prepared, electrode_change=None).doubts
+        warnings = replace(self.prepared, electrode_change=None).doubts
         if not self.moved.any():
-            return doubts
+            return warnings
         num_moved, num_imaged = int(self.moved.sum()), int((~self.refused).sum())
         return (
-            *doubts,
+            *warnings,
             f"in {num_moved} of {counted(num_imaged, 'frame')} the voltages have changed as if electrodes had moved "
             "since the reference. Their images show the rest of the difference (as_is=True, --as-is: all of it). "
             "Measure a new reference.",
@@ -145,34 +145,34 @@ def image_sequence(
     if not settings.as_is:
         measurement = mask_spikes(measurement, base, fill=True)
     voltages, mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
-    expected = np.asarray(base.voltages)[0]
+    expected_voltages = np.asarray(base.voltages)[0]
     is_common = (mask.mean(axis=0) >= _MIN_FRAME_SHARE) & np.asarray(base.mask)[0]
-    refused = np.asarray(~mask[:, is_common].all(axis=1))
-    reasons = dict.fromkeys(map(int, np.flatnonzero(refused)), "It lacks channels that most frames have.")
-    if not is_common.any() or refused.all():
+    is_refused = np.asarray(~mask[:, is_common].all(axis=1))
+    reasons = dict.fromkeys(map(int, np.flatnonzero(is_refused)), "It lacks channels that most frames have.")
+    if not is_common.any() or is_refused.all():
         raise ValueError(f"'{measurement.name}': no channel is usable in most frames, or none has all of them.")
     if not settings.as_is:
-        noisy = _noisy_frames(voltages - expected, is_common & mask, base)
+        noisy = _noisy_frames(voltages - expected_voltages, is_common & mask, base)
         if len(reasons | noisy) < measurement.num_frames:  # otherwise the error of the strongest frame is raised
             reasons |= noisy
-            refused[list(reasons)] = True
-    total_change = np.abs(np.where(is_common, voltages - expected, 0)).sum(axis=1)
+            is_refused[list(reasons)] = True
+    total_change = np.abs(np.where(is_common, voltages - expected_voltages, 0)).sum(axis=1)
     if not is_common.all():
         measurement = measurement.masked(is_common, "they are missing in most frames, or in the reference.")
-    strongest_first = np.argsort(np.where(refused, 1.0, -total_change), kind="stable")[: (~refused).sum()]
+    frames_by_change = np.argsort(np.where(is_refused, 1.0, -total_change), kind="stable")[: (~is_refused).sum()]
     noisy = {}
-    for number, index in enumerate(map(int, strongest_first[:_NUM_CANDIDATES])):
-        if not (reason := assess(measurement.frame(index), base)[0].reason):
-            refused[list(noisy)] = True
+    for number, frame_index in enumerate(map(int, frames_by_change[:_NUM_CANDIDATES])):
+        if not (reason := assess(measurement.frame(frame_index), base)[0].reason):
+            is_refused[list(noisy)] = True
             reasons |= noisy
-            strongest_first = strongest_first[number:]
+            frames_by_change = frames_by_change[number:]
             break
-        noisy[index] = f"{reason[0].upper()}{reason[1:]}"
-    strongest = int(strongest_first[0])
+        noisy[frame_index] = f"{reason[0].upper()}{reason[1:]}"
+    largest_change_frame = int(frames_by_change[0])
     prepared = prepare_difference(
         measurement,
         base,
-        frame=strongest,
+        frame=largest_change_frame,
         contact=settings.contact,
         num_points=settings.num_points,
         as_is=settings.as_is,
@@ -191,22 +191,22 @@ def image_sequence(
             raise ValueError(
                 f"method: {settings.method} images frame by frame; take a linear one, or `jeit.inverse.stream`."
             )
-        changes, moved = np.full((num_frames, num_cells), np.nan, np.float32), np.zeros(num_frames, bool)
+        changes, has_moved_electrodes = np.full((num_frames, num_cells), np.nan, np.float32), np.zeros(num_frames, bool)
         changes_of_electrodes = None if settings.as_is else prepared.electrode_changes
-        raw_differences = np.where(is_common, voltages[strongest_first[:_NUM_SEARCHED]] - expected, 0)
+        raw_differences = np.where(is_common, voltages[frames_by_change[:_NUM_SEARCHED]] - expected_voltages, 0)
         estimator = changes_of_electrodes and changes_of_electrodes.estimator_for(raw_differences)
-        imaged_frames = np.flatnonzero(~refused)
+        imaged_frames = np.flatnonzero(~is_refused)
         for start in range(0, len(imaged_frames), _BATCH):
             batch = imaged_frames[start : start + _BATCH]
-            difference = np.where(is_common, voltages[batch] - expected, 0)
+            difference = np.where(is_common, voltages[batch] - expected_voltages, 0)
             if changes_of_electrodes is not None and estimator is not None:
                 due_to_electrodes = changes_of_electrodes.voltages(difference, estimator)
-                moved[batch] = due_to_electrodes.any(axis=1)
+                has_moved_electrodes[batch] = due_to_electrodes.any(axis=1)
                 difference = difference - due_to_electrodes
             changes[batch] = np.asarray(reconstruction.image(as_array(difference)))
     background = float(np.real(prepared.calibration.conductivity))
     series = ImageSeries(prepared.mesh, changes, times, background, timed=measurement.times is not None)
-    return ImagedSequence(series, prepared, reconstruction, refused, region_masks, moved, reasons)
+    return ImagedSequence(series, prepared, reconstruction, is_refused, region_masks, has_moved_electrodes, reasons)
 
 
 def _noisy_frames(
@@ -214,17 +214,20 @@ def _noisy_frames(
 ) -> dict[int, str]:
     """Numbers of the frames, from their changes (F, M) in volts, whose noise hides every change or is that of one
     electrode, each with the reason to refuse it."""
-    protocol, expected = reference.protocol, np.asarray(reference.voltages)[0]
+    protocol, expected_voltages = reference.protocol, np.asarray(reference.voltages)[0]
     touching = np.array([protocol.channels_touching(electrode) for electrode in range(protocol.num_electrodes)])
     pairs, ratios = map(np.asarray, protocol.reciprocal_pairs())
-    used = usable.any(axis=0)
-    noise = np.asarray(relative_noise(expected, as_array(used)))
-    check = FrameCheck(used, expected, touching, (pairs.reshape(-1, 2), ratios), noise)
-    judged = (check.judge_noise(np.where(used, change, 0), used) for change, used in zip(changes, usable, strict=True))
+    is_used = usable.any(axis=0)
+    noise = np.asarray(relative_noise(expected_voltages, as_array(is_used)))
+    check = FrameCheck(is_used, expected_voltages, touching, (pairs.reshape(-1, 2), ratios), noise)
+    judgements = (
+        check.judge_noise(np.where(is_used, change, 0), is_used)
+        for change, is_used in zip(changes, usable, strict=True)
+    )
     faulty = FrameStatus.REFUSED, FrameStatus.PARTIAL
     return {
         number: reason.removesuffix(" Its channels are left out.")
-        for number, (_, status, reason) in enumerate(judged)
+        for number, (_, status, reason) in enumerate(judgements)
         if status in faulty
     }
 
@@ -312,8 +315,10 @@ def frequency_weight(second: Measurement, first: Measurement) -> float | complex
             f"second has {second_voltages.size} channels and first {first_voltages.size}; measure both with one "
             "protocol."
         )
-    used = np.asarray(second.mask)[0] & np.asarray(first.mask)[0]
-    weight = np.vdot(first_voltages[used], second_voltages[used]) / np.vdot(first_voltages[used], first_voltages[used])
+    is_used = np.asarray(second.mask)[0] & np.asarray(first.mask)[0]
+    weight = np.vdot(first_voltages[is_used], second_voltages[is_used]) / np.vdot(
+        first_voltages[is_used], first_voltages[is_used]
+    )
     if not (np.isfinite(weight) and weight.real > 0):
         raise ValueError(
             f"second and first have nothing in common (α = {weight:.3g}); are they the same body at two frequencies, "

@@ -35,12 +35,12 @@ def exchanges_message(frame: Measurement, reference: Measurement) -> str:
     """Describe in a sentence which drives, or which measurements of every drive, seem exchanged in a frame, numbered
     from 1. The sentence is empty if no exchanges halve the frame's difference from the reference, or if not all drives
     have the same measurements."""
-    order = _channel_index(frame)
-    if order is None:
+    channel_indices = _channel_index(frame)
+    if channel_indices is None:
         return ""
-    usable = (np.asarray(frame.mask)[0] & np.asarray(reference.mask)[0])[order]
+    usable = (np.asarray(frame.mask)[0] & np.asarray(reference.mask)[0])[channel_indices]
     frame_values, reference_values = (
-        np.where(usable, np.asarray(measurement.filled())[0][order], 0) for measurement in (frame, reference)
+        np.where(usable, np.asarray(measurement.filled())[0][channel_indices], 0) for measurement in (frame, reference)
     )
     described_norm = float(np.linalg.norm(frame_values - reference_values))
     candidates = [
@@ -64,9 +64,9 @@ def _channel_index(frame: Measurement) -> np.ndarray | None:
     measurement."""
     drive, measurement = (np.asarray(index) for index in (frame.protocol.drive_index, frame.protocol.measurement_index))
     shape = int(drive.max()) + 1, int(measurement.max()) + 1
-    order = np.full(shape, -1)
-    order[drive, measurement] = np.arange(len(drive))
-    return None if (order < 0).any() else order
+    channel_indices = np.full(shape, -1)
+    channel_indices[drive, measurement] = np.arange(len(drive))
+    return None if (channel_indices < 0).any() else channel_indices
 
 
 def _exchanges(
@@ -81,12 +81,12 @@ def _exchanges(
     for _ in range(_MAX_EXCHANGES):
         diagonal = np.diag(squared_distances)
         gain = diagonal[:, None] + diagonal - squared_distances - squared_distances.T
-        first, second = np.unravel_index(np.argmax(gain), gain.shape)
-        if total - gain[first, second] > _MAX_EXCHANGE_RATIO**2 * total:
+        first_electrode, second_electrode = np.unravel_index(np.argmax(gain), gain.shape)
+        if total - gain[first_electrode, second_electrode] > _MAX_EXCHANGE_RATIO**2 * total:
             break
-        total = max(total - float(gain[first, second]), 0.0)
-        pairs.append((int(min(first, second)), int(max(first, second))))
-        squared_distances[[first, second]] = squared_distances[[second, first]]
+        total = max(total - float(gain[first_electrode, second_electrode]), 0.0)
+        pairs.append((int(min(first_electrode, second_electrode)), int(max(first_electrode, second_electrode))))
+        squared_distances[[first_electrode, second_electrode]] = squared_distances[[second_electrode, first_electrode]]
     return float(np.sqrt(total)), pairs
 
 
@@ -155,12 +155,12 @@ class Wiring:
 
     def _exchange_cycles(self) -> list[list[int]]:
         """Cycles of the permutation of electrodes: each electrode is at the place of the next in its cycle."""
-        cycles, moved = [], {k for k, place in enumerate(self.places) if place != k}
-        while moved:
-            cycle = [min(moved)]
+        cycles, moved_electrodes = [], {k for k, electrode in enumerate(self.places) if electrode != k}
+        while moved_electrodes:
+            cycle = [min(moved_electrodes)]
             while self.places[cycle[-1]] != cycle[0]:
                 cycle.append(self.places[cycle[-1]])
-            moved -= set(cycle)
+            moved_electrodes -= set(cycle)
             cycles.append(cycle)
         return cycles
 
@@ -188,16 +188,16 @@ def find_wiring(
         )  # a frame without signal does not determine the wiring
     impedances = uniform_impedances(model) if impedances is None else impedances
     protocol = on_host(model.protocol)
-    misfit_of = _comparison(protocol, impedances, measurement, orders)
-    compared = misfit_of(described_wiring)
+    compute_misfit = _create_comparison(protocol, impedances, measurement, orders)
+    compared = compute_misfit(described_wiring)
     described_misfit = 1.0 if compared.reversed_signs else compared.misfit
     if compared.misfit < MOST_MISFIT:  # as described, except possibly for the sign
         return replace(compared, described=described_misfit)
-    best_wiring = _better_wiring(misfit_of, described_wiring, compared, orders)
-    expected = np.asarray(select_channels(protocol, impedances[0]))
-    if (has_one_sign := _has_one_sign(expected, measurement)) is not None:
-        misfit_of = _comparison(protocol, impedances, measurement, orders, signs=False)
-        unsigned_wiring = _better_wiring(misfit_of, described_wiring, misfit_of(described_wiring), orders)
+    best_wiring = _better_wiring(compute_misfit, described_wiring, compared, orders)
+    expected_voltages = np.asarray(select_channels(protocol, impedances[0]))
+    if (has_one_sign := _has_one_sign(expected_voltages, measurement)) is not None:
+        compute_misfit = _create_comparison(protocol, impedances, measurement, orders, signs=False)
+        unsigned_wiring = _better_wiring(compute_misfit, described_wiring, compute_misfit(described_wiring), orders)
         if unsigned_wiring.misfit < _MAX_STEP_RATIO * best_wiring.misfit:
             best_wiring = replace(unsigned_wiring, magnitudes=has_one_sign)
     best_wiring = (
@@ -209,23 +209,23 @@ def find_wiring(
 
 
 def _better_wiring(
-    misfit_of: Callable[[Wiring], Wiring], described_wiring: Wiring, best_wiring: Wiring, orders: Iterable[str]
+    compute_misfit: Callable[[Wiring], Wiring], described_wiring: Wiring, best_wiring: Wiring, orders: Iterable[str]
 ) -> Wiring:
     """Return the wiring that explains a frame far better than `best_wiring`, the described wiring with its misfit, or
     `best_wiring` if no wiring does."""
     num_electrodes = len(described_wiring.places)
 
-    def best_of(wirings: Iterable[Wiring], last_best: Wiring) -> Wiring:
+    def choose_best(wirings: Iterable[Wiring], last_best: Wiring) -> Wiring:
         # Misfits are rounded so that the first of equivalent wirings is chosen, for example of orders that are
         # equivalent by reciprocity.
-        best_wiring = min((misfit_of(wiring) for wiring in wirings), key=lambda wiring: round(wiring.misfit, 9))
+        best_wiring = min((compute_misfit(wiring) for wiring in wirings), key=lambda wiring: round(wiring.misfit, 9))
         return best_wiring if best_wiring.misfit < _MAX_STEP_RATIO * last_best.misfit else last_best
 
-    def with_exchanges(best_wiring: Wiring) -> Wiring:
+    def improve_by_exchanges(best_wiring: Wiring) -> Wiring:
         for _ in range(_MAX_ELECTRODE_EXCHANGES):
             pairs = combinations(range(num_electrodes), 2)
             last_best = best_wiring
-            best_wiring = best_of(
+            best_wiring = choose_best(
                 [replace(best_wiring, places=_exchange_places(best_wiring.places, *pair)) for pair in pairs],
                 best_wiring,
             )
@@ -233,20 +233,24 @@ def _better_wiring(
                 break
         return best_wiring
 
-    best_wiring = with_exchanges(best_of([replace(described_wiring, order=order) for order in orders], best_wiring))
+    best_wiring = improve_by_exchanges(
+        choose_best([replace(described_wiring, order=order) for order in orders], best_wiring)
+    )
     turned_wirings = [Wiring(places, order) for places in _rotated_places(num_electrodes) for order in orders]
-    return best_of([with_exchanges(best_of(turned_wirings, misfit_of(described_wiring)))], best_wiring)
+    return choose_best(
+        [improve_by_exchanges(choose_best(turned_wirings, compute_misfit(described_wiring)))], best_wiring
+    )
 
 
-def _has_one_sign(expected: Float[np.ndarray, " M"], measurement: Measurement) -> bool | None:
-    """True if all voltages have one sign; False if all signs equal, or all oppose, those of the `expected` voltages of
-    a uniform body with the described wiring (which are assigned to magnitudes when their file is read); None for other
-    signs."""
-    used = np.asarray(measurement.mask)[0]
-    signs = np.sign(np.real(np.asarray(measurement.filled())[0]))[used]
+def _has_one_sign(expected_voltages: Float[np.ndarray, " M"], measurement: Measurement) -> bool | None:
+    """True if all voltages have one sign; False if all signs equal, or all oppose, those of the `expected_voltages`
+    voltages of a uniform body with the described wiring (which are assigned to magnitudes when their file is read);
+    None for other signs."""
+    is_used = np.asarray(measurement.mask)[0]
+    signs = np.sign(np.real(np.asarray(measurement.filled())[0]))[is_used]
     if abs(signs.sum()) == np.count_nonzero(signs):
         return True
-    products = signs * np.sign(expected)[used]
+    products = signs * np.sign(expected_voltages)[is_used]
     return False if (products >= 0).all() or (products <= 0).all() else None
 
 
@@ -278,7 +282,7 @@ def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
     return orders
 
 
-def _comparison(
+def _create_comparison(
     protocol: Protocol,
     impedances: Sequence[Float[np.ndarray, "L L"]],
     measurement: Measurement,
@@ -293,19 +297,21 @@ def _comparison(
 
     stacked = np.stack([np.asarray(impedance) for impedance in impedances])
 
-    def misfit_of(wiring: Wiring) -> Wiring:
-        electrode_places, order = np.array(wiring.places), orders[wiring.order]
-        measured, used = voltages[order], mask[order]
-        placed = stacked[:, electrode_places[:, None], electrode_places]
-        expected = np.where(used, [select_channels(protocol, impedance) for impedance in placed], 0)
-        expected = expected if signs else np.abs(expected)
-        scales = expected @ measured / np.sum(expected**2, axis=1)
-        residual_norms = np.linalg.norm(measured - scales[:, None] * expected, axis=1)
+    def compute_misfit(wiring: Wiring) -> Wiring:
+        electrode_places, channel_order = np.array(wiring.places), orders[wiring.order]
+        measured, is_used = voltages[channel_order], mask[channel_order]
+        exchanged_impedances = stacked[:, electrode_places[:, None], electrode_places]
+        expected_voltages = np.where(
+            is_used, [select_channels(protocol, impedance) for impedance in exchanged_impedances], 0
+        )
+        expected_voltages = expected_voltages if signs else np.abs(expected_voltages)
+        scales = expected_voltages @ measured / np.sum(expected_voltages**2, axis=1)
+        residual_norms = np.linalg.norm(measured - scales[:, None] * expected_voltages, axis=1)
         best = int(np.argmin(residual_norms))
         misfit = float(residual_norms[best] / np.linalg.norm(measured))
         return replace(wiring, misfit=misfit, reversed_signs=bool(scales[best] < 0))
 
-    return misfit_of
+    return compute_misfit
 
 
 def uniform_impedances(model: ForwardModel) -> list[Float[np.ndarray, "L L"]]:
@@ -332,9 +338,12 @@ def _rotated_places(num_electrodes: int) -> Iterator[tuple[int, ...]]:
                 yield tuple((shift + direction * k) % num_electrodes for k in range(num_electrodes))
 
 
-def _exchange_places(places: tuple[int, ...], first: int, second: int) -> tuple[int, ...]:
+def _exchange_places(places: tuple[int, ...], first_electrode: int, second_electrode: int) -> tuple[int, ...]:
     new_places = list(places)
-    new_places[first], new_places[second] = new_places[second], new_places[first]
+    new_places[first_electrode], new_places[second_electrode] = (
+        new_places[second_electrode],
+        new_places[first_electrode],
+    )
     return tuple(new_places)
 
 
@@ -342,9 +351,11 @@ def _exchange_text(places: tuple[int, ...], cycles: list[list[int]]) -> str:
     """Description of exchanged electrodes, in words."""
     if cycles and places in _rotated_places(len(places)):
         direction = "from another one" if (places[1] - places[0]) % len(places) == 1 else "the other way round"
-        first = f", electrode 1 standing where {places[0] + 1} should" if places[0] else ""
-        return f"the electrodes look counted {direction}{first}"
-    pairs = [f"{first + 1} and {second + 1}" for first, second in (cycle for cycle in cycles if len(cycle) == 2)]
+        first_text = f", electrode 1 standing where {places[0] + 1} should" if places[0] else ""
+        return f"the electrodes look counted {direction}{first_text}"
+    pairs = [
+        f"{first_text + 1} and {second + 1}" for first_text, second in (cycle for cycle in cycles if len(cycle) == 2)
+    ]
     descriptions = [f"electrodes {', '.join(pairs)} look exchanged"] if pairs else []
     descriptions += [
         f"electrodes {' → '.join(str(k + 1) for k in [*cycle, cycle[0]])} each look as if they stood where the next "
@@ -360,8 +371,8 @@ def check_wiring(wiring: Wiring, reference: Measurement, as_is: bool) -> None:
     the reference too poorly (see `Wiring.fault`), unless `as_is`."""
     if wiring.fault and not as_is:
         # Voltages of the opposite sign cannot be calibrated, even with `as_is`.
-        advice = "" if wiring.reversed_signs else "; or go on as it is (as_is=True, --as-is)"
+        remedy = "" if wiring.reversed_signs else "; or go on as it is (as_is=True, --as-is)"
         raise ValueError(
             f"'{reference.name}' does not fit its description: {wiring.fault} Mend the wires or the description"
-            f"{advice}."
+            f"{remedy}."
         )

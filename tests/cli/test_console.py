@@ -11,7 +11,7 @@ from rich.console import Console
 from jeit.arguments import percent
 from jeit.cli import console as console_room
 from jeit.cli.commands.reconstruct import bodies_text
-from jeit.cli.console import Steps, in_one_unit, inclusion_table, quantity_table, with_unit
+from jeit.cli.console import Steps, format_in_one_unit, format_with_unit, inclusion_table, quantity_table
 from jeit.image import Inclusion, SolidForm
 
 SAID = {
@@ -127,14 +127,14 @@ def test_steps_are_printed_with_their_duration_once_they_end(monkeypatch):
 def test_values_have_the_prefix_that_suits_them():
     said = {None: "not known", 0.0: "0 S", 1.234: "1.23 S", -0.0567: "-56.7 mS", 9.996e-4: "1 mS", 9.99e-7: "999 nS"}
     said |= {2e-10: "2e-10 S", 1234.0: "1.23e+03 S"}
-    assert {value: with_unit(value, "S") for value in said} == said
+    assert {value: format_with_unit(value, "S") for value in said} == said
     for values, unit, texts in (
         ([2e-6, -3.456e-3], "mS", ["0.002", "-3.46"]),
         ([9.996e-4, 2e-5], "mS", ["1", "0.02"]),
         ([0.0], "S", ["0"]),
         ([], "S", []),
     ):
-        assert in_one_unit(values, "S") == (unit, texts)
+        assert format_in_one_unit(values, "S") == (unit, texts)
 
 
 def test_the_time_left_is_estimated_where_parts_are_known(monkeypatch):

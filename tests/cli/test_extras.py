@@ -12,7 +12,7 @@ from scipy.io import wavfile
 from studies import SMALL
 
 from jeit.arguments.extras import EXTRAS
-from jeit.cli.app import as_command
+from jeit.cli.app import run_as_command
 
 ROOT = Path(__file__).resolve().parents[2]
 SKIN = "[electrodes]\nlayout = 'grid-4x4'\n[skin]\nwidth_mm = 100\n"
@@ -80,7 +80,7 @@ def folder(tmp_path_factory):
 
 def commands(one=None, path=()):
     """Every command that is not a group of commands, by its words."""
-    one = one or as_command()
+    one = one or run_as_command()
     inside = getattr(one, "commands", {})
     for name, other in inside.items():
         yield from commands(other, (*path, name))

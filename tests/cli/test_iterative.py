@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import binary_erosion, label
 
 from jeit.arguments import counted
-from jeit.cli.console import in_one_unit
+from jeit.cli.console import format_in_one_unit
 from jeit.cli.options import NETWORK
 from jeit.data import read, write_table
 from jeit.imaging import METHODS, StreamSettings
@@ -233,9 +233,9 @@ def test_bad_input_is_refused_in_one_line(arguments, words, tank, run, tmp_path)
 
 
 def test_columns_have_one_unit():
-    assert in_one_unit([2.7e-3, -1.85e-4], "S") == ("mS", ["2.7", "-0.185"])
-    assert in_one_unit([12.0], "S/m") == ("S/m", ["12"])
-    assert in_one_unit([], "S") == ("S", [])
+    assert format_in_one_unit([2.7e-3, -1.85e-4], "S") == ("mS", ["2.7", "-0.185"])
+    assert format_in_one_unit([12.0], "S/m") == ("S/m", ["12"])
+    assert format_in_one_unit([], "S") == ("S", [])
 
 
 def test_singular_and_plural():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from jeit.cli.app import as_command
+from jeit.cli.app import run_as_command
 from jeit.cli.console import Steps
 from jeit.design.commands.layout import _OPTIMISATION_FILES, _parse_region
 from jeit.layout import Layout, read_layout, write_layout
@@ -16,7 +16,7 @@ from jeit.mesh import Disk, Rectangle
 
 
 def run(*arguments):
-    as_command().main(args=["layout", "optimise", *map(str, arguments)], standalone_mode=False)
+    run_as_command().main(args=["layout", "optimise", *map(str, arguments)], standalone_mode=False)
 
 
 @pytest.mark.slow

@@ -47,7 +47,7 @@ def test_no_frame_is_skipped_with_a_given_rate(clock):
     seconds, values = zip(*live, strict=True)
     np.testing.assert_allclose(seconds, np.arange(50) / 100)
     assert [one[0] for one in values] == list(range(50))
-    assert (live.left_out, live.rate_seen) == (0, 100.0)
+    assert (live.left_out, live.measured_rate) == (0, 100.0)
 
 
 def test_old_frames_are_skipped(clock):
@@ -55,7 +55,7 @@ def test_old_frames_are_skipped(clock):
     still = live.initial_frames(0.1)
     assert live.left_out == 22  # and two of the three delayed frames
     assert still[0, 0] == 22
-    assert live.rate_seen == pytest.approx(100, rel=1e-2)
+    assert live.measured_rate == pytest.approx(100, rel=1e-2)
     clock.now += 1.0  # time that the caller takes to get ready
     seconds, values = zip(*live, strict=True)
     assert values[0][0] == 22
@@ -118,7 +118,7 @@ def test_the_number_of_frames_is_reported_at_once_and_then_a_few_times_a_second(
     reported = []
     counter = FrameCounter(SimpleNamespace(report=reported.append), number)
     for _ in range(1100):
-        counter.one_more()
+        counter.count_frame()
         clock.now += 0.001
     assert counter.number == 1100
     first, *others, last = [text.removesuffix(total) for text in reported]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jeit.cli import main
-from jeit.cli.console import Steps, with_unit
+from jeit.cli.console import Steps, format_with_unit
 from jeit.data import load_description
 
 DESCRIBED = """
@@ -69,7 +69,7 @@ def test_results_are_written(recording, tmp_path, capsys, monkeypatch):
     printed = " ".join(capsys.readouterr().out.split())
     assert "20 frames, 5 a second, 0 refused 1.3 Hz (resolution 0.53 Hz): " in printed
     for name, one in found["regions"].items():
-        sizes = f"{with_unit(one['amplitude'], 'S')} ± {with_unit(one['noise'], 'S')}"
+        sizes = f"{format_with_unit(one['amplitude'], 'S')} ± {format_with_unit(one['noise'], 'S')}"
         assert f"{name}: amplitude {sizes}, phase {one['phase_degrees']:.0f}°" in printed
 
 

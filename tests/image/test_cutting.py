@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jeit.image import Plane, cut_by_plane, isosurface_of, node_values
-from jeit.image.plane import crossed_cells, part_above
+from jeit.image.plane import crossed_cells, cut_above_level
 from jeit.mesh import Mesh, box, centroids, cylinder, measures, rectangle
 
 BOX = (0.17, 0.255, 0.17)
@@ -189,7 +189,7 @@ def test_every_section_of_a_tetrahedron():
 def test_parts_of_a_surface_above_a_level():
     plane = rectangle(1.0, 1.0, num_points=200)
     points, triangles = np.asarray(plane.points), np.asarray(plane.cells)
-    pieces = part_above(triangles, points[:, 0], 0.2)
+    pieces = cut_above_level(triangles, points[:, 0], 0.2)
     corners = pieces.at_corners(points)
     x, y = corners[..., 0], corners[..., 1]
     area = 0.5 * np.abs((x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y).sum(axis=1)).sum()

@@ -25,7 +25,7 @@ def info(
 ) -> None:
     """Print what DATA contains: frames, electrodes, protocol, noise, assumptions, and masked voltages."""
     from jeit.arguments import counted, percent
-    from jeit.cli.console import name_value_table, plain_console, with_unit
+    from jeit.cli.console import format_with_unit, name_value_table, plain_console
     from jeit.data.frame_checks import MOST_IMPOSSIBLE_SIGNS
     from jeit.report import report_measurement
 
@@ -34,14 +34,14 @@ def info(
     body, noise = content["body"], content["noise"]
     names = f" ({', '.join(content['frame_names'])})" if content["frame_names"] else ""
     rate = f", {content['frame_rate']:.4g} a second" if content["frame_rate"] else ""
-    noise_text = noise and f"{with_unit(noise['standard_deviation'], 'V')}, from {noise['method']}"
+    noise_text = noise and f"{format_with_unit(noise['standard_deviation'], 'V')}, from {noise['method']}"
     rows = [
         ("frames", f"{content['frames']}{names}{rate}"),
         ("protocol", content["protocol"]),
         ("channels", f"{content['channels']}, of {counted(content['drives'], 'drive')}"),
         ("masked", f"{content['masked']} of {content['voltages']} voltages"),
-        ("largest current", with_unit(content["largest_current"], "A")),
-        ("largest voltage", with_unit(content["largest_voltage"], "V")),
+        ("largest current", format_with_unit(content["largest_current"], "A")),
+        ("largest voltage", format_with_unit(content["largest_voltage"], "V")),
         ("body", _body_text(body)),
         ("electrodes", f"{content['electrodes']['number']}, {content['electrodes']['kind']}"),
         ("reciprocity error", percent(content["reciprocity_error"])),

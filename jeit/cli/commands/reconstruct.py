@@ -174,22 +174,22 @@ def show(console, result: "ImagedDifference", *, frame_given: bool = False) -> N
     import numpy as np
 
     from jeit.arguments import counted, percent
-    from jeit.cli.console import inclusion_table, name_value_table, quantity_table, with_unit
+    from jeit.cli.console import format_with_unit, inclusion_table, name_value_table, quantity_table
     from jeit.inverse.nonlinear.reconstruct import Reconstruction
     from jeit_solvers import Status
 
     calibration, reconstruction = result.calibration, result.reconstruction
     unit = "S" if result.mesh.dimension == 2 else "S/m"
-    noise, share = result.quality.difference_noise, result.quality.noise_share
+    noise, noise_share = result.quality.difference_noise, result.quality.noise_share
     hyperparameter = float(reconstruction.hyperparameter)
     choice_text = "none" if result.chosen_by == "none" else f"{hyperparameter:.3g} ({result.chosen_by})"
     background = np.asarray(calibration.conductivity).item()
-    background_text = with_unit(background.real, unit)
+    background_text = format_with_unit(background.real, unit)
     background_text += (
-        f" and {with_unit(background.imag, unit)} of susceptivity" if isinstance(background, complex) else ""
+        f" and {format_with_unit(background.imag, unit)} of susceptivity" if isinstance(background, complex) else ""
     )
     noise_text = "not known" if noise is None else f"{percent(noise.relative)}, from {noise.method}"
-    noise_text = noise_text if share is None else f"{percent(share)}, from {result.quality.noise_source}"
+    noise_text = noise_text if noise_share is None else f"{percent(noise_share)}, from {result.quality.noise_source}"
     noise_text += "" if result.electrode_change is None else "; of the rest that moved electrodes leave"
     rows = [
         ("background", f"{background_text}, misfit {percent(float(calibration.misfit))}"),
@@ -244,10 +244,14 @@ def bodies_text(shapes: "ShapeReconstruction", dimension: int) -> str:
 
     noun = "surface" if dimension == 3 else "outline"
     ghosts_text = f"; {counted(len(shapes.doubtful), 'ghost')} left out" if shapes.doubtful else ""
-    num_strong = sum(not body.contrast_is_determined for body in shapes.bodies)
+    num_undetermined_contrasts = sum(not body.contrast_is_determined for body in shapes.bodies)
     num_columns = sum(isinstance(body, Ellipsoid) and body.column for body in shapes.bodies)
     columns_text = f", {counted(num_columns, 'column')} through the whole height" if num_columns else ""
-    assumed_text = f"; of {num_strong} the data give a limit of the change only" if num_strong else ""
+    assumed_text = (
+        f"; of {num_undetermined_contrasts} the data give a limit of the change only"
+        if num_undetermined_contrasts
+        else ""
+    )
     shares_material = any(isinstance(body, Ellipsoid) and body.alike for body in shapes.bodies)
     material_text = ", as of one material: the data do not contradict it" if shares_material else ""
     drift_text = f"the background has drifted by {percent(shapes.drift)}"

@@ -92,7 +92,7 @@ def series(
     import numpy as np
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps, plain_console, say_written, with_unit
+    from jeit.cli.console import Steps, format_with_unit, plain_console, say_written
     from jeit.image import oscillation
     from jeit.imaging import ImagingSettings, image_sequence
     from jeit.report import write_series
@@ -152,7 +152,7 @@ def series(
     for entry in report["oscillations"]:
         console.print(f"{entry['frequency']:.4g} Hz (resolution {entry['resolution']:.2g} Hz):")
         for name, component in entry["regions"].items():
-            sizes = f"{with_unit(component['amplitude'], unit)} ± {with_unit(component['noise'], unit)}"
+            sizes = f"{format_with_unit(component['amplitude'], unit)} ± {format_with_unit(component['noise'], unit)}"
             console.print(f"  {name}: amplitude {sizes}, phase {component['phase_degrees']:.0f}°", markup=False)
     say_written(console, output / "series.png", "series.npz", "regions.csv", "report.json", *films)
 

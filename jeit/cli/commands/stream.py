@@ -119,7 +119,7 @@ def stream(
     import numpy as np
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps, plain_console, say_written, with_unit
+    from jeit.cli.console import Steps, format_with_unit, plain_console, say_written
     from jeit.cli.streams import FrameCounter, Stopping
     from jeit.data.formats.lines import LineParser, read_lines
     from jeit.data.screening import mask_spikes
@@ -191,8 +191,8 @@ def stream(
             step("image")
             frame_counter = FrameCounter(step, num_frames)
 
-            def show(frame_image) -> None:
-                frame_counter.one_more()
+            def show_frame(frame_image) -> None:
+                frame_counter.count_frame()
                 if frame_image.reason and not quiet:
                     console.print(
                         f"  frame {frame_image.number}: {frame_image.status}. {frame_image.reason}", soft_wrap=True
@@ -210,18 +210,28 @@ def stream(
                 else image_stream(imager, calibration, arriving_frames, show_movement)
             )
             with stopping.exit_after_signal(frame_counter, "frames.csv", "images.npz"):
-                written = write_stream(
-                    images, calibration, output, name=data, film=film_name, rate=rate, progress=show, drawing=drawing
+                written_stream = write_stream(
+                    images,
+                    calibration,
+                    output,
+                    name=data,
+                    film=film_name,
+                    rate=rate,
+                    progress=show_frame,
+                    drawing=drawing,
                 )
-    if not written.latency.size:
+    if not written_stream.latency.size:
         raise ValueError(
-            f"'{data}': {counted(written.number, 'frame')}, and none could be imaged; the first: {written.first_reason}"
+            f"'{data}': {counted(written_stream.number, 'frame')}, and none could be imaged; the first: "
+            f"{written_stream.first_reason}"
         )
     if quiet:
         return
-    counts_text = ", ".join(f"{count} {status}" for status, count in sorted(written.counts.items()))
-    background = with_unit(float(calibration.conductivity), "S" if calibration.model.mesh.dimension == 2 else "S/m")
-    console.print(f"\n{counted(written.number, 'frame')}: {counts_text}; background {background}")
-    median, upper_quantile = 1e3 * np.quantile(written.latency, (0.5, 0.99))
+    counts_text = ", ".join(f"{count} {status}" for status, count in sorted(written_stream.counts.items()))
+    background = format_with_unit(
+        float(calibration.conductivity), "S" if calibration.model.mesh.dimension == 2 else "S/m"
+    )
+    console.print(f"\n{counted(written_stream.number, 'frame')}: {counts_text}; background {background}")
+    median, upper_quantile = 1e3 * np.quantile(written_stream.latency, (0.5, 0.99))
     console.print(f"latency: median {median:.2f} ms, 99 % within {upper_quantile:.2f} ms")
     say_written(console, output / "frames.csv", "images.npz", "frames.png", *films)

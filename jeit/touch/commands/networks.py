@@ -102,7 +102,7 @@ def image_by_network(
         counter = FrameCounter(step, None if numbers is None else len(numbers))
 
         def print_refused(frame_depth: "FrameDepth") -> None:
-            counter.one_more()
+            counter.count_frame()
             if frame_depth.depth is None and not quiet:
                 console.print(f"  frame {frame_depth.number}: refused. {frame_depth.reason}", soft_wrap=True)
 

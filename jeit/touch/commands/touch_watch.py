@@ -157,7 +157,7 @@ def watch(
                 if untouched_frames is None:
                     step(f"untouched, for {untouched:g} s")
                     untouched_frames = live_frames.initial_frames(untouched)
-                frames, frame_rate = live_frames, live_frames.rate_seen
+                frames, frame_rate = live_frames, live_frames.measured_rate
             else:
                 frames, untouched_frames, frame_rate = _read_recording(
                     Path(stream), description, untouched_frames, untouched, rate or default_rate
