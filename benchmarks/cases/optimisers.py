@@ -22,7 +22,7 @@ from benchmarks.harness.timing import say, timed
 from benchmarks.problems.touched_sensors import bodies, simulate
 from jeit.inverse import Gaussian, Noser, reconstruct
 from jeit.inverse.nonlinear import GaussNewton
-from jeit.inverse.nonlinear.solvers import minimise_between
+from jeit.inverse.nonlinear.solvers import minimise_within_bounds
 from jeit_solvers import Descent, lbfgsb, projected_gradient
 
 MOST_STEPS, MOST_BOUNDED_STEPS, TOLERANCE = 200, 2000, 1e-6
@@ -140,7 +140,7 @@ def solvers():
         def solve(inversion):
             first = start(inversion)
             least, greatest = jnp.full_like(first, -jnp.inf), jnp.full_like(first, jnp.inf)
-            found = minimise_between(inversion, first, least, greatest, method, MOST_BOUNDED_STEPS, TOLERANCE)
+            found = minimise_within_bounds(inversion, first, least, greatest, method, MOST_BOUNDED_STEPS, TOLERANCE)
             return found.x, found.steps
 
         return solve

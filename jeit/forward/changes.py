@@ -70,8 +70,8 @@ class SolvedFields(NamedTuple):
         return _field_energies(self.mesh, self.fields, cells, slope)
 
     def _energy_everywhere(self, change: Float[np.ndarray, " m"]) -> Float[np.ndarray, "L L"]:
-        no_contacts = (None,) * (self.pattern.num_groups - 1)
-        values: Any = self.pattern.assemble(stiffness(self.mesh, change), *no_contacts)  # pyright: ignore
+        empty_contacts = (None,) * (self.pattern.num_groups - 1)
+        values: Any = self.pattern.assemble(stiffness(self.mesh, change), *empty_contacts)  # pyright: ignore
         return self.pattern.quadratic_form(values, self.fields)
 
 
@@ -94,19 +94,19 @@ def _field_energies(mesh: Mesh, fields, cells, slope) -> Float[np.ndarray, "q L 
     num_fields, is_nonzero = fields.shape[1], slope != 0
     num_nonzero = is_nonzero.sum(axis=1)
     energy = np.zeros((slope.shape[1], num_fields**2), np.result_type(fields, slope))
-    for part in _parts(np.flatnonzero(num_nonzero > 1)):
-        local = weighted_gradient[part] @ fields[nodes[part]]
-        energy += slope[part].T @ (local.transpose(0, 2, 1) @ local).reshape(len(part), -1)
+    for index_part in _split_indices(np.flatnonzero(num_nonzero > 1)):
+        local_fields = weighted_gradient[index_part] @ fields[nodes[index_part]]
+        energy += slope[index_part].T @ (local_fields.transpose(0, 2, 1) @ local_fields).reshape(len(index_part), -1)
     energy = energy.reshape(-1, num_fields, num_fields)
     for coefficient, is_alone in enumerate((is_nonzero & (num_nonzero == 1)[:, None]).T):
-        for part in _parts(np.flatnonzero(is_alone)):
-            local = weighted_gradient[part] @ fields[nodes[part]]
-            weighted = slope[part, coefficient, None, None] * local
-            energy[coefficient] += local.reshape(-1, num_fields).T @ weighted.reshape(-1, num_fields)
+        for index_part in _split_indices(np.flatnonzero(is_alone)):
+            local_fields = weighted_gradient[index_part] @ fields[nodes[index_part]]
+            weighted = slope[index_part, coefficient, None, None] * local_fields
+            energy[coefficient] += local_fields.reshape(-1, num_fields).T @ weighted.reshape(-1, num_fields)
     return energy
 
 
-def _parts(indices: Int[np.ndarray, " k"]) -> list[Int[np.ndarray, " p"]]:
+def _split_indices(indices: Int[np.ndarray, " k"]) -> list[Int[np.ndarray, " p"]]:
     """Divide `indices` into parts of `_CELLS_AT_ONCE`."""
     return [indices[start : start + _CELLS_AT_ONCE] for start in range(0, len(indices), _CELLS_AT_ONCE)]
 
@@ -121,21 +121,21 @@ class _ContactMass(NamedTuple):
     mass: Float[np.ndarray, "q k k"]
 
 
-def _contact_of(mesh: Mesh, electrodes: AbstractElectrodes, members: Bool[np.ndarray, " L"]) -> Contact:
+def _select_contact(mesh: Mesh, electrodes: AbstractElectrodes, members: Bool[np.ndarray, " L"]) -> Contact:
     """Contact integrals for unit contact impedance of the electrodes that are `members`, and open contacts of all
     others."""
     contact_impedance = np.where(members, 1.0, _OPEN_CONTACT)
     return on_host(electrodes.with_contact_impedance(contact_impedance)).contact(mesh)
 
 
-def _groups_without_neighbours(shares: Bool[np.ndarray, "L L"]) -> list[Bool[np.ndarray, " L"]]:
+def _groups_without_neighbours(shares_cell: Bool[np.ndarray, "L L"]) -> list[Bool[np.ndarray, " L"]]:
     """Divide electrodes into as few groups as a simple search finds, so that no two electrodes of a group share a facet
-    or cell. `shares`: whether two electrodes share one. Each group is a mask of its members."""
+    or cell. `shares_cell`: whether two electrodes share one. Each group is a mask of its members."""
     groups: list[Bool[np.ndarray, " L"]] = []
-    for electrode, neighbours in enumerate(shares):
+    for electrode, neighbours in enumerate(shares_cell):
         group = next((group for group in groups if not (group & neighbours).any()), None)
         if group is None:
-            groups.append(group := np.zeros(len(shares), bool))
+            groups.append(group := np.zeros(len(shares_cell), bool))
         group[electrode] = True
     return groups
 
@@ -146,23 +146,23 @@ class ContactSensitivity:
 
     def __init__(self, mesh: Mesh, electrodes: AbstractElectrodes):
         mesh, num_electrodes = on_host(mesh), electrodes.num_electrodes
-        contact = _contact_of(mesh, electrodes, np.ones(num_electrodes, bool))
+        contact = _select_contact(mesh, electrodes, np.ones(num_electrodes, bool))
         load = np.asarray(contact.load)
         self._loads: list[Float[np.ndarray, " n"]] = list(load.T)
-        self._pieces: list[list[_ContactMass]] = [[] for _ in range(num_electrodes)]
+        self._contact_masses: list[list[_ContactMass]] = [[] for _ in range(num_electrodes)]
         # If an electrode covers a part of a facet or cell, all nodes of this facet or cell have a load.
         is_touched = [(load[np.asarray(nodes)] != 0).all(axis=1) for nodes in contact.nodes]
         counts = sum(touched.T.astype(float) @ touched for touched in is_touched)
         groups = _groups_without_neighbours((counts > 0) & ~np.eye(num_electrodes, dtype=bool))
         for members in groups:
-            own_contact = contact if members.all() else _contact_of(mesh, electrodes, members)
+            own_contact = contact if members.all() else _select_contact(mesh, electrodes, members)
             for nodes, mass, touched in zip(own_contact.nodes, own_contact.mass, is_touched, strict=True):
                 nodes, mass = np.asarray(nodes), np.asarray(mass)
                 size = np.abs(mass).max(axis=(1, 2), initial=0)
                 is_covered = size > 2 / _OPEN_CONTACT * size.max(initial=0)
                 for electrode in np.flatnonzero(members):
                     own = np.flatnonzero(is_covered & touched[:, electrode])
-                    self._pieces[electrode].append(_ContactMass(nodes[own], mass[own]))
+                    self._contact_masses[electrode].append(_ContactMass(nodes[own], mass[own]))
 
     def __call__(
         self, fields: Float[np.ndarray, "n L"], impedance: Float[np.ndarray, "L L"], contact_impedance
@@ -178,9 +178,9 @@ class ContactSensitivity:
         load, electrode_impedance = self._loads[electrode], impedance[electrode]
         cross_energy = np.outer(load @ fields, electrode_impedance)
         energy = load.sum() * np.outer(electrode_impedance, electrode_impedance) - cross_energy - cross_energy.T
-        for nodes, mass in self._pieces[electrode]:
-            local = fields[nodes]
-            energy += np.einsum("qip,qir->pr", local, np.einsum("qij,qjr->qir", mass, local))
+        for nodes, mass in self._contact_masses[electrode]:
+            local_fields = fields[nodes]
+            energy += np.einsum("qip,qir->pr", local_fields, np.einsum("qij,qjr->qir", mass, local_fields))
         return energy
 
 
@@ -216,8 +216,10 @@ class PlacementSensitivity:
         ohms, for these electrodes."""
         contact = self._contact_impedance
         shift_derivatives = []
-        for forward, backward in self._shifted_sensitivities:
-            energies = [sensitivity(fields, impedance, contact) for sensitivity in (backward, forward)]
+        for forward_sensitivity, backward_sensitivity in self._shifted_sensitivities:
+            energies = [
+                sensitivity(fields, impedance, contact) for sensitivity in (backward_sensitivity, forward_sensitivity)
+            ]
             shift_derivatives.append((energies[0] - energies[1]) / (2 * self._step))
         shift_derivatives = np.stack(shift_derivatives, axis=1).reshape(-1, *impedance.shape)
         return np.concatenate([shift_derivatives, self._sensitivity(fields, impedance, contact)])

@@ -215,14 +215,16 @@ class System(Module):
 
         `conductivity` per cell, in S/m (2-D: S).
         """
-        no_contacts = (None,) * len(contact.mass)
-        stiffness_values = self.pattern.assemble(stiffness(mesh, conductivity), *no_contacts)
-        ground = ground_conductance(self.pattern.diagonal(stiffness_values), contact.load)
+        empty_contacts = (None,) * len(contact.mass)
+        stiffness_values = self.pattern.assemble(stiffness(mesh, conductivity), *empty_contacts)
+        ground_conductances = ground_conductance(self.pattern.diagonal(stiffness_values), contact.load)
         values = (
             stiffness_values if electrodes.is_point else stiffness_values + self.pattern.assemble(None, *contact.mass)
         )
-        values = values + namespace(values).concatenate([ground, np.zeros(len(values) - len(ground))])
-        load = contact.load if electrodes.is_point else with_ground(contact.load, ground)
+        values = values + namespace(values).concatenate(
+            [ground_conductances, np.zeros(len(values) - len(ground_conductances))]
+        )
+        load = contact.load if electrodes.is_point else append_ground(contact.load, ground_conductances)
         return SparseSymmetric(values, self.pattern), load
 
     def solve(self, operator: SparseSymmetric, load: Inexact[Array, "n c"]) -> Inexact[Array, "n c"]:
@@ -279,6 +281,6 @@ def ground_conductance(stiffness: Inexact[Array, " n"], load: Inexact[Array, "n 
     return xp.where(np.arange(len(stiffness)) == node, stiffness, 0)
 
 
-def with_ground(load: Inexact[Array, "n L"], ground: Inexact[Array, " n"]) -> Inexact[Array, "n c"]:
-    """Loads (n, L + 1): the loads of the electrodes, followed by the load of the `ground` (n,)."""
-    return namespace(load, ground).concatenate([load, ground[:, None]], axis=1)
+def append_ground(load: Inexact[Array, "n L"], ground_conductances: Inexact[Array, " n"]) -> Inexact[Array, "n c"]:
+    """Loads (n, L + 1): the loads of the electrodes, followed by `ground_conductances` (n,)."""
+    return namespace(load, ground_conductances).concatenate([load, ground_conductances[:, None]], axis=1)

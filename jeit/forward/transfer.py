@@ -223,7 +223,7 @@ def terminal_impedance(product: Inexact[Array, "c c"]) -> Inexact[Array, "c c"]:
 
 
 def _refinement_correction(
-    others: Inexact[Array, "c c"], impedance: Inexact[Array, "c c"], current: Inexact[Array, "c c"]
+    other_impedance: Inexact[Array, "c c"], impedance: Inexact[Array, "c c"], current: Inexact[Array, "c c"]
 ):
     """Correction of the impedance of terminals by one step of iterative refinement; needed if two terminals are nearly
     short-circuited.
@@ -232,11 +232,13 @@ def _refinement_correction(
     terminal therefore equals the current that enters the other, even with rounding errors. The residual is `current`
     minus all these currents; it retains the digits that couple a short-circuited pair to the other terminals.
     """
-    xp = namespace(others)
+    xp = namespace(other_impedance)
     if xp is np:
-        flow = np.stack([row @ (potential - impedance) for row, potential in zip(others, impedance, strict=True)])
+        flow = np.stack(
+            [row @ (potential - impedance) for row, potential in zip(other_impedance, impedance, strict=True)]
+        )
     else:
-        flow = (others[:, :, None] * (impedance[:, None] - impedance)).sum(axis=1)
+        flow = (other_impedance[:, :, None] * (impedance[:, None] - impedance)).sum(axis=1)
     correction = impedance @ (current - flow)
     return (correction + correction.T) / 2
 
@@ -269,7 +271,7 @@ def _contact_energy(contact: Contact, fields, impedance):
     U, W, as a matrix (L, L)."""
     body_term = 0
     for nodes, mass in zip(contact.nodes, contact.mass, strict=True):
-        local = fields.at[nodes].get(mode="promise_in_bounds")  # (q, k, L)
-        body_term += jnp.einsum("qip,qij,qjr->pr", local, mass, local)
+        local_fields = fields.at[nodes].get(mode="promise_in_bounds")  # (q, k, L)
+        body_term += jnp.einsum("qip,qij,qjr->pr", local_fields, mass, local_fields)
     coupling = fields.T @ contact.load @ impedance
     return body_term - coupling - coupling.T + impedance.T @ (contact.load.sum(axis=0)[:, None] * impedance)

@@ -44,14 +44,14 @@ class TracedFit(NamedTuple):
 
 
 @eqx.filter_jit
-def traced_fit(model: ForwardModel, measured: Float[Array, " M"], used, contact: str, max_steps: int) -> TracedFit:
+def traced_fit(model: ForwardModel, measured: Float[Array, " M"], is_used, contact: str, max_steps: int) -> TracedFit:
     """Fit the logarithms of the conductivity σ and of z·σ / z₀, with contact impedances z and those of the model z₀, to
-    the channels `used` by least squares, inside a JAX transformation; see `calibrate`."""
-    problem = on_device((model, measured, used))
-    unit_voltages = jnp.where(used, model.voltages(1.0), 0)
+    the channels `is_used` by least squares, inside a JAX transformation; see `calibrate`."""
+    problem = on_device((model, measured, is_used))
+    unit_voltages = jnp.where(is_used, model.voltages(1.0), 0)
     num_parameters = {"fixed": 1, "common": 2, "each": 1 + model.electrodes.num_electrodes}[contact]
     start = jnp.full(
-        num_parameters, jnp.log(unit_voltages @ unit_voltages / (unit_voltages @ jnp.where(used, measured, 0)))
+        num_parameters, jnp.log(unit_voltages @ unit_voltages / (unit_voltages @ jnp.where(is_used, measured, 0)))
     )
     optimiser = optx.LevenbergMarquardt(rtol=_TRACED_TOLERANCE, atol=_TRACED_TOLERANCE)
     residual = partial(_relative_residual, contact)
@@ -63,7 +63,7 @@ def traced_fit(model: ForwardModel, measured: Float[Array, " M"], used, contact:
     fitted_model, conductivity = _fitted_model(contact, parameters, model)
     final_residual = residual(parameters, problem)
     covariance = symmetric_inverse(_normal_matrix(contact, parameters, problem))
-    degrees_of_freedom = jnp.maximum(jnp.sum(used) - num_parameters, 1)
+    degrees_of_freedom = jnp.maximum(jnp.sum(is_used) - num_parameters, 1)
     deviation = jnp.sqrt(covariance.diagonal() * (final_residual @ final_residual) / degrees_of_freedom)[1:]
     misfit = jnp.sqrt(final_residual @ final_residual)
     outcome = jnp.where(jnp.isfinite(misfit), ended_number(solution.result), Status.FAILED.number)
@@ -85,10 +85,10 @@ def _fitted_model(contact: str, parameters, model: ForwardModel) -> tuple[Forwar
 
 def _relative_residual(contact: str, parameters, problem):
     """Residual (predicted - measured) / ‖measured‖ (M,) of the channels in use, zero for the other channels."""
-    model, measured, used = problem
+    model, measured, is_used = problem
     fitted_model, conductivity = _fitted_model(contact, parameters, model)
     predicted = fitted_model.voltages(conductivity)
-    return jnp.where(used, predicted - measured, 0) / jnp.linalg.norm(jnp.where(used, measured, 0))
+    return jnp.where(is_used, predicted - measured, 0) / jnp.linalg.norm(jnp.where(is_used, measured, 0))
 
 
 def _gradient(contact: str, parameters, problem):
@@ -193,15 +193,15 @@ class Calibration(Module):
         if not float(self.misfit) > _LARGE_MISFIT:
             return ""
         if self.model.mesh.dimension == 3:
-            possible_errors, alternative = (
+            possible_errors, remedy = (
                 "size of the body, how high it is filled, places and sizes of the electrodes",
                 "",
             )
         else:
-            possible_errors, alternative = "radius, width of the electrodes", ", or the body deeper than a sheet"
+            possible_errors, remedy = "radius, width of the electrodes", ", or the body deeper than a sheet"
         return (
             f"the model misses {100 * float(self.misfit):.0f} % of the reference: {possible_errors}, protocol or "
-            f"gain may be others than described{alternative}. An error that is the same in both frames hardly moves "
+            f"gain may be others than described{remedy}. An error that is the same in both frames hardly moves "
             "the image of a change; but do not trust the size of the change, nor the background conductivity."
         )
 
@@ -250,10 +250,11 @@ def calibrate(
         raise ValueError(f"voltages are {measured.dtype}; give numbers, in volts.")
     measured = measured.astype(number_type)
     shape = (model.protocol.num_measurements,)
-    used = np.ones(shape, bool) if mask is None else np.asarray(mask, bool)
-    if measured.shape != shape or used.shape != shape:
+    is_used = np.ones(shape, bool) if mask is None else np.asarray(mask, bool)
+    if measured.shape != shape or is_used.shape != shape:
         raise ValueError(
-            f"voltages has shape {measured.shape} and mask {used.shape}; protocol '{model.protocol.name}' has {shape}."
+            f"voltages has shape {measured.shape} and mask {is_used.shape}; protocol '{model.protocol.name}' has "
+            f"{shape}."
         )
     check_name("contact", contact, ("common", "each", "fixed"))
     max_steps = check_steps("max_steps", max_steps)
@@ -264,23 +265,25 @@ def calibrate(
                 "calibrate outside these functions, or fit the real parts, calibrate(model, voltages.real)."
             )
         contact = "fixed" if model.electrodes.is_point else contact
-        return Calibration(*traced_fit(model, jnp.where(used, measured, 0), used, contact, max_steps), _TRACED_REASON)
-    measured = np.where(used, measured, 0)
+        return Calibration(
+            *traced_fit(model, jnp.where(is_used, measured, 0), is_used, contact, max_steps), _TRACED_REASON
+        )
+    measured = np.where(is_used, measured, 0)
     max_voltage = np.abs(measured).max()
     if not np.isfinite(max_voltage) or max_voltage == 0:
         raise ValueError("voltages: the reference frame has no finite, non-zero values to calibrate on.")
     if not _MIN_VOLTAGE < max_voltage < 1 / _MIN_VOLTAGE:
         raise ValueError(f"voltages: the largest of the reference frame is {max_voltage:.3g} V; are they in volts?")
     with np.errstate(all="ignore"):
-        return _fit(model, measured, used, contact, max_steps)
+        return _fit(model, measured, is_used, contact, max_steps)
 
 
-def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> Calibration:
+def _fit(model: ForwardModel, measured, is_used, contact: str, max_steps: int) -> Calibration:
     if model.electrodes.is_point:
         contact = "fixed"
     data_norm = np.linalg.norm(measured)
     # The starting conductivity is that with which the model's voltages fit the data best.
-    unit_voltages = np.where(used, model.voltages(1.0), 0)
+    unit_voltages = np.where(is_used, model.voltages(1.0), 0)
     if not (unit_voltages @ measured).real > 0:
         raise ValueError(
             "voltages: they have the opposite sign of the model's. Is the polarity of drive or measurement turned "
@@ -297,10 +300,10 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
         return np.concatenate([residuals.real, residuals.imag]) if is_complex else residuals
 
     def residual(parameters):
-        return real_and_imaginary_parts(np.where(used, problem.voltages(parameters) - measured, 0) / data_norm)
+        return real_and_imaginary_parts(np.where(is_used, problem.voltages(parameters) - measured, 0) / data_norm)
 
     def jacobian(parameters):
-        return real_and_imaginary_parts(np.where(used[:, None], problem.jacobian(parameters), 0) / data_norm)
+        return real_and_imaginary_parts(np.where(is_used[:, None], problem.jacobian(parameters), 0) / data_norm)
 
     tolerance = _TOLERANCE_LARGE_MESH if model.mesh.num_cells > _LARGE_MESH_CELLS else _TOLERANCE
     options: dict[str, Any] = {
@@ -387,22 +390,23 @@ class _CalibrationProblem:
         model, fields, impedance = self._fields(parameters)
         conductivity_derivative = -self.select(impedance)[:, None]
         if self.sensitivity is None:
-            return self._with_phase(conductivity_derivative, conductivity_derivative)
+            return self._add_phase_derivative(conductivity_derivative, conductivity_derivative)
         contact_derivatives = self.sensitivity(fields, impedance, model.electrodes.contact_impedance)
         contact_columns = np.stack([self.select(derivative) for derivative in contact_derivatives], axis=1)
         derivative_at_fixed_contact = conductivity_derivative + contact_columns.sum(
             axis=1, keepdims=True
         )  # z·σ is proportional to σ
         if self.contact == "fixed":
-            return self._with_phase(derivative_at_fixed_contact, derivative_at_fixed_contact)
+            return self._add_phase_derivative(derivative_at_fixed_contact, derivative_at_fixed_contact)
         chosen_contact_columns = (
             contact_columns if self.contact == "each" else contact_columns.sum(axis=1, keepdims=True)
         )
         return np.concatenate(
-            [self._with_phase(conductivity_derivative, derivative_at_fixed_contact), chosen_contact_columns], axis=1
+            [self._add_phase_derivative(conductivity_derivative, derivative_at_fixed_contact), chosen_contact_columns],
+            axis=1,
         )
 
-    def _with_phase(self, magnitude_derivative, derivative_at_fixed_contact):
+    def _add_phase_derivative(self, magnitude_derivative, derivative_at_fixed_contact):
         """Columns of the Jacobian: derivatives of the voltages with respect to log |γ| and, for a complex admittivity
         γ, with respect to its phase at fixed contact impedance."""
         return (

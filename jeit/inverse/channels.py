@@ -147,9 +147,11 @@ def relative_noise(
     """
     xp = namespace(voltages, mask)
     magnitude = abs(xp.asarray(voltages))
-    used = xp.isfinite(magnitude) if mask is None else xp.asarray(mask) & xp.isfinite(magnitude)
-    median_magnitude = xp.nanmedian(xp.where(used, magnitude, xp.nan))
-    return xp.where(used, relative * xp.sqrt(xp.where(used, magnitude, 0) ** 2 + (floor * median_magnitude) ** 2), 1.0)
+    is_used = xp.isfinite(magnitude) if mask is None else xp.asarray(mask) & xp.isfinite(magnitude)
+    median_magnitude = xp.nanmedian(xp.where(is_used, magnitude, xp.nan))
+    return xp.where(
+        is_used, relative * xp.sqrt(xp.where(is_used, magnitude, 0) ** 2 + (floor * median_magnitude) ** 2), 1.0
+    )
 
 
 def electrode_misfits(
@@ -161,9 +163,9 @@ def electrode_misfits(
     see `relative_noise`; `mask`: True for usable channels. The ratio is 1 for electrodes that no usable channel uses. A
     misfit far above 1 indicates an electrode whose gain, offset or position differs from the model's.
     """
-    used = np.asarray(mask)
-    reads_electrode = (np.asarray(protocol.channel_measurement) != 0) & used[:, None]
-    squared_sums = np.where(used, np.abs(np.asarray(residual) / np.asarray(noise)) ** 2, 0) @ reads_electrode
+    is_used = np.asarray(mask)
+    reads_electrode = (np.asarray(protocol.channel_measurement) != 0) & is_used[:, None]
+    squared_sums = np.where(is_used, np.abs(np.asarray(residual) / np.asarray(noise)) ** 2, 0) @ reads_electrode
     num_readings = reads_electrode.sum(axis=0)
     root_mean_squares = np.sqrt(squared_sums / np.maximum(num_readings, 1))
     median_misfit = np.median(root_mean_squares[num_readings > 0])
@@ -203,15 +205,15 @@ def repeated_noise(
     values = np.asarray(frames, float)
     if values.ndim != 2 or len(values) < 2:
         raise ValueError(f"frames has shape {values.shape}; give at least two repeated frames, (frames, channels).")
-    used = np.ones(values.shape, bool) if mask is None else np.asarray(mask)
-    if used.dtype != bool or used.shape not in (values.shape, values.shape[1:]):
+    is_used = np.ones(values.shape, bool) if mask is None else np.asarray(mask)
+    if is_used.dtype != bool or is_used.shape not in (values.shape, values.shape[1:]):
         raise ValueError(f"mask must be booleans of shape {values.shape} or {values.shape[1:]}.")
-    used = np.broadcast_to(used, values.shape)
-    if not np.isfinite(values[used]).all():
+    is_used = np.broadcast_to(is_used, values.shape)
+    if not np.isfinite(values[is_used]).all():
         raise ValueError("frames: some voltages in use are NaN or infinite; mask them.")
-    num_frames = used.sum(axis=0)
-    mean = np.where(used, values, 0).sum(axis=0) / np.maximum(num_frames, 1)
-    squares = np.where(used, (values - mean) ** 2, 0).sum(axis=0)
+    num_frames = is_used.sum(axis=0)
+    mean = np.where(is_used, values, 0).sum(axis=0) / np.maximum(num_frames, 1)
+    squares = np.where(is_used, (values - mean) ** 2, 0).sum(axis=0)
     has_variance = num_frames >= 2
     if not has_variance.any():
         raise ValueError("mask: it leaves no channel with two frames.")

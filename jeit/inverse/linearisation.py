@@ -120,9 +120,9 @@ class Linearisation(Module):
                 model, conductivity, channels, (root_weight[:, None] * directions).T
             )
             product = prior.covariance_product(model.mesh, reduced_jacobian.conj())
-            num_repeated = model.protocol.repeated_facts(channels)
+            num_redundant = model.protocol.repeated_facts(channels)
             null_space = prior.null_space(model.mesh)
-            spectrum = Spectrum.create(reduced_jacobian, product, null_space, as_array(directions), num_repeated)
+            spectrum = Spectrum.create(reduced_jacobian, product, null_space, as_array(directions), num_redundant)
         else:
             jacobian = model.jacobian(conductivity)
             directions = _traced_directions(model.protocol, channels, root_weight)
@@ -211,24 +211,24 @@ def used_channels(model: ForwardModel, noise, mask) -> tuple[np.ndarray, Float[A
     volts. Raises `ValueError` for an invalid mask or noise."""
     check_mask(mask)
     num_channels = model.protocol.num_measurements
-    used = np.ones(num_channels, bool) if mask is None else np.asarray(mask, bool)
-    if used.shape != (num_channels,) or not used.any():
+    is_used = np.ones(num_channels, bool) if mask is None else np.asarray(mask, bool)
+    if is_used.shape != (num_channels,) or not is_used.any():
         raise ValueError(f"mask must be ({num_channels},) booleans with at least one True: one for each channel.")
     deviation = np.asarray(noise, float) if has_values(noise) else jnp.asarray(noise, float)
     if deviation.shape not in ((), (num_channels,)):
         raise ValueError(
             f"noise has shape {deviation.shape}; give one number, or one for each channel: ({num_channels},)."
         )
-    deviation = namespace(deviation).broadcast_to(deviation, (num_channels,))[used]
+    deviation = namespace(deviation).broadcast_to(deviation, (num_channels,))[is_used]
     if has_values(deviation) and not (np.isfinite(deviation) & (deviation > 0)).all():
         raise ValueError("noise must be positive and finite for every channel in use.")
-    return np.flatnonzero(used), 1 / deviation
+    return np.flatnonzero(is_used), 1 / deviation
 
 
 def check_mask(mask) -> None:
     """Raise `ValueError` for a traced mask, because the number of channels in use must be known."""
-    advice = "give it as an array of NumPy, outside; to weigh channels by what is traced, give noise"
-    check_has_values("mask", mask, "which channels are used depends on", advice)
+    remedy = "give it as an array of NumPy, outside; to weigh channels by what is traced, give noise"
+    check_has_values("mask", mask, "which channels are used depends on", remedy)
 
 
 def data_directions(protocol: Protocol, channels, root_weight) -> Float[np.ndarray, "K r"]:

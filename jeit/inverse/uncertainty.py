@@ -162,17 +162,17 @@ def posterior(reconstruction: Reconstruction) -> Posterior:
     # Compilation takes seconds, and for a solid body compiled programs would store several copies of the Jacobian.
     with np.errstate(all="ignore"):
         host_inversion, host_coefficients = on_host((inversion, coefficients))
-        jacobian, cross, data_covariance, normal = _data_space_matrices(host_inversion, host_coefficients)
-        root = scipy.linalg.inv(np.linalg.cholesky(data_covariance))
-    return Posterior(host_inversion, host_coefficients, jacobian, root, cross, normal)
+        jacobian, cross_covariance, data_covariance, normal = _data_space_matrices(host_inversion, host_coefficients)
+        inverse_root = scipy.linalg.inv(np.linalg.cholesky(data_covariance))
+    return Posterior(host_inversion, host_coefficients, jacobian, inverse_root, cross_covariance, normal)
 
 
 @eqx.filter_jit
 def _compute_posterior(inversion: Inversion, coefficients) -> Posterior:
-    jacobian, cross, data_covariance, normal = _data_space_matrices(inversion, coefficients)
+    jacobian, cross_covariance, data_covariance, normal = _data_space_matrices(inversion, coefficients)
     lower_factor = jnp.linalg.cholesky(data_covariance)
-    root = jax.scipy.linalg.solve_triangular(lower_factor, jnp.eye(len(lower_factor)), lower=True)
-    return Posterior(inversion, coefficients, jacobian, root, cross, normal)
+    inverse_root = jax.scipy.linalg.solve_triangular(lower_factor, jnp.eye(len(lower_factor)), lower=True)
+    return Posterior(inversion, coefficients, jacobian, inverse_root, cross_covariance, normal)
 
 
 def _data_space_matrices(inversion: Inversion, coefficients):
@@ -184,8 +184,8 @@ def _data_space_matrices(inversion: Inversion, coefficients):
             "upper) in place of bounds."
         )
     _, jacobian = inversion.linearise(coefficients)
-    cross = normal.covariance_product(jacobian.T).T
-    return jacobian, cross, cross @ jacobian.T + inversion.data.covariance, normal
+    cross_covariance = normal.covariance_product(jacobian.T).T
+    return jacobian, cross_covariance, cross_covariance @ jacobian.T + inversion.data.covariance, normal
 
 
 @either_engine
@@ -200,15 +200,17 @@ def _sample_estimates(posterior: Posterior):
     basis, xp = inversion.basis, namespace(posterior)
     estimate, num_basis = inversion.estimate(coefficients), basis.num_coefficients
     # An unknown changes the image linearly or not at all.
-    unknown_indicators = [np.arange(len(coefficients)) == index for index in range(num_basis, len(coefficients))]
+    unknown_indicators = [
+        np.arange(len(coefficients)) == coefficient_index for coefficient_index in range(num_basis, len(coefficients))
+    ]
     unknown_images = [inversion.estimate(coefficients + indicator) - estimate for indicator in unknown_indicators]
     variance = posterior.prior.variance(basis) + sum(image**2 for image in unknown_images)
     num_rows = len(posterior.root)
     for start in range(0, num_rows, _ROWS_AT_ONCE):
         gain = posterior.root[start : start + _ROWS_AT_ONCE] @ posterior.cross
         row_images = expand_rows(basis, gain[:, :num_basis])
-        for index, image in enumerate(unknown_images):
-            row_images = row_images + gain[:, num_basis + index, None] * image
+        for coefficient_index, image in enumerate(unknown_images):
+            row_images = row_images + gain[:, num_basis + coefficient_index, None] * image
         variance = variance - (row_images**2).sum(axis=0)
     return estimate, xp.sqrt(xp.maximum(variance, 0))
 
@@ -219,7 +221,9 @@ def _weighted_mean(posterior: Posterior, weight):
     inversion, coefficients, xp = posterior.inversion, posterior.coefficients, namespace(posterior, weight)
     estimate, num_basis = inversion.estimate(coefficients), inversion.basis.num_coefficients
     slope = weight * inversion.link.slope(estimate)
-    unknown_indicators = [np.arange(len(coefficients)) == index for index in range(num_basis, len(coefficients))]
+    unknown_indicators = [
+        np.arange(len(coefficients)) == coefficient_index for coefficient_index in range(num_basis, len(coefficients))
+    ]
     unknown_slopes = [
         slope @ (inversion.estimate(coefficients + indicator) - estimate) for indicator in unknown_indicators
     ]
@@ -233,10 +237,10 @@ def _weighted_mean(posterior: Posterior, weight):
 def _draw_samples(posterior: Posterior, prior_draws, noise_draws):
     """Sample conductivities from the posterior: c = ĉ + z - Q⁻¹Jᵀ(JQ⁻¹Jᵀ + C)⁻¹(Jz + e), where z is drawn from the
     prior and e from the noise."""
-    inversion, root, xp = posterior.inversion, posterior.root, namespace(posterior, prior_draws)
+    inversion, inverse_root, xp = posterior.inversion, posterior.root, namespace(posterior, prior_draws)
     prior_samples = posterior.prior.drawn(prior_draws.T).T
     data_samples = prior_samples @ posterior.jacobian.T + noise_draws @ xp.linalg.cholesky(inversion.data.covariance).T
-    samples = prior_samples - (data_samples @ root.T @ root) @ posterior.cross
+    samples = prior_samples - (data_samples @ inverse_root.T @ inverse_root) @ posterior.cross
     return xp.stack([inversion.conductivity(sample) for sample in posterior.coefficients + samples])
 
 

@@ -88,7 +88,7 @@ def read_table(path: Path, length_columns: Sequence[str]) -> LayoutTable:
     and "diameter"; the title of each column states its unit. Raises `ValueError` for a table with other columns or
     invalid values."""
     lines = _read_lines(path, length_columns)
-    delimiter = next((mark for mark in ";\t" if mark in lines[0][1]), ",")
+    delimiter = next((separator for separator in ";\t" if separator in lines[0][1]), ",")
     (_, header), *rows = [(number, _split_cells(line, delimiter)) for number, line in lines]
     columns = _find_columns(header, length_columns)
     check_electrodes("the table", len(rows))
@@ -96,13 +96,18 @@ def read_table(path: Path, length_columns: Sequence[str]) -> LayoutTable:
         raise ValueError("there is no electrode below the names of the columns.")
     for number, row in rows:
         if len(row) != len(header):
-            hint = " Write decimals with a point, or separate columns by semicolons." if delimiter == "," else ""
-            raise ValueError(f"line {number} has {len(row)} values for {len(header)} columns.{hint}")
+            decimal_hint = (
+                " Write decimals with a point, or separate columns by semicolons." if delimiter == "," else ""
+            )
+            raise ValueError(f"line {number} has {len(row)} values for {len(header)} columns.{decimal_hint}")
 
     def numbers(name: str) -> np.ndarray:
-        place, unit = columns[name]
+        column_index, unit = columns[name]
         return unit * np.array(
-            [_parse_number(row[place], delimiter, f"line {at}: {header[place]}") for at, row in rows]
+            [
+                _parse_number(row[column_index], delimiter, f"line {line_number}: {header[column_index]}")
+                for line_number, row in rows
+            ]
         )
 
     lengths = {name: numbers(name) for name in length_columns}
@@ -111,7 +116,7 @@ def read_table(path: Path, length_columns: Sequence[str]) -> LayoutTable:
         if values is not None and values.min() <= 0:
             raise ValueError(f"line {rows[int(values.argmin())][0]}: {name} is not positive.")
     labels = (
-        [row[columns[_LABEL_COLUMN][0]] or str(index + 1) for index, (_, row) in enumerate(rows)]
+        [row[columns[_LABEL_COLUMN][0]] or str(row_index + 1) for row_index, (_, row) in enumerate(rows)]
         if _LABEL_COLUMN in columns
         else None
     )
@@ -157,7 +162,7 @@ def _find_columns(header: list[str], length_columns: Sequence[str]) -> dict[str,
     """Index and unit (in metres) of every column of a table, by name. Raises `ValueError` for columns that are missing,
     unknown, repeated, or do not state their unit."""
     columns: dict[str, tuple[int, float]] = {}
-    for index, title in enumerate(header):
+    for column_index, title in enumerate(header):
         length = _LENGTH_TITLE.fullmatch(title.lower())
         name = length[1] if length else title.lower()
         if name in length_columns and not length:
@@ -172,7 +177,7 @@ def _find_columns(header: list[str], length_columns: Sequence[str]) -> dict[str,
             )
         if name in columns:
             raise ValueError(f"there are two columns for {name}; keep one.")
-        columns[name] = (index, _UNITS[length[2]] if length else 1.0)
+        columns[name] = (column_index, _UNITS[length[2]] if length else 1.0)
     missing_columns = [name for name in length_columns if name not in columns]
     if missing_columns:
         raise ValueError(
@@ -183,8 +188,8 @@ def _find_columns(header: list[str], length_columns: Sequence[str]) -> dict[str,
 
 
 def _header_example(length_columns: Sequence[str]) -> str:
-    first = ", ".join(f"{name}_mm" for name in length_columns)
-    return f"{first} and, if wanted, {_LABEL_COLUMN} and {_IMPEDANCE_COLUMN}"
+    first_columns = ", ".join(f"{name}_mm" for name in length_columns)
+    return f"{first_columns} and, if wanted, {_LABEL_COLUMN} and {_IMPEDANCE_COLUMN}"
 
 
 def _parse_number(cell: str, delimiter: str, cell_name: str) -> float:

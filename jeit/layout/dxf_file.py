@@ -53,13 +53,13 @@ class _DxfPen:
     """Pen that draws circles and polygons on one layer of a DXF drawing."""
 
     def __init__(self, space: Any, layer: str):
-        self.space, self.on = space, {"layer": layer}
+        self.space, self.layer_attributes = space, {"layer": layer}
 
     def circle(self, centre: Any, radius: float) -> None:
-        self.space.add_circle(1e3 * np.asarray(centre), 1e3 * radius, dxfattribs=self.on)
+        self.space.add_circle(1e3 * np.asarray(centre), 1e3 * radius, dxfattribs=self.layer_attributes)
 
     def loop(self, vertices: np.ndarray) -> None:
-        self.space.add_lwpolyline(1e3 * vertices, close=True, dxfattribs=self.on)
+        self.space.add_lwpolyline(1e3 * vertices, close=True, dxfattribs=self.layer_attributes)
 
 
 class _Entity(NamedTuple):
@@ -67,10 +67,10 @@ class _Entity(NamedTuple):
 
     kind: str
     circle: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    place: tuple[float, float] = (0.0, 0.0)
+    position: tuple[float, float] = (0.0, 0.0)
     text: str = ""
     loop: Any = None
-    arcs: bool = False
+    has_arcs: bool = False
     closed: bool = False
 
 
@@ -102,11 +102,11 @@ def read_dxf(path: Path, outline: Domain | None) -> Layout:
     circles = np.array([_circle_of_entity(entity) for entity in entities[_ELECTRODE_LAYER]]) * unit
     centres, radii = circles[:, :2], circles[:, 2]
     texts = [entity for entity in entities[_LABEL_LAYER] if entity.kind == "TEXT"]
-    text_positions = np.array([entity.place for entity in texts]).reshape(-1, 2) * unit
+    text_positions = np.array([entity.position for entity in texts]).reshape(-1, 2) * unit
     labels = []
     for electrode, (centre, radius) in enumerate(zip(centres, radii, strict=True), start=1):
-        inside = np.linalg.norm(centre - text_positions, axis=-1) <= radius
-        electrode_labels = [texts[index].text for index in np.flatnonzero(inside)]
+        is_inside = np.linalg.norm(centre - text_positions, axis=-1) <= radius
+        electrode_labels = [texts[index].text for index in np.flatnonzero(is_inside)]
         if len(electrode_labels) > 1:
             raise ValueError(f"electrode {electrode} has several labels: {names_text(map(repr, electrode_labels))}.")
         labels += electrode_labels or [str(electrode)]
@@ -123,11 +123,11 @@ def _convert_entity(entity, decode: Callable[[str], str]) -> _Entity:
         return _Entity(kind, circle=(x, y, float(entity.dxf.radius)))
     if kind == "TEXT":
         x, y, _ = entity.ocs().to_wcs(entity.get_placement()[1])
-        return _Entity(kind, place=(x, y), text=decode(entity.dxf.text).strip())
+        return _Entity(kind, position=(x, y), text=decode(entity.dxf.text).strip())
     if kind in ("LWPOLYLINE", "POLYLINE"):
         points = entity.vertices_in_wcs() if kind == "LWPOLYLINE" else entity.points_in_wcs()
         loop = np.array([(x, y) for x, y, _ in points]).reshape(-1, 2)
-        return _Entity(kind, loop=loop, arcs=bool(entity.has_arc), closed=bool(entity.is_closed))
+        return _Entity(kind, loop=loop, has_arcs=bool(entity.has_arc), closed=bool(entity.is_closed))
     return _Entity(kind)
 
 
@@ -156,13 +156,13 @@ def _outline_of_entities(entities: list[_Entity], unit: float) -> Domain | None:
 def _polyline_vertices(entity: _Entity) -> np.ndarray:
     """Vertices (k, 2) of a closed polyline with straight sides, in the unit of the drawing. Raises `ValueError` for
     other entities."""
-    advice = f"on the layer {_OUTLINE_LAYER}; draw closed polylines of straight sides, or one circle."
+    remedy = f"on the layer {_OUTLINE_LAYER}; draw closed polylines of straight sides, or one circle."
     if entity.loop is None:
-        raise ValueError(f"there is a {entity.kind[:40]} {advice}")
-    if entity.arcs:
-        raise ValueError(f"there is a polyline with arcs {advice}")
+        raise ValueError(f"there is a {entity.kind[:40]} {remedy}")
+    if entity.has_arcs:
+        raise ValueError(f"there is a polyline with arcs {remedy}")
     loop = entity.loop
-    closes = len(loop) > 3 and np.allclose(loop[0], loop[-1], rtol=0, atol=1e-9 * np.ptp(loop))
-    if not (entity.closed or closes):
-        raise ValueError(f"there is an open polyline {advice}")
-    return loop[:-1] if closes else loop
+    is_closing = len(loop) > 3 and np.allclose(loop[0], loop[-1], rtol=0, atol=1e-9 * np.ptp(loop))
+    if not (entity.closed or is_closing):
+        raise ValueError(f"there is an open polyline {remedy}")
+    return loop[:-1] if is_closing else loop

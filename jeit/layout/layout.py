@@ -111,8 +111,8 @@ class Layout(Module):
         self.labels = check_labels(labels, number)
         self.name = name
         if has_values(self.centres, self.diameters, outline):
-            called = [f"electrode {index + 1} ('{label}')" for index, label in enumerate(self.labels)]
-            check_discs_fit(np.asarray(self.centres), np.asarray(self.diameters), outline, called)
+            electrode_texts = [f"electrode {index + 1} ('{label}')" for index, label in enumerate(self.labels)]
+            check_discs_fit(np.asarray(self.centres), np.asarray(self.diameters), outline, electrode_texts)
 
     @property
     def num_electrodes(self) -> int:
@@ -165,27 +165,28 @@ def check_discs_fit(
     gaps = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
     np.fill_diagonal(gaps, np.inf)
     if gaps.min() < -_ROUNDING:
-        first, second = map(int, np.unravel_index(gaps.argmin(), gaps.shape))
-        is_same_place = np.linalg.norm(centres[first] - centres[second]) < _ROUNDING
+        first_electrode, second_electrode = map(int, np.unravel_index(gaps.argmin(), gaps.shape))
+        is_same_place = np.linalg.norm(centres[first_electrode] - centres[second_electrode]) < _ROUNDING
         fault = "are at the same place" if is_same_place else f"overlap by {-1e3 * gaps.min():.3g} mm"
         raise ValueError(
-            f"centres: {disc_names[first]} and {disc_names[second]} {fault}; remove one or move them apart."
+            f"centres: {disc_names[first_electrode]} and {disc_names[second_electrode]} {fault}; remove one or "
+            "move them apart."
         )
     if outline is None:
         return
     clearances = np.asarray(outline.signed_distance(centres)) - diameters / 2
-    index = int(clearances.argmin())
-    if clearances[index] < -_ROUNDING:
-        hint = ""
+    electrode_index = int(clearances.argmin())
+    if clearances[electrode_index] < -_ROUNDING:
+        unit_hint = ""
         if (np.abs(centres) > MAX_SKIN_SIZE).any() and bool((outline.signed_distance(centres / 1000) > 0).all()):
-            hint = " Are they in millimetres? Divide by 1000."
-        elif diameters[index] > size:
-            hint = " Is its diameter in metres?"
-        x, y = 1e3 * centres[index]
+            unit_hint = " Are they in millimetres? Divide by 1000."
+        elif diameters[electrode_index] > size:
+            unit_hint = " Is its diameter in metres?"
+        x, y = 1e3 * centres[electrode_index]
         raise ValueError(
-            f"centres: {disc_names[index]}, {1e3 * diameters[index]:g} mm across at ({x:g}, {y:g}) mm, reaches "
-            f"{-1e3 * clearances[index]:.3g} mm beyond the outline, which spans {1e3 * x_min:g} to {1e3 * x_max:g} "
-            f"mm by {1e3 * y_min:g} to {1e3 * y_max:g} mm.{hint}"
+            f"centres: {disc_names[electrode_index]}, {1e3 * diameters[electrode_index]:g} mm across at ({x:g}, {y:g}) "
+            f"mm, reaches {-1e3 * clearances[electrode_index]:.3g} mm beyond the outline, which spans {1e3 * x_min:g} "
+            f"to {1e3 * x_max:g} mm by {1e3 * y_min:g} to {1e3 * y_max:g} mm.{unit_hint}"
         )
 
 

@@ -163,13 +163,13 @@ def quasi_uniform(domain: Domain, num_electrodes: int, *, margin: float = 0.0, i
         distance = np.minimum(distance, np.sum((samples - position[-1]) ** 2, axis=1))
         position = np.vstack([position, samples[distance.argmax()]])
     for _ in range(iterations):
-        owner = KDTree(position).query(samples)[1]
-        count = np.bincount(owner, minlength=num_electrodes)
-        total = np.stack([np.bincount(owner, samples[:, k], num_electrodes) for k in range(2)], axis=1)
-        moved = np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None], position)
-        if np.abs(moved - position).max() < 1e-3 * spacing:
+        nearest_electrodes = KDTree(position).query(samples)[1]
+        count = np.bincount(nearest_electrodes, minlength=num_electrodes)
+        total = np.stack([np.bincount(nearest_electrodes, samples[:, k], num_electrodes) for k in range(2)], axis=1)
+        moved_positions = np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None], position)
+        if np.abs(moved_positions - position).max() < 1e-3 * spacing:
             break
-        position = moved
+        position = moved_positions
     return position
 
 
@@ -263,8 +263,8 @@ def same_outline(outline: Domain | None, other_outline: Domain) -> bool:
 def _park_centres(name: str) -> np.ndarray:
     if name == "park-inner":
         return quasi_uniform(Rectangle(_PARK_SIDE, _PARK_SIDE), 32)
-    inset = DIAMETER + 2 * _PARK_EDGE_DISTANCE
-    track = Rectangle(_PARK_SIDE - inset, _PARK_SIDE - inset)
+    edge_distance = DIAMETER + 2 * _PARK_EDGE_DISTANCE
+    track = Rectangle(_PARK_SIDE - edge_distance, _PARK_SIDE - edge_distance)
     pitch = track.perimeter / 32
     return np.asarray(track.boundary(pitch * (np.arange(32) + 0.5)))
 
@@ -289,22 +289,22 @@ def _grid_centres(name: str, outline: Domain, diameter: float, columns: int, row
             f"{1e3 * diameter:g} mm across: they would overlap by {1e3 * (diameter - min(pitches)):.3g} mm; give "
             "fewer, or move them apart."
         )
-    middle = (x_min + x_max) / 2, (y_min + y_max) / 2
-    return grid(x_max - x_min - pitches[0], y_max - y_min - pitches[1], columns, rows, centre=middle)
+    centre = (x_min + x_max) / 2, (y_min + y_max) / 2
+    return grid(x_max - x_min - pitches[0], y_max - y_min - pitches[1], columns, rows, centre=centre)
 
 
 def _perimeter_centres(name: str, outline: Domain, diameter: float, number: int) -> np.ndarray:
     if not isinstance(outline, Disk | Rectangle):
         raise ValueError(f"name: {name!r} is of rectangles and disks, and this skin is neither; take inner-N.")
     x_min, x_max, y_min, y_max = outline.extent
-    width, height, inset = x_max - x_min, y_max - y_min, diameter + 2 * _PARK_EDGE_DISTANCE
-    if inset >= min(width, height):
+    width, height, edge_distance = x_max - x_min, y_max - y_min, diameter + 2 * _PARK_EDGE_DISTANCE
+    if edge_distance >= min(width, height):
         raise ValueError(
             f"name: electrodes {1e3 * diameter:g} mm across do not fit around the edge; make them smaller."
         )
     if isinstance(outline, Disk):
-        return perimeter(Disk(outline.radius - inset / 2, outline.centre), number)
-    track = Rectangle(width - inset, height - inset, outline.centre)
+        return perimeter(Disk(outline.radius - edge_distance / 2, outline.centre), number)
+    track = Rectangle(width - edge_distance, height - edge_distance, outline.centre)
     return perimeter(track, number, start=track.perimeter / number / 2 if number else 0.0)
 
 

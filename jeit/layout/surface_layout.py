@@ -72,14 +72,14 @@ def spread(
     geodesics = Geodesics.create(triangles)
     position = triangles.points[_initial_nodes(geodesics, usable, weight, number)]
     for _ in range(iterations):
-        owner = (
+        nearest_electrodes = (
             geodesics.owners(position)[0]
             if number <= _MAX_GEODESIC_POSITIONS
             else _nearest_positions(triangles, position)
         )[usable]
-        position_weights = np.bincount(owner, weight[usable], number)
+        position_weights = np.bincount(nearest_electrodes, weight[usable], number)
         centroid_sums = np.stack(
-            [np.bincount(owner, weight[usable] * x, number) for x in triangles.points[usable].T], axis=1
+            [np.bincount(nearest_electrodes, weight[usable] * x, number) for x in triangles.points[usable].T], axis=1
         )
         new_positions = np.where(
             position_weights[:, None] > 0, centroid_sums / np.maximum(position_weights, 1e-300)[:, None], position
@@ -191,7 +191,7 @@ class SurfaceLayout(Module):
             triangles = Triangles.of(surface)
             check_on_surface(self.centres, self.diameters / 2, triangles)
             self.centres = as_array(triangles.nearest(self.centres).points)
-            _check_apart(np.asarray(self.centres), np.asarray(self.diameters), self.labels)
+            _check_no_overlap(np.asarray(self.centres), np.asarray(self.diameters), self.labels)
 
     @classmethod
     def spread(
@@ -244,16 +244,17 @@ class SurfaceLayout(Module):
         return (SurfaceDiscs if sheet else FaceDiscs)(self.centres, self.diameters / 2, impedance)
 
 
-def _check_apart(centres: np.ndarray, diameters: np.ndarray, labels: Sequence[str]) -> None:
+def _check_no_overlap(centres: np.ndarray, diameters: np.ndarray, labels: Sequence[str]) -> None:
     """Raise `ValueError` for discs that overlap. Straight-line distances are used, since for discs that overlap they
     hardly differ from distances along the surface."""
     gaps = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
     np.fill_diagonal(gaps, np.inf)
     if gaps.min() < -_ROUNDING:
-        first, second = map(int, np.unravel_index(gaps.argmin(), gaps.shape))
+        first_electrode, second_electrode = map(int, np.unravel_index(gaps.argmin(), gaps.shape))
         raise ValueError(
-            f"centres: electrode {first + 1} ('{labels[first]}') and electrode {second + 1} ('{labels[second]}') "
-            f"overlap by {-1e3 * gaps.min():.3g} mm; remove one or move them apart."
+            f"centres: electrode {first_electrode + 1} ('{labels[first_electrode]}') and electrode "
+            f"{second_electrode + 1} ('{labels[second_electrode]}') overlap by "
+            f"{-1e3 * gaps.min():.3g} mm; remove one or move them apart."
         )
 
 

@@ -25,14 +25,14 @@ MAX_NUMBER = 1e30
 ROUND_TAGS = ("circle", "ellipse")
 
 
-def transform_of(element: ElementTree.Element) -> np.ndarray:
+def read_transform(element: ElementTree.Element) -> np.ndarray:
     """Matrix (2, 3) of the transform of an SVG element. Raises `ValueError` for a transform that cannot be read."""
     text, matrix = element.get("transform", "").strip(), np.eye(2, 3)
     if re.fullmatch(r"(\w++\s*+\([^()]*+\)[\s,]*+)*+", text) is None:
         raise ValueError(f"transform of {describe_element(element)} is {describe(text)}, not a list of transforms.")
     for kind, argument_text in re.findall(r"(\w+)\s*\(([^()]*)\)", text):
         numbers = [
-            number_of(element, "transform", number_text)
+            parse_number(element, "transform", number_text)
             for number_text in re.split(r"[\s,]+", argument_text.strip())
             if number_text
         ]
@@ -58,9 +58,9 @@ def transform_of(element: ElementTree.Element) -> np.ndarray:
     return matrix
 
 
-def compose_transforms(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
-    """Matrix (2, 3) that applies the transform `inner`, then `outer`."""
-    return outer[:, :2] @ inner + np.column_stack([np.zeros((2, 2)), outer[:, 2]])
+def compose_transforms(outer_transform: np.ndarray, inner_transform: np.ndarray) -> np.ndarray:
+    """Matrix (2, 3) that applies the transform `inner_transform`, then `outer_transform`."""
+    return outer_transform[:, :2] @ inner_transform + np.column_stack([np.zeros((2, 2)), outer_transform[:, 2]])
 
 
 def transform_points(points, matrix: np.ndarray) -> np.ndarray:
@@ -68,7 +68,7 @@ def transform_points(points, matrix: np.ndarray) -> np.ndarray:
     return np.asarray(points, float).reshape(-1, 2) @ matrix[:, :2].T + matrix[:, 2]
 
 
-def tag_of(element: ElementTree.Element) -> str:
+def local_tag(element: ElementTree.Element) -> str:
     """Tag of an SVG element without its namespace, such as "circle"."""
     return element.tag.split("}")[-1]
 
@@ -76,13 +76,13 @@ def tag_of(element: ElementTree.Element) -> str:
 def describe_element(element: ElementTree.Element) -> str:
     """Text that names an SVG element in error messages."""
     return (
-        f"<{tag_of(element)[:20]} id={describe(element.get('id'))}>"
+        f"<{local_tag(element)[:20]} id={describe(element.get('id'))}>"
         if "id" in element.attrib
-        else f"a <{tag_of(element)[:20]}>"
+        else f"a <{local_tag(element)[:20]}>"
     )
 
 
-def number_of(element: ElementTree.Element, name: str, text: str | None) -> float:
+def parse_number(element: ElementTree.Element, name: str, text: str | None) -> float:
     """Convert `text`, the value of the attribute `name`, to a number. Raises `ValueError` if `text` is not a number."""
     if text is None or re.fullmatch(NUMBER, text.strip()) is None:
         raise ValueError(f"{name} of {describe_element(element)} is {describe(text)}, not a number.")
@@ -92,14 +92,14 @@ def number_of(element: ElementTree.Element, name: str, text: str | None) -> floa
     return value
 
 
-def disc_of(element: ElementTree.Element, matrix: np.ndarray) -> tuple[float, float, float]:
+def read_disc(element: ElementTree.Element, matrix: np.ndarray) -> tuple[float, float, float]:
     """Centre and radius of a circle in metres, with y up. `matrix`: matrix (2, 3) to metres. Raises `ValueError` if the
     element is not a circle."""
-    if tag_of(element) not in ROUND_TAGS:
+    if local_tag(element) not in ROUND_TAGS:
         raise ValueError(f"{describe_element(element)} stands where a circle should: electrodes are circles.")
-    x, y = (number_of(element, name, element.get(name, "0")) for name in ("cx", "cy"))
-    names = ("r", "r") if tag_of(element) == "circle" else ("rx", "ry")
-    radii = [number_of(element, name, element.get(name)) for name in names]
+    x, y = (parse_number(element, name, element.get(name, "0")) for name in ("cx", "cy"))
+    names = ("r", "r") if local_tag(element) == "circle" else ("rx", "ry")
+    radii = [parse_number(element, name, element.get(name)) for name in names]
     half_axes = np.linalg.svd(matrix[:, :2] * radii, compute_uv=False)
     if half_axes[0] > half_axes[1] * (1 + 1e-3):
         raise ValueError(
@@ -110,18 +110,20 @@ def disc_of(element: ElementTree.Element, matrix: np.ndarray) -> tuple[float, fl
     return float(centre[0]), float(centre[1]), float(half_axes.mean())
 
 
-def loops_of(element: ElementTree.Element) -> list[np.ndarray]:
+def read_loops(element: ElementTree.Element) -> list[np.ndarray]:
     """Vertices (k, 2) of each loop of a closed shape with straight sides, in the units of the element. Raises
     `ValueError` for other shapes."""
-    tag = tag_of(element)
+    tag = local_tag(element)
     if tag == "rect":
-        x, y = (number_of(element, name, element.get(name, "0")) for name in ("x", "y"))
-        width, height = (number_of(element, name, element.get(name)) for name in ("width", "height"))
-        if any(number_of(element, name, element.get(name, "0")) for name in ("rx", "ry")):
+        x, y = (parse_number(element, name, element.get(name, "0")) for name in ("x", "y"))
+        width, height = (parse_number(element, name, element.get(name)) for name in ("width", "height"))
+        if any(parse_number(element, name, element.get(name, "0")) for name in ("rx", "ry")):
             raise ValueError(f"{describe_element(element)} has round corners; draw the skin with straight sides.")
         return [np.array([[x, y], [x + width, y], [x + width, y + height], [x, y + height]])]
     if tag in ("polygon", "polyline"):
-        values = [number_of(element, "points", text) for text in re.split(r"[\s,]+", element.get("points", "").strip())]
+        values = [
+            parse_number(element, "points", text) for text in re.split(r"[\s,]+", element.get("points", "").strip())
+        ]
         if len(values) % 2:
             raise ValueError(f"points of {describe_element(element)} are {len(values)} numbers, not pairs.")
         return [_closed_loop(element, np.array(values).reshape(-1, 2), tag == "polygon")]
@@ -137,27 +139,29 @@ def _path_loops(element: ElementTree.Element) -> list[np.ndarray]:
     if re.fullmatch(rf"(?:[MmLlHhVvZz]|{NUMBER}|[\s,])*+", text) is None or not text.strip():
         raise ValueError(f"{describe_element(element)} has curves, or is no path; draw the skin with straight sides.")
     loops: list[tuple[list[np.ndarray], bool]] = []
-    place = np.zeros(2)
-    for letter, inside in re.findall(r"([MmLlHhVvZz])([^MmLlHhVvZz]*)", text):
-        numbers = [number_of(element, "d", number) for number in re.findall(NUMBER, inside)]
+    position = np.zeros(2)
+    for letter, argument_text in re.findall(r"([MmLlHhVvZz])([^MmLlHhVvZz]*)", text):
+        numbers = [parse_number(element, "d", number) for number in re.findall(NUMBER, argument_text)]
         kind, relative = letter.upper(), letter.islower()
         size = {"H": 1, "V": 1}.get(kind, 2)
         if kind == "Z" and loops:
             loops[-1] = (loops[-1][0], True)
-            place = loops[-1][0][0]
+            position = loops[-1][0][0]
             continue
         if kind == "Z" or not numbers or len(numbers) % size or (kind != "M" and not loops):
-            raise ValueError(f"d of {describe_element(element)} is not a path: {letter}{inside.strip()[:40]}.")
+            raise ValueError(f"d of {describe_element(element)} is not a path: {letter}{argument_text.strip()[:40]}.")
         for index in range(0, len(numbers), size):
-            origin = place if relative else np.array({"H": [0, place[1]], "V": [place[0], 0]}.get(kind, [0, 0]))
+            origin = (
+                position if relative else np.array({"H": [0, position[1]], "V": [position[0], 0]}.get(kind, [0, 0]))
+            )
             step = {"H": [numbers[index], 0], "V": [0, numbers[index]]}.get(kind, numbers[index : index + 2])
-            start, place = place, origin + np.array(step)
+            start, position = position, origin + np.array(step)
             if kind == "M" and index == 0:
-                loops.append(([place], False))
+                loops.append(([position], False))
             else:  # a line after Z without M starts a new loop where the closed loop began
                 if loops[-1][1]:
                     loops.append(([start], False))
-                loops[-1][0].append(place)
+                loops[-1][0].append(position)
     return [_closed_loop(element, np.array(points), closed) for points, closed in loops]
 
 
@@ -187,23 +191,23 @@ def write_svg(layout: Layout, file: BinaryIO) -> None:
     view_left, view_top = millimetres(x_min - _MARGIN), millimetres(-y_max - _MARGIN)
     width, height = millimetres(x_max - x_min + 2 * _MARGIN), millimetres(y_max - y_min + 2 * _MARGIN)
     size = {"width": f"{width}mm", "height": f"{height}mm", "viewBox": f"{view_left} {view_top} {width} {height}"}
-    root = ElementTree.Element("svg", {"xmlns": _SVG_NAMESPACE, **size})
-    _add_element(root, "title").text = layout.name
+    root_element = ElementTree.Element("svg", {"xmlns": _SVG_NAMESPACE, **size})
+    _add_element(root_element, "title").text = layout.name
     line_style = {"fill": "none", "stroke-width": "0.1"}
-    group = _add_element(root, "g", id="OUTLINE", stroke="#ff0000", **line_style)
+    group = _add_element(root_element, "g", id="OUTLINE", stroke="#ff0000", **line_style)
     if layout.outline is not None:
         layout.outline.draw(_SvgPen(group))
-    group = _add_element(root, "g", id="ELECTRODES", stroke="#0000ff", **line_style)
+    group = _add_element(root_element, "g", id="ELECTRODES", stroke="#0000ff", **line_style)
     text_style = {"text-anchor": "middle", "dominant-baseline": "central", "font-family": "sans-serif"}
-    label_group = _add_element(root, "g", id="LABELS", fill="#808080", **text_style)
+    label_group = _add_element(root_element, "g", id="LABELS", fill="#808080", **text_style)
     centres, diameters = np.asarray(layout.centres), np.asarray(layout.diameters)
     for centre, diameter, label in zip(centres, diameters, layout.labels, strict=True):
         circle = _add_circle(centre, diameter)
         _add_element(group, "circle", **circle)
         text_position = {"x": circle["cx"], "y": circle["cy"], "font-size": str(millimetres(float(diameter) / 3))}
         _add_element(label_group, "text", **text_position).text = label
-    ElementTree.indent(root)
-    ElementTree.ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)
+    ElementTree.indent(root_element)
+    ElementTree.ElementTree(root_element).write(file, encoding="utf-8", xml_declaration=True)
 
 
 def read_svg(path: Path, outline: Domain | None) -> Layout:
@@ -219,20 +223,20 @@ def read_svg(path: Path, outline: Domain | None) -> Layout:
     labels = [
         "".join(element.itertext()).strip()
         for element, role, _ in shapes
-        if role == "LABELS" and tag_of(element) == "text"
+        if role == "LABELS" and local_tag(element) == "text"
     ]
     electrode_role = "ELECTRODES" if "ELECTRODES" in roles else None
     electrodes = [
         (element, matrix)
         for element, role, matrix in shapes
-        if role == electrode_role and (electrode_role or tag_of(element) in ROUND_TAGS)
+        if role == electrode_role and (electrode_role or local_tag(element) in ROUND_TAGS)
     ]
     if not electrodes:
         raise ValueError("there is no circle in the drawing; electrodes are circles, in a group ELECTRODES or all.")
     check_electrodes("the drawing", len(electrodes))
-    circles = np.array([disc_of(element, matrix) for element, matrix in electrodes])
+    circles = np.array([read_disc(element, matrix) for element, matrix in electrodes])
     drawn_outline = (
-        _outline_of_shapes([(element, matrix) for element, role, matrix in shapes if role == "OUTLINE"])
+        _create_outline([(element, matrix) for element, role, matrix in shapes if role == "OUTLINE"])
         if "OUTLINE" in roles
         else None
     )
@@ -273,27 +277,29 @@ class _Builder(ElementTree.TreeBuilder):
         raise ValueError("the file has a <!DOCTYPE …>, which jeit does not read; remove it with a text editor.")
 
 
-def _drawn_shapes(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str | None, np.ndarray]]:
+def _drawn_shapes(root_element: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str | None, np.ndarray]]:
     """Yield the shapes of a drawing in their order: the element; its role, which is the name in `_GROUP_NAMES` of the
     element or of an enclosing group, or None; and the matrix (2, 3) from the element's units to metres, with y up."""
-    stack: list[tuple[ElementTree.Element, str | None, np.ndarray]] = [(root, None, _matrix_to_metres(root))]
+    stack: list[tuple[ElementTree.Element, str | None, np.ndarray]] = [
+        (root_element, None, _matrix_to_metres(root_element))
+    ]
     while stack:
         element, role, matrix = stack.pop()
-        tag = tag_of(element)
+        tag = local_tag(element)
         if (
             tag in _INVISIBLE_TAGS
             or not element.tag.startswith(f"{{{_SVG_NAMESPACE}}}")
             or "display:none" in _style(element)
         ):
             continue
-        if tag == "use" or (tag == "svg" and element is not root):
+        if tag == "use" or (tag == "svg" and element is not root_element):
             raise ValueError(
                 f"there is {describe_element(element)} in the drawing; unlink clones and embedded drawings first."
             )
         names = {element.get("id", ""), element.get(_INKSCAPE_LABEL, ""), *element.get("class", "").split()}
         role = next((name for name in _GROUP_NAMES if name in {text.upper() for text in names}), role)
         if "transform" in element.attrib:
-            matrix = compose_transforms(matrix, transform_of(element))
+            matrix = compose_transforms(matrix, read_transform(element))
             if not (np.abs(matrix) < MAX_NUMBER).all():
                 raise ValueError(f"transforms about {describe_element(element)} are too large for a drawing.")
         if tag in _GROUP_TAGS:
@@ -302,29 +308,31 @@ def _drawn_shapes(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Eleme
             yield element, role, matrix
 
 
-def _matrix_to_metres(root: ElementTree.Element) -> np.ndarray:
+def _matrix_to_metres(root_element: ElementTree.Element) -> np.ndarray:
     """Matrix (2, 3) from the units of the drawing to metres, with y up. Raises `ValueError` if the drawing does not
     state its size."""
     box = [
-        number_of(root, "viewBox", number_text)
-        for number_text in re.split(r"[\s,]+", root.get("viewBox", "").strip())
+        parse_number(root_element, "viewBox", number_text)
+        for number_text in re.split(r"[\s,]+", root_element.get("viewBox", "").strip())
         if number_text
     ]
     scales = []
-    for name, inside in (("width", box[2:3]), ("height", box[3:4])):
-        size = re.fullmatch(rf"({NUMBER})\s*({'|'.join(_UNITS)})", root.get(name, "").strip())
+    for name, view_box_sizes in (("width", box[2:3]), ("height", box[3:4])):
+        size = re.fullmatch(rf"({NUMBER})\s*({'|'.join(_UNITS)})", root_element.get(name, "").strip())
         if size is None:
             raise ValueError(
-                f"{name} is {describe(root.get(name))}, which says no length; set the document's size in mm "
+                f"{name} is {describe(root_element.get(name))}, which says no length; set the document's size in mm "
                 f'({name}="200mm").'
             )
-        if box and (len(box) != 4 or not inside[0] > 0):
-            raise ValueError(f"viewBox is {describe(root.get('viewBox'))}; it is four numbers, the last two positive.")
-        scales.append(float(size[1]) * _UNITS[size[2]] / inside[0] if box else _UNITS["px"])
+        if box and (len(box) != 4 or not view_box_sizes[0] > 0):
+            raise ValueError(
+                f"viewBox is {describe(root_element.get('viewBox'))}; it is four numbers, the last two positive."
+            )
+        scales.append(float(size[1]) * _UNITS[size[2]] / view_box_sizes[0] if box else _UNITS["px"])
     if not math.isclose(*scales, rel_tol=1e-3):
         raise ValueError(
-            f"viewBox is {describe(root.get('viewBox'))}, so that a unit is {1e3 * scales[0]:.4g} mm across and "
-            f"{1e3 * scales[1]:.4g} mm up; make its sides as width and height."
+            f"viewBox is {describe(root_element.get('viewBox'))}, so that a unit is {1e3 * scales[0]:.4g} mm across "
+            f"and {1e3 * scales[1]:.4g} mm up; make its sides as width and height."
         )
     return np.array([[scales[0], 0, 0], [0, -scales[0], 0]])
 
@@ -333,13 +341,13 @@ def _style(element: ElementTree.Element) -> str:
     return "".join(f"{element.get('style', '')};display:{element.get('display', '')}".split())
 
 
-def _outline_of_shapes(drawn: list[tuple[ElementTree.Element, np.ndarray]]) -> Domain:
+def _create_outline(drawn_shapes: list[tuple[ElementTree.Element, np.ndarray]]) -> Domain:
     """Outline from the content of the group OUTLINE: a single circle, or shapes with straight sides, of which the
     largest is the skin and others are holes."""
-    if len(drawn) == 1 and tag_of(drawn[0][0]) in ROUND_TAGS:
-        x, y, radius = disc_of(*drawn[0])
+    if len(drawn_shapes) == 1 and local_tag(drawn_shapes[0][0]) in ROUND_TAGS:
+        x, y, radius = read_disc(*drawn_shapes[0])
         return Disk(radius, (x, y))
-    loops = [transform_points(loop, to) for one, to in drawn for loop in loops_of(one)]
+    loops = [transform_points(loop, matrix) for element, matrix in drawn_shapes for loop in read_loops(element)]
     loops.sort(key=lambda loop: -np.prod(np.ptp(loop, axis=0)))
     return Polygon(loops[0], loops[1:])
 
@@ -349,9 +357,9 @@ def _single_closed_outline(shapes: list[tuple[ElementTree.Element, np.ndarray]])
     no shape with straight sides."""
     closed_shapes, errors = [], []
     for element, matrix in shapes:
-        if tag_of(element) in _STRAIGHT_SHAPES:
+        if local_tag(element) in _STRAIGHT_SHAPES:
             try:
-                loops_of(element)
+                read_loops(element)
                 closed_shapes.append((element, matrix))
             except ValueError as error:
                 errors.append(error)
@@ -362,4 +370,4 @@ def _single_closed_outline(shapes: list[tuple[ElementTree.Element, np.ndarray]])
         )
     if not closed_shapes and errors:
         raise errors[0]
-    return _outline_of_shapes(closed_shapes) if closed_shapes else None
+    return _create_outline(closed_shapes) if closed_shapes else None

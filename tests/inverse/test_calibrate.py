@@ -95,8 +95,8 @@ def test_contact_sensitivity_against_differences(model):
 def test_contact_sensitivity_of_electrodes_that_share_facets(monkeypatch):
     """Electrodes around the disk share a facet with a neighbour, so that the integrals of groups without neighbours are
     needed, but not of each electrode."""
-    contact, computed = changes._contact_of, []
-    monkeypatch.setattr(changes, "_contact_of", lambda *given: computed.append(given[2].sum()) or contact(*given))
+    contact, computed = changes._select_contact, []
+    monkeypatch.setattr(changes, "_select_contact", lambda *given: computed.append(given[2].sum()) or contact(*given))
     check_contact_sensitivity(ForwardModel(MESH, BoundaryElectrodes(ring(0.1, 8), 0.075, 1e-3), PROTOCOL))
     assert computed[0] == sum(computed[1:]) == 8
     assert len(computed) <= 4

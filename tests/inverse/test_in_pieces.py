@@ -12,7 +12,7 @@ from jeit.inverse import Laplace, one_step
 from jeit.inverse.linear import greit
 from jeit.inverse.linearisation import Linearisation, combined_jacobian
 from jeit.inverse.prior.bases import DenseBasis, DiagonalBasis, NodalBasis
-from jeit.inverse.prior.linear_algebra import by_columns
+from jeit.inverse.prior.linear_algebra import apply_to_columns
 from jeit.layout import ring
 from jeit.mesh import Disk, box
 from jeit.protocol import adjacent
@@ -62,7 +62,7 @@ def test_restricted_rows_by_blocks(kind):
 @pytest.mark.parametrize("number", [1, 32, 33, 64, 100])
 def test_columns_by_blocks(number):
     matrix, columns = RANDOM.normal(size=(7, 5)), RANDOM.normal(size=(5, number))
-    np.testing.assert_allclose(by_columns(lambda part: matrix @ part, columns, 7), matrix @ columns, rtol=1e-12)
+    np.testing.assert_allclose(apply_to_columns(lambda part: matrix @ part, columns, 7), matrix @ columns, rtol=1e-12)
 
 
 def test_columns_are_always_solved_on_the_same_threads():
@@ -74,7 +74,7 @@ def test_columns_are_always_solved_on_the_same_threads():
         return part
 
     for _ in range(3):
-        by_columns(noted, np.ones((2, 640)), 2)
+        apply_to_columns(noted, np.ones((2, 640)), 2)
     assert len(threads) <= number_of_cores() + 1
 
 

@@ -113,7 +113,7 @@ def test_fewer_basis_functions_give_the_same_image(prior, least, monkeypatch):
 
     image, deviation = found()
     monkeypatch.setattr(priors, "_LARGE_MESH_CELLS", 10)
-    monkeypatch.setattr(GriddedGaussian, "suits", staticmethod(lambda places, length: True))
+    monkeypatch.setattr(GriddedGaussian, "is_efficient", staticmethod(lambda places, length: True))
     few, bars = found()
     assert np.abs(few - image).max() < 0.03 * np.abs(image).max()
     assert np.abs(bars / deviation - 1).max() < (least or 1.0)
@@ -132,9 +132,9 @@ def test_a_grid_with_more_points_than_cells_is_still_faster():
     """A cylinder has fewer cells than its bounding box has grid points, but far more pairs of cells."""
     mesh = box(1.0, 1.0, 1.0, num_points=1500)
     centre = np.asarray(centroids(mesh))
-    assert GriddedGaussian.suits(centre, 0.14)
+    assert GriddedGaussian.is_efficient(centre, 0.14)
     assert np.prod(3 / 0.14 * np.ptp(centre, axis=0) + 5) > mesh.num_cells
-    assert not GriddedGaussian.suits(centre, 0.05)
+    assert not GriddedGaussian.is_efficient(centre, 0.05)
 
 
 def test_results_do_not_depend_on_the_number_of_columns():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, image_difference, ring
-from jeit.cli.console import with_interval
+from jeit.cli.console import format_with_interval
 from jeit.data import Measurement
 from jeit.electrodes.face_patches import body_mesh
 from jeit.image import Inclusion
@@ -290,9 +290,9 @@ def test_intervals_as_text():
     def written(value):
         return f"{value:g}"
 
-    assert with_interval(2.0, (1.0, 3.0), written) == "2\n1 to 3"
-    assert with_interval(2.0, (1.0, None), written) == "at least 1"
-    assert with_interval(2.0, (None, 3.0), written) == "at most 3"
-    assert with_interval(2.0, (None, None), written) == "not determined"
-    assert with_interval(2.0, None, written) == "2"
+    assert format_with_interval(2.0, (1.0, 3.0), written) == "2\n1 to 3"
+    assert format_with_interval(2.0, (1.0, None), written) == "at least 1"
+    assert format_with_interval(2.0, (None, 3.0), written) == "at most 3"
+    assert format_with_interval(2.0, (None, None), written) == "not determined"
+    assert format_with_interval(2.0, None, written) == "2"
     assert Inclusion(1, (0.0, 0.0), 1.0, 1.0).contrast_interval is None

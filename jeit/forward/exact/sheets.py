@@ -122,8 +122,8 @@ def point_inclusion_effect(disk: ConductingDisk, angles: np.ndarray) -> np.ndarr
 def point_potentials(disk: ConductingDisk, angles: np.ndarray, current: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Potential (V) at `points` (n, 2) of a disk without inclusion; `current` (L,), with sum zero, enters at
     `angles`."""
-    feet = disk.radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    distance = np.linalg.norm(points[:, None, :] - feet[None, :, :], axis=-1)
+    projected_points = disk.radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    distance = np.linalg.norm(points[:, None, :] - projected_points[None, :, :], axis=-1)
     return -np.log(distance) @ current / (np.pi * disk.conductivity)
 
 
@@ -153,33 +153,33 @@ def arc_transfer_impedance(
     are M Z Dᵀ, where Z is the matrix returned.
     """
     num = len(angles)
-    half = np.broadcast_to(widths, (num,)) / (2.0 * disk.radius)
+    half_angles = np.broadcast_to(widths, (num,)) / (2.0 * disk.radius)
     z = np.broadcast_to(contact_impedance, (num,))
     nodes, weights = np.polynomial.legendre.leggauss(2 * order + 16)
     basis = np.polynomial.legendre.legvander(nodes, order - 1)
     weighted = weights[:, None] * basis
 
-    theta = angles[:, None] + half[:, None] * nodes
+    theta = angles[:, None] + half_angles[:, None] * nodes
     dtype = np.result_type(disk.kernel(np.ones(1)), z)
     galerkin = np.zeros((num, order, num, order), dtype=dtype)
     source = np.zeros((num, order, num))
     for row in range(num):
         for column in range(num):
             distance = theta[row][:, None] - theta[column][None, :]
-            scale = disk.radius**2 * half[row] * half[column]
+            scale = disk.radius**2 * half_angles[row] * half_angles[column]
             if row != column:
                 block = weighted.T @ disk.kernel(distance) @ weighted
             else:
                 # 2 sin(δ/2)/δ, computed with sinc(x) = sin(πx)/(πx), is the smooth factor of the logarithm's argument.
-                smooth = -np.log(np.sinc(distance / (2.0 * np.pi))) / (np.pi * disk.conductivity)
-                block = weighted.T @ (smooth + disk.inclusion_kernel(distance)) @ weighted
+                smooth_part = -np.log(np.sinc(distance / (2.0 * np.pi))) / (np.pi * disk.conductivity)
+                block = weighted.T @ (smooth_part + disk.inclusion_kernel(distance)) @ weighted
                 logarithm = logarithm_moments(order)
-                logarithm[0, 0] += 4.0 * np.log(half[row])
+                logarithm[0, 0] += 4.0 * np.log(half_angles[row])
                 block = block - logarithm / (np.pi * disk.conductivity)
-                mass = disk.radius * half[row] * 2.0 / (2.0 * np.arange(order) + 1.0)
+                mass = disk.radius * half_angles[row] * 2.0 / (2.0 * np.arange(order) + 1.0)
                 galerkin[row, :, row, :] += z[row] * np.diag(mass)
             galerkin[row, :, column, :] += scale * block
-        source[row, 0, row] = 2.0 * disk.radius * half[row]
+        source[row, 0, row] = 2.0 * disk.radius * half_angles[row]
 
     source = source.reshape(num * order, num)
     density = np.linalg.solve(galerkin.reshape(num * order, num * order), source)
@@ -227,12 +227,12 @@ def disc_transfer_impedance(
     `positions` (L, 2) and `radii` (L,) in metres, `contact_impedance` (L,) in ohm·m²; the disk has no inclusion.
     """
     num = len(positions)
-    order = np.arange(1, num_multipoles + 1)
+    multipole_orders = np.arange(1, num_multipoles + 1)
     centre = positions[:, 0] + 1j * positions[:, 1]
     num_samples = 4 * num_multipoles
     circle = np.exp(2j * np.pi * np.arange(num_samples) / num_samples)
     # Row n of `analysis` maps samples on a circle to the coefficient of cos nφ, and row N + n to that of sin nφ.
-    harmonics = circle ** order[:, None]
+    harmonics = circle ** multipole_orders[:, None]
     analysis = np.concatenate([harmonics.real, harmonics.imag]) * (2.0 / num_samples)
     dtype = np.result_type(disk.conductivity, contact_impedance, 1.0)
     centring = np.eye(num) - 1.0 / num
@@ -243,29 +243,33 @@ def disc_transfer_impedance(
     fed_mean = np.zeros((num, num))
     reflection = np.zeros((num, 2 * num_multipoles), dtype=dtype)
     contact = np.zeros(num, dtype=dtype)
-    for at in range(num):
-        transfer_length = np.sqrt(disk.conductivity * contact_impedance[at])
-        argument = radii[at] / transfer_length
-        slope = argument * ive(order + 1, argument) / ive(order, argument) + order
-        reflection[at] = np.tile((order - slope) / (order + slope), 2)
-        contact[at] = disc_contact_resistance(disk.conductivity, radii[at], contact_impedance[at])
+    for electrode_index in range(num):
+        transfer_length = np.sqrt(disk.conductivity * contact_impedance[electrode_index])
+        argument = radii[electrode_index] / transfer_length
+        slope = argument * ive(multipole_orders + 1, argument) / ive(multipole_orders, argument) + multipole_orders
+        reflection[electrode_index] = np.tile((multipole_orders - slope) / (multipole_orders + slope), 2)
+        contact[electrode_index] = disc_contact_resistance(
+            disk.conductivity, radii[electrode_index], contact_impedance[electrode_index]
+        )
 
-        point = centre[at] + radii[at] * circle
+        point = centre[electrode_index] + radii[electrode_index] * circle
         for source in range(num):
             # The image is a²/w̄ − w_l = (a² − w_l w̄)/w̄; its term log|w̄| cancels for currents with sum zero.
             logarithm = -np.log(np.abs(disk.radius**2 - centre[source] * point.conj()))
             # The multipole cos nφ is the real part of (b/(w − w_l))^n, and sin nφ is minus its imaginary part.
-            field = (radii[source] * point.conj() / (disk.radius**2 - centre[source] * point.conj()))[:, None] ** order
-            if at == source:
+            field = (radii[source] * point.conj() / (disk.radius**2 - centre[source] * point.conj()))[
+                :, None
+            ] ** multipole_orders
+            if electrode_index == source:
                 logarithm = logarithm - np.log(radii[source])
             else:
                 logarithm = logarithm - np.log(np.abs(point - centre[source]))
-                field = field + (radii[source] / (point - centre[source]))[:, None] ** order
+                field = field + (radii[source] / (point - centre[source]))[:, None] ** multipole_orders
             multipoles = np.concatenate([field.real, -field.imag], axis=1)
-            regular[at, :, source, :] = analysis @ multipoles
-            regular_mean[at, source] = multipoles.mean(axis=0)
-            fed[at, :, source] = analysis @ logarithm
-            fed_mean[at, source] = logarithm.mean()
+            regular[electrode_index, :, source, :] = analysis @ multipoles
+            regular_mean[electrode_index, source] = multipoles.mean(axis=0)
+            fed[electrode_index, :, source] = analysis @ logarithm
+            fed_mean[electrode_index, source] = logarithm.mean()
 
     current = centring / (2.0 * np.pi * disk.conductivity)
     size = num * 2 * num_multipoles

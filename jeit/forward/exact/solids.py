@@ -99,19 +99,23 @@ class ConductingCylinder:
     def response(self, num_around: int, num_along: int) -> np.ndarray:
         """Ratio F(R₂) / F'(R₂), (n, m) in metres, of the radial functions F of the modes n < `num_around` and m <
         `num_along`; 0 for the constant mode."""
-        order = np.arange(num_around)[:, None]
+        bessel_orders = np.arange(num_around)[:, None]
         ratio = self.inner_radius / self.radius
         response = np.zeros((num_around, num_along))
-        power = ratio ** (2.0 * order[1:, 0])
-        response[1:, 0] = self.radius / order[1:, 0] * (1 + power) / (1 - power)
+        power = ratio ** (2.0 * bessel_orders[1:, 0])
+        response[1:, 0] = self.radius / bessel_orders[1:, 0] * (1 + power) / (1 - power)
         wave = np.arange(1, num_along) * np.pi / self.height
-        outer = _Bessel(num_around, wave * self.radius)
-        response[:, 1:] = 1 / (wave * outer.growth)
+        outer_bessel = _Bessel(num_around, wave * self.radius)
+        response[:, 1:] = 1 / (wave * outer_bessel.growth)
         if self.inner_radius > 0:
-            inner = _Bessel(num_around, wave * self.inner_radius)
+            inner_bessel = _Bessel(num_around, wave * self.inner_radius)
             # Ratio of the K_n term of F to its I_n term at R₂.
-            share = inner.growth / inner.decay * np.exp(inner.log_i - inner.log_k + outer.log_k - outer.log_i)
-            response[:, 1:] *= (1 + share) / (1 - share * outer.decay / outer.growth)
+            share = (
+                inner_bessel.growth
+                / inner_bessel.decay
+                * np.exp(inner_bessel.log_i - inner_bessel.log_k + outer_bessel.log_k - outer_bessel.log_i)
+            )
+            response[:, 1:] *= (1 + share) / (1 - share * outer_bessel.decay / outer_bessel.growth)
         return response
 
 
@@ -132,11 +136,11 @@ def wall_patch_impedance(
     wave = m * np.pi / cylinder.height
     # sin(x)/x is numpy.sinc(x/π).
     around = np.sinc(n * size[0] / (2 * cylinder.radius) / np.pi)
-    along = np.sinc(wave * size[1] / 2 / np.pi) * np.cos(wave * heights[:, None])
-    doubled = np.outer(np.where(n > 0, 2, 1), np.where(m > 0, 2, 1))
-    weight = doubled * cylinder.response(*num_modes) * around[:, None] ** 2
-    turned = np.cos(n * (angles[:, None] - angles)[..., None])
-    impedance = np.einsum("lkn,nm,lm,km->lk", turned, weight, along, along, optimize=True)
+    axial_factors = np.sinc(wave * size[1] / 2 / np.pi) * np.cos(wave * heights[:, None])
+    mode_factors = np.outer(np.where(n > 0, 2, 1), np.where(m > 0, 2, 1))
+    weight = mode_factors * cylinder.response(*num_modes) * around[:, None] ** 2
+    angular_factors = np.cos(n * (angles[:, None] - angles)[..., None])
+    impedance = np.einsum("lkn,nm,lm,km->lk", angular_factors, weight, axial_factors, axial_factors, optimize=True)
     return impedance / (2 * np.pi * cylinder.radius * cylinder.height * cylinder.conductivity)
 
 
@@ -146,19 +150,19 @@ class _Bessel:
 
     def __init__(self, count: int, x: np.ndarray):
         order = np.arange(count)[:, None]
-        rising, falling = np.empty((count, len(x))), np.empty((count, len(x)))
+        first_kind_ratios, second_kind_ratios = np.empty((count, len(x))), np.empty((count, len(x)))
         ratio = x / (2.0 * (count + 60))
         for n in range(count + 59, -1, -1):  # I_{n+1} / I_n
             ratio = 1 / (2 * (n + 1) / x + ratio)
             if n < count:
-                rising[n] = ratio
-        falling[0] = kve(1, x) / kve(0, x)  # K_{n+1} / K_n
+                first_kind_ratios[n] = ratio
+        second_kind_ratios[0] = kve(1, x) / kve(0, x)  # K_{n+1} / K_n
         for n in range(1, count):
-            falling[n] = 2 * n / x + 1 / falling[n - 1]
+            second_kind_ratios[n] = 2 * n / x + 1 / second_kind_ratios[n - 1]
         zero = np.zeros((1, len(x)))
-        self.log_i = np.log(ive(0, x)) + x + np.concatenate([zero, np.cumsum(np.log(rising[:-1]), axis=0)])
-        self.log_k = np.log(kve(0, x)) - x + np.concatenate([zero, np.cumsum(np.log(falling[:-1]), axis=0)])
-        self.growth, self.decay = rising + order / x, falling - order / x
+        self.log_i = np.log(ive(0, x)) + x + np.concatenate([zero, np.cumsum(np.log(first_kind_ratios[:-1]), axis=0)])
+        self.log_k = np.log(kve(0, x)) - x + np.concatenate([zero, np.cumsum(np.log(second_kind_ratios[:-1]), axis=0)])
+        self.growth, self.decay = first_kind_ratios + order / x, second_kind_ratios - order / x
 
 
 @dataclass(frozen=True)
@@ -184,7 +188,7 @@ def cap_impedance(sphere: ConductingSphere, directions: np.ndarray, radius: floa
     mean = (values[n - 1] - values[n + 1]) / ((2 * n + 1) * (1 - cosine))
     power = (sphere.inner_radius / sphere.radius) ** (2.0 * n + 1)
     response = (1 + n / (n + 1) * power) / (n * (1 - power))
-    between = np.clip(directions @ directions.T, -1, 1)
+    cosines = np.clip(directions @ directions.T, -1, 1)
     coefficients = np.concatenate([[0.0], (2 * n + 1) * response * mean**2])
-    series = np.polynomial.legendre.legval(between, coefficients)
+    series = np.polynomial.legendre.legval(cosines, coefficients)
     return series / (4 * np.pi * sphere.radius * sphere.conductivity)

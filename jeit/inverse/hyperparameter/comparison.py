@@ -46,9 +46,9 @@ def choose_hyperparameter(
     """
     if not (isinstance(rule, str) or callable(rule)):
         raise ValueError(f"rule: give one of {', '.join(RULES)}, not {rule!r}; a number needs no choosing.")
-    linear = Linearisation.create(model, conductivity, prior=prior, noise=noise, mask=mask)
-    data = None if difference is None else linear.whiten(difference)
-    return choose(linear.spectrum, rule, data, model.mesh)
+    linearisation = Linearisation.create(model, conductivity, prior=prior, noise=noise, mask=mask)
+    data = None if difference is None else linearisation.whiten(difference)
+    return choose(linearisation.spectrum, rule, data, model.mesh)
 
 
 def compare_rules(
@@ -84,10 +84,10 @@ def compare_rules(
     """
     rules, report = RULES if rules is None else rules, progress or (lambda step: None)
     report("linearise")
-    linear = Linearisation.create(model, conductivity, prior=prior, noise=noise, mask=mask)
-    data = linear.whiten(difference)
+    linearisation = Linearisation.create(model, conductivity, prior=prior, noise=noise, mask=mask)
+    data = linearisation.whiten(difference)
     choices = {}
     for name, rule in rules.items():
         report(name)
-        choices[name] = choose(linear.spectrum, rule, data, model.mesh)
+        choices[name] = choose(linearisation.spectrum, rule, data, model.mesh)
     return choices

@@ -110,9 +110,9 @@ def blur_radius(
     expected_areas = np.empty((len(candidates), len(targets)))
     for candidate_index in range(len(candidates)):
         image = np.real(modes @ (damping[candidate_index][:, None] * components) + null_space_images)
-        excess = image - image[targets, np.arange(len(targets))] / 2
+        excess_over_half = image - image[targets, np.arange(len(targets))] / 2
         expected_areas[candidate_index] = cell_areas @ ndtr(
-            strength * excess / np.sqrt(variance[candidate_index])[:, None]
+            strength * excess_over_half / np.sqrt(variance[candidate_index])[:, None]
         )
     return (expected_areas / cell_areas.sum()) ** (1 / mesh.dimension)
 
@@ -125,15 +125,15 @@ def select_spread_cells(mesh: Mesh, num_cells: int) -> Int[np.ndarray, " T"]:
     spacing = (cell_measures.sum() / num_cells) ** (1 / mesh.dimension)
     counts = np.maximum(np.round((upper_corner - lower_corner) / spacing).astype(int), 1)
     coordinates = [
-        start + (np.arange(num_steps) + 0.5) * (stop - start) / num_steps
-        for start, stop, num_steps in zip(lower_corner, upper_corner, counts, strict=True)
+        start + (np.arange(num_steps) + 0.5) * (end - start) / num_steps
+        for start, end, num_steps in zip(lower_corner, upper_corner, counts, strict=True)
     ]
     lattice = np.stack(np.meshgrid(*coordinates, indexing="ij"), axis=-1).reshape(-1, mesh.space_dimension)
-    distances, nearest = (np.asarray(result) for result in KDTree(centres).query(lattice))
+    distances, nearest_cells = (np.asarray(result) for result in KDTree(centres).query(lattice))
     # A surface in space passes between lattice points, so lattice points up to half a spacing from the surface count as
     # inside.
-    inside = distances <= (spacing / 2 if mesh.is_surface else cell_measures[nearest] ** (1 / mesh.dimension))
-    return np.unique(nearest[inside] if inside.any() else nearest)
+    is_inside = distances <= (spacing / 2 if mesh.is_surface else cell_measures[nearest_cells] ** (1 / mesh.dimension))
+    return np.unique(nearest_cells[is_inside] if is_inside.any() else nearest_cells)
 
 
 def greit_noise_figure(target: float, eigenvalues, signal, data_ratio: float, image_modes, measure) -> float:
@@ -150,22 +150,22 @@ def greit_noise_figure(target: float, eigenvalues, signal, data_ratio: float, im
     weight = measure / measure.sum()
     noise_gain = weight @ image_modes**2
 
-    def excess(log_hyperparameter) -> float:
+    def excess_noise_figure(log_hyperparameter) -> float:
         filter_values = 1 / (eigenvalues + np.exp(2 * log_hyperparameter))
         noise, image = np.sqrt(noise_gain @ filter_values**2), weight @ np.abs(image_modes @ (signal * filter_values))
         return float(np.log(data_ratio * noise / image / target))
 
     grid = np.log(np.sqrt(eigenvalues.max()) * np.logspace(-6, 1, 71))
-    excesses = np.array([excess(grid_point) for grid_point in grid])
-    below_target = np.flatnonzero(excesses <= 0)
+    grid_excesses = np.array([excess_noise_figure(grid_point) for grid_point in grid])
+    below_target = np.flatnonzero(grid_excesses <= 0)
     if below_target.size == 0 or below_target[0] == 0:
-        min_figure, max_figure = target * np.exp([excesses.min(), excesses.max()])
+        min_figure, max_figure = target * np.exp([grid_excesses.min(), grid_excesses.max()])
         raise ValueError(
             f"noise_figure: no hyperparameter gives {target:g}; here it lies between {min_figure:.3g} and "
             f"{max_figure:.3g}. A larger radius brings it down; a larger noise_figure takes a noisier image."
         )
     bracket = (grid[below_target[0] - 1], grid[below_target[0]])
-    return float(np.exp(scipy.optimize.root_scalar(excess, bracket=bracket, rtol=1e-10).root))
+    return float(np.exp(scipy.optimize.root_scalar(excess_noise_figure, bracket=bracket, rtol=1e-10).root))
 
 
 Rule = Callable[[Spectrum, Float[Array, " M"] | None, Mesh | None], Choice]
@@ -193,8 +193,8 @@ def generalised_cross_validation(spectrum: Spectrum, data: ArrayLike | None, mes
     # Repeated readings have filter 1 but no residual, so their number is subtracted from the number of channels and
     # from the trace.
     num_independent = len(data) - spectrum.repeated
-    score = num_independent * residual**2 / (_filters(spectrum, candidates).sum(axis=1) - spectrum.repeated) ** 2
-    return Choice.among("gcv", candidates, int(np.argmin(score)), score, (residual, penalty))
+    gcv_scores = num_independent * residual**2 / (_filters(spectrum, candidates).sum(axis=1) - spectrum.repeated) ** 2
+    return Choice.among("gcv", candidates, int(np.argmin(gcv_scores)), gcv_scores, (residual, penalty))
 
 
 def discrepancy(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = None, *, noise: float = 1.0) -> Choice:
@@ -226,18 +226,22 @@ def discrepancy(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = 
     residual, penalty = spectrum.curves(data, candidates)
     criterion = residual / np.sqrt(degrees_of_freedom)
     allowed_indices = np.flatnonzero(criterion <= noise)
-    index = allowed_indices[-1] if allowed_indices.size else 0
-    between = None
-    if allowed_indices.size and index + 1 < len(candidates):
+    candidate_index = allowed_indices[-1] if allowed_indices.size else 0
+    bracket = None
+    if allowed_indices.size and candidate_index + 1 < len(candidates):
 
-        def excess(log_value) -> float:
+        def excess_misfit(log_value) -> float:
             return float(
                 np.sqrt(((_filters(spectrum, np.exp(log_value)) * components) ** 2).sum() / degrees_of_freedom) - noise
             )
 
-        between = np.exp(scipy.optimize.root_scalar(excess, bracket=np.log(candidates[index : index + 2])).root)
+        bracket = np.exp(
+            scipy.optimize.root_scalar(
+                excess_misfit, bracket=np.log(candidates[candidate_index : candidate_index + 2])
+            ).root
+        )
     return Choice.among(
-        "discrepancy", candidates, index, criterion, (residual, penalty), target=float(noise), between=between
+        "discrepancy", candidates, candidate_index, criterion, (residual, penalty), target=float(noise), between=bracket
     )
 
 
@@ -338,8 +342,8 @@ def choose(spectrum: Any, hyperparameter: float | str | Rule | Choice, data, mes
 
 def _check_problem(problem, name: str) -> None:
     """Raise `ValueError` for a traced problem, because a rule for λ needs numerical values."""
-    advice = "give a number, such as the one that jeit.inverse.choose_hyperparameter finds outside"
-    check_has_values("hyperparameter: the problem", problem, f"the rule '{name}' looks at", advice)
+    remedy = "give a number, such as the one that jeit.inverse.choose_hyperparameter finds outside"
+    check_has_values("hyperparameter: the problem", problem, f"the rule '{name}' looks at", remedy)
 
 
 def _filters(spectrum: Spectrum, candidates) -> Float[np.ndarray, "K r"]:
@@ -377,8 +381,8 @@ def _second_log_derivative(terms, first_factors, second_factors):
 def _check_data(data, rule: str) -> Float[np.ndarray, " M"]:
     if data is None:
         raise ValueError(f"The rule '{rule}' looks at the data: give difference, the change of voltages to be imaged.")
-    advice = "give a number as hyperparameter, such as the one that the rule finds outside"
-    check_has_values("difference (voltages)", data, f"the rule '{rule}' looks at", advice)
+    remedy = "give a number as hyperparameter, such as the one that the rule finds outside"
+    check_has_values("difference (voltages)", data, f"the rule '{rule}' looks at", remedy)
     values = np.asarray(data)
     if not (np.isfinite(values).all() and values.any()):
         raise ValueError(f"The rule '{rule}' looks at the data, and they are all zero, NaN or infinite: give others.")

@@ -87,10 +87,10 @@ def greit(
     ```
     """
     check_model(model)
-    advice = (
+    remedy = (
         "work it out once outside: its image() is what JAX transforms; or take one_step, which can be differentiated"
     )
-    check_has_values("model, conductivity or noise", (model, conductivity, noise), "GREIT is trained on", advice)
+    check_has_values("model, conductivity or noise", (model, conductivity, noise), "GREIT is trained on", remedy)
     mesh = model.mesh
     check_flat(mesh, "GREIT's targets")
     radius = float(model.electrodes.num_electrodes**-0.5) if radius is None else radius
@@ -148,21 +148,21 @@ def _ball_measure(radius: float, dimension: int) -> float:
     return np.pi * radius**2 if dimension == 2 else 4 / 3 * np.pi * radius**3
 
 
-def _place_targets(mesh: Mesh, middle, radius: float, num_targets: int) -> tuple[np.ndarray, scipy.sparse.csc_array]:
+def _place_targets(mesh: Mesh, centre, radius: float, num_targets: int) -> tuple[np.ndarray, scipy.sparse.csc_array]:
     """Centres (K, d) of the K training targets that lie in the body, and the fraction (m, K) of every cell that each
     target covers."""
     cell_measures, points = np.asarray(measures(mesh)), np.asarray(mesh.points)
     lower_corner, upper_corner = points.min(axis=0), points.max(axis=0)
     if mesh.dimension == 2:
         spacing = np.sqrt(2 / np.sqrt(3) * cell_measures.sum() / num_targets)
-        grid = _hexagonal_lattice(lower_corner, upper_corner, middle, spacing)
+        grid = _hexagonal_lattice(lower_corner, upper_corner, centre, spacing)
     else:
         spacing = np.cbrt(cell_measures.sum() / num_targets)
-        grid = _cubic_lattice(lower_corner, upper_corner, middle, spacing)
+        grid = _cubic_lattice(lower_corner, upper_corner, centre, spacing)
     tree, entry_groups = KDTree(grid), []
     for samples, sample_cells, sample_shares in _sample_points(mesh, radius / _SAMPLES_PER_RADIUS[mesh.dimension]):
         if mesh.dimension == 3:
-            offsets = (samples - middle) / spacing
+            offsets = (samples - centre) / spacing
             offsets -= np.rint(offsets)  # offset from the nearest centre; not all points lie within a target
             near_indices = np.flatnonzero(
                 np.einsum("qi,qi->q", offsets, offsets) < (_SEARCH_RADII * radius / spacing) ** 2
@@ -174,8 +174,10 @@ def _place_targets(mesh: Mesh, middle, radius: float, num_targets: int) -> tuple
             )
         pairs = tree.sparse_distance_matrix(KDTree(samples), radius, output_type="ndarray")
         entry_groups.append((sample_shares[pairs["j"]], sample_cells[pairs["j"]], pairs["i"]))
-    shares, cells, targets = (np.concatenate(entries) for entries in zip(*entry_groups, strict=True))
-    coverage = scipy.sparse.coo_array((shares, (cells, targets)), shape=(mesh.num_cells, len(grid))).tocsc()
+    overlap_fractions, cells, targets = (
+        np.concatenate(group_arrays) for group_arrays in zip(*entry_groups, strict=True)
+    )
+    coverage = scipy.sparse.coo_array((overlap_fractions, (cells, targets)), shape=(mesh.num_cells, len(grid))).tocsc()
     targets_inside = np.flatnonzero(
         coverage.T @ cell_measures > _MIN_INSIDE_FRACTION * _ball_measure(radius, mesh.dimension)
     )
@@ -242,8 +244,8 @@ def _desired_images(mesh: Mesh, positions, integrals, radius: float) -> scipy.sp
     pairs = KDTree(cell_centres).sparse_distance_matrix(
         KDTree(positions), (1 + _EDGE_HALF_WIDTH) * radius, output_type="ndarray"
     )
-    ramp = np.clip((pairs["v"] / radius - 1) / _EDGE_HALF_WIDTH, -1, 1)
-    heights = (1 - np.sin(0.5 * np.pi * ramp)) / 2
+    edge_positions = np.clip((pairs["v"] / radius - 1) / _EDGE_HALF_WIDTH, -1, 1)
+    heights = (1 - np.sin(0.5 * np.pi * edge_positions)) / 2
     discs = scipy.sparse.coo_array(
         (heights, (pairs["i"], pairs["j"])), shape=(len(cell_centres), len(positions))
     ).tocsc()

@@ -103,12 +103,16 @@ class LinearReconstruction:
         images, weights = factors
         # Columns of two channels are proportional in every cell or in none, so a sample of the cells suffices.
         sampled_images = images[:: max(1, len(images) // _NUM_SAMPLED_CELLS)]
-        first, second, ratio = _proportional_channels(model, sampled_images @ weights)
-        combined_weights = (weights.T[first] + ratio[:, None] * weights.T[second]) / (1 + ratio**2)[:, None]
+        first_channels, second_channels, ratio = _find_proportional_channels(model, sampled_images @ weights)
+        combined_weights = (weights.T[first_channels] + ratio[:, None] * weights.T[second_channels]) / (1 + ratio**2)[
+            :, None
+        ]
         rows, mixing = (
-            (images.T, combined_weights) if len(first) > images.shape[1] else (combined_weights @ images.T, None)
+            (images.T, combined_weights)
+            if len(first_channels) > images.shape[1]
+            else (combined_weights @ images.T, None)
         )
-        channel_pairs = as_array(first), as_array(second), as_array(ratio)
+        channel_pairs = as_array(first_channels), as_array(second_channels), as_array(ratio)
         num_measurements = weights.shape[1]
         device_mixing = None if mixing is None else as_array(mixing)
         reconstruction_fields = (
@@ -145,15 +149,15 @@ class LinearReconstruction:
             )
             return cls(model.mesh, *traced_fields, matrix.shape[1], rule, method, choice)
         matrix = np.asarray(matrix)
-        first, second, ratio = _proportional_channels(model, matrix)
+        first_channels, second_channels, ratio = _find_proportional_channels(model, matrix)
         # Both columns of reciprocal channels are replaced by a weighted mean: for small λ their rounding errors are
         # large and opposite.
-        summed_columns = matrix.T[first] + ratio[:, None] * matrix.T[second]
+        summed_columns = matrix.T[first_channels] + ratio[:, None] * matrix.T[second_channels]
         weights = summed_columns / (1 + ratio**2)[:, None]
         return cls(
             model.mesh,
-            as_array(first),
-            as_array(second),
+            as_array(first_channels),
+            as_array(second_channels),
             as_array(ratio),
             as_array(weights),
             as_array(hyperparameter, float),
@@ -187,8 +191,8 @@ class LinearReconstruction:
             raise ValueError(f"difference is {voltages.dtype}; give numbers, in volts.")
         if not np.isfinite(voltages).all():
             raise ValueError("difference has NaN or infinite voltages; put zeros in masked channels.")
-        first, second, ratio, mixing, weights = self._numpy_arrays
-        combined = _combine_channels(voltages, first, second, ratio, mixing)
+        first_channels, second_channels, ratio, mixing, weights = self._numpy_arrays
+        combined = _combine_channels(voltages, first_channels, second_channels, ratio, mixing)
         return on_device(combined @ weights) if is_forked() else product_for_jax(combined, weights)
 
     def image_noise(self, noise: Float[Array | np.ndarray, " M"]) -> Float[np.ndarray, " m"]:
@@ -197,8 +201,8 @@ class LinearReconstruction:
         deviations = np.asarray(noise)
         if deviations.shape != (self.num_measurements,):
             raise ValueError(f"noise has shape {deviations.shape}; give a voltage for each of {self.num_measurements}.")
-        first, second, ratio, mixing, weights = self._numpy_arrays
-        combined_noise = np.hypot(deviations[first], ratio * deviations[second])
+        first_channels, second_channels, ratio, mixing, weights = self._numpy_arrays
+        combined_noise = np.hypot(deviations[first_channels], ratio * deviations[second_channels])
         variance = np.zeros(weights.shape[1])
         for start in range(0, len(combined_noise), _ROWS_AT_ONCE):
             rows = slice(start, start + _ROWS_AT_ONCE)
@@ -214,10 +218,16 @@ class LinearReconstruction:
 
 
 @values_at_once
-def _full_matrix(linear: LinearReconstruction) -> Inexact[Array, "m M"]:
-    weights = linear.weights if linear.mixing is None else linear.mixing @ linear.weights
-    full = sum_into((linear.num_measurements, weights.shape[1]), linear.second, linear.ratio[:, None] * weights)
-    return add_into(full, linear.first, weights).T
+def _full_matrix(reconstruction: LinearReconstruction) -> Inexact[Array, "m M"]:
+    weights = (
+        reconstruction.weights if reconstruction.mixing is None else reconstruction.mixing @ reconstruction.weights
+    )
+    full = sum_into(
+        (reconstruction.num_measurements, weights.shape[1]),
+        reconstruction.second,
+        reconstruction.ratio[:, None] * weights,
+    )
+    return add_into(full, reconstruction.first, weights).T
 
 
 def _image_product(arrays, difference) -> Any:
@@ -225,28 +235,37 @@ def _image_product(arrays, difference) -> Any:
     return _combine_channels(difference, *channels) @ weights
 
 
-def _combine_channels(difference, first, second, ratio, mixing) -> Any:
-    combined = difference[..., first] + ratio * difference[..., second]
+def _combine_channels(difference, first_channels, second_channels, ratio, mixing) -> Any:
+    combined = difference[..., first_channels] + ratio * difference[..., second_channels]
     return combined if mixing is None else combined @ mixing
 
 
-def _proportional_channels(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Channels `first` and `second` that are added before the product with the matrix, and the `ratio` of their
-    columns. The pairs are reciprocal channels with proportional columns; every other channel is used alone, with ratio
-    0."""
+def _find_proportional_channels(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Channels `first_channels` and `second_channels` that are added before the product with the matrix, and the
+    `ratio` of their columns. The pairs are reciprocal channels with proportional columns; every other channel is used
+    alone, with ratio 0."""
     column_norms = np.linalg.norm(matrix, axis=0)
     is_single = column_norms > 0
     pairs, _ = model.protocol.reciprocal_pairs()
     pairs = np.asarray(pairs).reshape(-1, 2)
-    first, second = pairs[(column_norms[pairs] > 0).all(axis=1)].T
-    ratio = np.einsum("ij,ij->j", matrix[:, first].conj(), matrix[:, second]).real / column_norms[first] ** 2
-    is_proportional = np.abs(matrix[:, second] - ratio * matrix[:, first]).max(axis=0) < 1e-9 * np.abs(matrix).max()
-    first, second, ratio = first[is_proportional], second[is_proportional], ratio[is_proportional]
-    is_single[first] = is_single[second] = False
+    first_channels, second_channels = pairs[(column_norms[pairs] > 0).all(axis=1)].T
+    ratio = (
+        np.einsum("ij,ij->j", matrix[:, first_channels].conj(), matrix[:, second_channels]).real
+        / column_norms[first_channels] ** 2
+    )
+    is_proportional = (
+        np.abs(matrix[:, second_channels] - ratio * matrix[:, first_channels]).max(axis=0) < 1e-9 * np.abs(matrix).max()
+    )
+    first_channels, second_channels, ratio = (
+        first_channels[is_proportional],
+        second_channels[is_proportional],
+        ratio[is_proportional],
+    )
+    is_single[first_channels] = is_single[second_channels] = False
     single_channels = np.flatnonzero(is_single)
     return (
-        np.concatenate([first, single_channels]),
-        np.concatenate([second, single_channels]),
+        np.concatenate([first_channels, single_channels]),
+        np.concatenate([second_channels, single_channels]),
         np.concatenate([ratio, np.zeros(len(single_channels))]),
     )
 
@@ -293,21 +312,23 @@ def one_step(
     image = one_step(model, 1.0, hyperparameter=0.1).image(change)
     ```
     """
-    linear = Linearisation.create(model, conductivity, prior=prior, noise=noise, mask=mask)
-    data = None if difference is None else linear.whiten(difference)
-    choice = choose(linear.spectrum, hyperparameter, data, model.mesh)
+    linearisation = Linearisation.create(model, conductivity, prior=prior, noise=noise, mask=mask)
+    data = None if difference is None else linearisation.whiten(difference)
+    choice = choose(linearisation.spectrum, hyperparameter, data, model.mesh)
     if has_values(choice) and not (np.isfinite(choice.hyperparameter) and choice.hyperparameter > 0):
         raise ValueError(
             f"hyperparameter: the rule '{choice.rule}' finds none, for numbers overflow; are noise and conductivity in "
             "volts and S/m (2-D: S)?"
         )
-    method = f"one-step, {type(linear.prior).__name__} prior"
+    method = f"one-step, {type(linearisation.prior).__name__} prior"
     result_fields = choice.hyperparameter, choice.rule, method, choice
-    if isinstance(linear.spectrum, Spectrum) and has_values(choice.hyperparameter):
-        factors = linear.factors(choice.hyperparameter)
-        del linear  # frees memory, because the problem and the factors of a large body do not fit in memory together
+    if isinstance(linearisation.spectrum, Spectrum) and has_values(choice.hyperparameter):
+        factors = linearisation.factors(choice.hyperparameter)
+        del (
+            linearisation
+        )  # frees memory, because the problem and the factors of a large body do not fit in memory together
         return LinearReconstruction.of_factors(model, factors, *result_fields)
-    return LinearReconstruction.create(model, linear.matrix(choice.hyperparameter), *result_fields)
+    return LinearReconstruction.create(model, linearisation.matrix(choice.hyperparameter), *result_fields)
 
 
 def back_projection(
@@ -344,13 +365,13 @@ def back_projection(
     ```
     """
     check_model(model)
-    advice = (
+    remedy = (
         "work it out once outside: its image() is what JAX transforms; or take one_step, which can be differentiated"
     )
-    check_has_values("model or conductivity", (model, conductivity), "its bands are drawn from", advice)
+    check_has_values("model or conductivity", (model, conductivity), "its bands are drawn from", remedy)
     protocol = model.protocol
-    used = np.ones(protocol.num_measurements, bool) if mask is None else np.asarray(mask, bool)
-    if used.shape != (protocol.num_measurements,) or not used.any():
+    is_used = np.ones(protocol.num_measurements, bool) if mask is None else np.asarray(mask, bool)
+    if is_used.shape != (protocol.num_measurements,) or not is_used.any():
         raise ValueError(f"mask must be ({protocol.num_measurements},) booleans with at least one True.")
     measurement = np.asarray(protocol.measurement)
     if (np.count_nonzero(measurement, axis=1) != 2).any():
@@ -363,20 +384,22 @@ def back_projection(
     cells = np.asarray(model.mesh.cells)
     cell_potentials = node_potentials[:, cells].mean(axis=2)  # (S, m)
     electrode_potentials = np.asarray(protocol.drive @ model.transfer_impedance(conductivity))  # (S, L)
-    first, second = (measurement > 0).argmax(axis=1), (measurement < 0).argmax(axis=1)
+    first_electrodes, second_electrodes = (measurement > 0).argmax(axis=1), (measurement < 0).argmax(axis=1)
     drive, pair = np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)
-    band_limits = np.stack([electrode_potentials[drive, first[pair]], electrode_potentials[drive, second[pair]]])
-    in_band = (cell_potentials[drive] >= band_limits.min(axis=0)[:, None]) & (
+    band_limits = np.stack(
+        [electrode_potentials[drive, first_electrodes[pair]], electrode_potentials[drive, second_electrodes[pair]]]
+    )
+    is_in_band = (cell_potentials[drive] >= band_limits.min(axis=0)[:, None]) & (
         cell_potentials[drive] < band_limits.max(axis=0)[:, None]
     )
-    in_band = (in_band & used[:, None]).T.astype(float)  # (m, M)
-    num_bands = np.maximum(in_band.sum(axis=1), 1)
+    is_in_band = (is_in_band & is_used[:, None]).T.astype(float)  # (m, M)
+    num_bands = np.maximum(is_in_band.sum(axis=1), 1)
     # Scale: a uniform relative change δ of conductivity changes every voltage by the relative amount -δ.
     scale = np.broadcast_to(np.asarray(conductivity, float), (model.mesh.num_cells,))
-    projection = -(scale / num_bands)[:, None] * in_band / np.where(used & (voltages != 0), voltages, np.inf)
+    projection = -(scale / num_bands)[:, None] * is_in_band / np.where(is_used & (voltages != 0), voltages, np.inf)
     if not filtered:
         return LinearReconstruction.create(model, projection, np.nan, "none", "back-projection")
-    used_channels = np.flatnonzero(used)
+    used_channels = np.flatnonzero(is_used)
     projected_jacobian = jacobian[used_channels] @ projection[:, used_channels]
     damping = (hyperparameter * np.linalg.norm(projected_jacobian, 2)) ** 2
     matrix = np.zeros_like(projection)

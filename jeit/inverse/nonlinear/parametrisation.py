@@ -340,18 +340,18 @@ def _logistic(estimate):
     return scipy.special.expit(estimate) if isinstance(estimate, np.ndarray) else jax.nn.sigmoid(estimate)
 
 
-def _check_inside(conductivity, lower, upper) -> None:
-    if not has_values(conductivity, lower, upper):
+def _check_inside(conductivity, lower_bound, upper_bound) -> None:
+    if not has_values(conductivity, lower_bound, upper_bound):
         return
     values = np.asarray(conductivity)
-    if not ((values > lower) & (values < upper)).all():
+    if not ((values > lower_bound) & (values < upper_bound)).all():
         raise ValueError(
-            f"conductivity must lie between {lower:g} and {upper:g}; it goes from {values.min():.3g} to "
+            f"conductivity must lie between {lower_bound:g} and {upper_bound:g}; it goes from {values.min():.3g} to "
             f"{values.max():.3g}."
         )
 
 
-def _as_tuple(unknowns) -> tuple[AbstractUnknown, ...]:
+def _convert_to_tuple(unknowns) -> tuple[AbstractUnknown, ...]:
     if not isinstance(unknowns, Sequence) or not all(isinstance(unknown, AbstractUnknown) for unknown in unknowns):
         raise ValueError(
             f"unknowns must be a list of those in jeit.inverse.nonlinear, such as [Scale()]; it is {unknowns!r}."
@@ -397,7 +397,7 @@ class Parametrisation(Module):
     link: AbstractLink = eqx.field(default_factory=Log)
     bounds: tuple[float, float] | None = None
     regions: Int[np.ndarray, " m"] | None = None
-    unknowns: tuple[AbstractUnknown, ...] = eqx.field(default=(), converter=_as_tuple)
+    unknowns: tuple[AbstractUnknown, ...] = eqx.field(default=(), converter=_convert_to_tuple)
     informative: float | None = None
 
     def __check_init__(self):
@@ -434,17 +434,17 @@ class Parametrisation(Module):
 
         Raises `ValueError` if the link does not allow bounds or the background lies outside them.
         """
-        lower, upper = (0.0, np.inf) if self.bounds is None else self.bounds
+        lower_bound, upper_bound = (0.0, np.inf) if self.bounds is None else self.bounds
         reference = self.link.estimate(background)
         if has_values(self.bounds):
-            lower, upper = float(lower), float(upper)
-        scaled_bounds = self.link.ends(lower, upper, reference)
+            lower_bound, upper_bound = float(lower_bound), float(upper_bound)
+        scaled_bounds = self.link.ends(lower_bound, upper_bound, reference)
         if (
             has_values(reference, scaled_bounds)
             and not ((reference >= scaled_bounds[0]) & (reference <= scaled_bounds[1])).all()
         ):
-            raise ValueError(f"background must lie between the bounds, {lower:g} and {upper:g}.")
-        no_bounds = jnp.full(sum(unknown.size for unknown in self.unknowns), jnp.inf)
-        return jnp.concatenate([scaled_bounds[0] - reference, -no_bounds]), jnp.concatenate(
-            [scaled_bounds[1] - reference, no_bounds]
+            raise ValueError(f"background must lie between the bounds, {lower_bound:g} and {upper_bound:g}.")
+        infinite_bounds = jnp.full(sum(unknown.size for unknown in self.unknowns), jnp.inf)
+        return jnp.concatenate([scaled_bounds[0] - reference, -infinite_bounds]), jnp.concatenate(
+            [scaled_bounds[1] - reference, infinite_bounds]
         )

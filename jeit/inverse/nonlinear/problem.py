@@ -52,7 +52,7 @@ def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"]
     """
     check_model(model)
     check_mask(mask)
-    voltages = _as_float_array(voltages)
+    voltages = _convert_to_floats(voltages)
     if voltages.dtype.kind == "c":
         raise ValueError(
             "voltages are complex, and this method takes real ones: image their change by one_step, repeatedly for an "
@@ -62,30 +62,30 @@ def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"]
         raise ValueError(f"voltages are {voltages.dtype}; give real numbers, in volts.")
     shape = (model.protocol.num_measurements,)
     measured = voltages.astype(float)
-    used = np.ones(shape, bool) if mask is None else np.asarray(mask)
-    if measured.shape != shape or used.shape != shape or used.dtype != bool:
+    is_used = np.ones(shape, bool) if mask is None else np.asarray(mask)
+    if measured.shape != shape or is_used.shape != shape or is_used.dtype != bool:
         raise ValueError(
-            f"voltages has shape {measured.shape} and mask {used.shape} of {used.dtype}; protocol "
+            f"voltages has shape {measured.shape} and mask {is_used.shape} of {is_used.dtype}; protocol "
             f"'{model.protocol.name}' has {shape[0]} channels, and the mask must be booleans."
         )
-    if not used.any():
+    if not is_used.any():
         raise ValueError("mask: every channel is left out, so there is nothing to reconstruct from.")
     if not has_values(measured):
-        return jnp.where(used, measured, 0), used
-    values = np.asarray(measured)[used]
+        return jnp.where(is_used, measured, 0), is_used
+    values = np.asarray(measured)[is_used]
     if not np.isfinite(values).all():
         raise ValueError(
             f"voltages: NaN or infinite in {(~np.isfinite(values)).sum()} of the channels in use; mask them."
         )
     if not values.any():
         raise ValueError("voltages: all channels in use read zero; was the current source on?")
-    return host.where(used, measured, 0), used
+    return host.where(is_used, measured, 0), is_used
 
 
 def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
     """Background conductivity per cell; raises `ValueError` unless `background` is one positive number or one positive
     number per cell."""
-    background = _as_float_array(background)
+    background = _convert_to_floats(background)
     if background.dtype.kind not in "biuf" or background.shape not in ((), (model.mesh.num_cells,)):
         raise ValueError(
             f"background must be one real conductivity, or one for each of the {model.mesh.num_cells} cells; it is "
@@ -99,10 +99,10 @@ def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
     return namespace(background).broadcast_to(background.astype(float), (model.mesh.num_cells,))
 
 
-def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[Array, " M"]:
+def check_noise(noise, measured: Float[Array, " M"], is_used: np.ndarray) -> Float[Array, " M"]:
     """Standard deviation of every channel in volts, 1 in channels that are not used; raises `ValueError` for invalid
     noise."""
-    standard_deviation = np.zeros(()) if noise is None else _as_float_array(noise)
+    standard_deviation = np.zeros(()) if noise is None else _convert_to_floats(noise)
     if standard_deviation.shape not in ((), measured.shape) or standard_deviation.dtype.kind not in "iuf":
         raise ValueError(
             f"noise is {standard_deviation.dtype} of shape {standard_deviation.shape}; give one real number, or one "
@@ -110,16 +110,16 @@ def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[
         )
     xp = namespace(standard_deviation, measured)
     deviation = (
-        relative_noise(measured, xp.asarray(used))
+        relative_noise(measured, xp.asarray(is_used))
         if noise is None
         else xp.broadcast_to(standard_deviation, measured.shape)
     )
-    if has_values(deviation) and not (np.isfinite(deviation)[used] & (np.asarray(deviation)[used] > 0)).all():
+    if has_values(deviation) and not (np.isfinite(deviation)[is_used] & (np.asarray(deviation)[is_used] > 0)).all():
         raise ValueError("noise must be positive and finite for every channel in use.")
-    return xp.where(used, deviation, 1)
+    return xp.where(is_used, deviation, 1)
 
 
-def _as_float_array(values):
+def _convert_to_floats(values):
     """Copy of `values` as a NumPy array of floats, or as a JAX array if traced."""
     return host.array(values) if has_values(values) else jnp.asarray(values)
 
@@ -141,7 +141,7 @@ def check_tolerance(name: str, tolerance) -> float:
 def independent_data(
     model: ForwardModel,
     measured: Float[Array, " M"],
-    used: Bool[np.ndarray, " M"],
+    is_used: Bool[np.ndarray, " M"],
     deviation: Float[Array, " M"],
     *,
     at_once: bool,
@@ -151,8 +151,8 @@ def independent_data(
     `deviation` (M,): standard deviation of the noise, volts. `at_once`: whether to return NumPy arrays if the model
     supports it.
     """
-    used_indices = np.flatnonzero(used)
-    observed_model = model if used.all() else model.with_protocol(model.protocol.subset(used_indices))
+    used_indices = np.flatnonzero(is_used)
+    observed_model = model if is_used.all() else model.with_protocol(model.protocol.subset(used_indices))
     channels = IndependentChannels.create(observed_model.protocol)
     independent_model = observed_model
     if has_values(observed_model.protocol):
@@ -336,20 +336,20 @@ def as_solution(coefficients: Float[Array, " n"], inversion: Inversion, box: Any
     point = as_minimum(
         jnp.where(active_bounds == 0, coefficients, 0), (inversion, box, active_bounds), _free_gradient, _preconditioner
     )
-    return _with_bounds(point, box, active_bounds)
+    return _replace_bound_components(point, box, active_bounds)
 
 
-def _with_bounds(point, box, active_bounds):
+def _replace_bound_components(point, box, active_bounds):
     """Coefficients that equal `point` where they are free and their bounds elsewhere."""
     return point if box is None else jnp.where(active_bounds < 0, box[0], jnp.where(active_bounds > 0, box[1], point))
 
 
 def _free_gradient(point, problem):
     """Gradient of the objective with respect to the free coefficients. For the other coefficients the function returns
-    `point`, so at a zero of this function their entries in `point` are zero; `_with_bounds` replaces them by the
-    bounds."""
+    `point`, so at a zero of this function their entries in `point` are zero; `_replace_bound_components` replaces them
+    by the bounds."""
     inversion, box, active_bounds = problem
-    gradient = jax.grad(inversion.cost)(_with_bounds(point, box, active_bounds))
+    gradient = jax.grad(inversion.cost)(_replace_bound_components(point, box, active_bounds))
     return gradient if box is None else jnp.where(active_bounds == 0, gradient, point)
 
 
@@ -357,14 +357,14 @@ def _preconditioner(point, problem):
     """Function that multiplies a vector by the inverse of the Gauss-Newton matrix JᵀGJ + P of the free coefficients,
     where P is the penalty's Hessian. Woodbury's identity gives P⁻¹ - P⁻¹Jᵀ(JP⁻¹Jᵀ + G⁻¹)⁻¹JP⁻¹."""
     inversion, box, active_bounds = problem
-    coefficients = _with_bounds(point, box, active_bounds)
+    coefficients = _replace_bound_components(point, box, active_bounds)
     is_free = jnp.ones(point.shape, bool) if box is None else active_bounds == 0
     jacobian = jnp.where(is_free, inversion.linearise(coefficients)[1], 0)
     covariance_product = inversion.penalty.inverse_hessian(coefficients, is_free, jacobian.T)
     data_covariance = jacobian @ covariance_product
     inverse_data_covariance = symmetric_inverse((data_covariance + data_covariance.T) / 2 + inversion.data.covariance)
 
-    def apply(vector):
+    def apply_preconditioner(vector):
         prior_part = inversion.penalty.inverse_hessian(coefficients, is_free, jnp.where(is_free, vector, 0)[:, None])[
             :, 0
         ]
@@ -372,4 +372,4 @@ def _preconditioner(point, problem):
             is_free, prior_part - covariance_product @ (inverse_data_covariance @ (jacobian @ prior_part)), vector
         )
 
-    return apply
+    return apply_preconditioner

@@ -173,24 +173,24 @@ def reconstruct(
     image.conductivity.max(), image.misfit
     ```
     """
-    measured, used = check_frame(model, voltages, mask)
+    measured, is_used = check_frame(model, voltages, mask)
     prior = DEFAULT_PRIOR if prior is None else prior
     check_prior(prior)
     parametrisation = as_parametrisation(parametrisation)
     parametrisation.check_model(model)
     background = check_background(model, background)
-    deviation = check_noise(noise, measured, used)
-    solver = _solver_for(solver, prior, parametrisation)
+    deviation = check_noise(noise, measured, is_used)
+    solver = _choose_solver(solver, prior, parametrisation)
     box = parametrisation.box(background) if solver.keeps_bounds else None
-    _check_protocol(model, used)
+    _check_protocol(model, is_used)
     may_use_numpy = not (parametrisation.unknowns or solver.keeps_bounds or solver.needs_squares)
-    independent_model, data = independent_data(model, measured, used, deviation, at_once=may_use_numpy)
+    independent_model, data = independent_data(model, measured, is_used, deviation, at_once=may_use_numpy)
     inversion, choice = pose(
         independent_model, data, background, prior, hyperparameter, parametrisation, per_cell=solver.keeps_bounds
     )
     if parametrisation.informative and inversion.penalty.is_standard_normal:
-        advice = "leave it out, and take all shapes"
-        check_has_values("informative: the problem", inversion, "shapes that the data support come from", advice)
+        remedy = "leave it out, and take all shapes"
+        check_has_values("informative: the problem", inversion, "shapes that the data support come from", remedy)
         inversion = keep_informed_shapes(inversion, parametrisation.informative)
     start_coefficients = (
         as_array(np.zeros(inversion.num_coefficients))
@@ -202,7 +202,7 @@ def reconstruct(
     fitted_model, conductivity = inversion.applied(model, coefficients), _conductivity(inversion, coefficients)
     predicted = evaluate(fitted_model, voltages_of, conductivity)
     xp = jnp if not has_values(predicted, measured, deviation) else np
-    used_indices = np.flatnonzero(used)
+    used_indices = np.flatnonzero(is_used)
     normalised_residual = ((xp.asarray(predicted) - xp.asarray(measured)) / xp.asarray(deviation))[used_indices]
     if xp is jnp or not isinstance(status, Status):
         is_invalid = ~(jnp.isfinite(conductivity).all() & jnp.isfinite(normalised_residual).all())
@@ -233,10 +233,10 @@ def reconstruct(
     )
 
 
-def _check_protocol(model: ForwardModel, used) -> None:
-    if not used.all():
-        advice = "close over the model, and put into it what varies, such as model.with_electrodes(electrodes)"
-        check_has_values("model: its protocol", model.protocol, "to leave out the channels of a mask takes", advice)
+def _check_protocol(model: ForwardModel, is_used) -> None:
+    if not is_used.all():
+        remedy = "close over the model, and put into it what varies, such as model.with_electrodes(electrodes)"
+        check_has_values("model: its protocol", model.protocol, "to leave out the channels of a mask takes", remedy)
 
 
 def _default_solver(parametrisation: Parametrisation) -> AbstractSolver:
@@ -247,7 +247,7 @@ def _default_solver(parametrisation: Parametrisation) -> AbstractSolver:
     return LevenbergMarquardt(max_steps=100) if parametrisation.unknowns else GaussNewton()
 
 
-def _solver_for(solver, prior: AbstractPrior, parametrisation: Parametrisation) -> AbstractSolver:
+def _choose_solver(solver, prior: AbstractPrior, parametrisation: Parametrisation) -> AbstractSolver:
     """Return the requested `solver`, or the default solver for the prior and the parametrisation. Raises `ValueError`
     if the solver cannot solve a problem with this prior and parametrisation."""
     if solver is None:
@@ -338,7 +338,7 @@ def _start_coefficients(start, inversion: Inversion, choice: Choice) -> Float[Ar
     return start.coefficients.at[:num_coefficients].multiply(scale)
 
 
-def _have_same_unknowns(first: Inversion, second: Inversion) -> bool:
+def _have_same_unknowns(first_inversion: Inversion, second_inversion: Inversion) -> bool:
     """Whether two problems have the same types of link, basis, penalty and unknowns, so that their coefficients agree
     in meaning."""
 
@@ -347,7 +347,7 @@ def _have_same_unknowns(first: Inversion, second: Inversion) -> bool:
             type(component) for component in (inversion.link, inversion.basis, inversion.penalty, *inversion.unknowns)
         ]
 
-    return component_types(first) == component_types(second)
+    return component_types(first_inversion) == component_types(second_inversion)
 
 
 def _mismatch_reason(model: ForwardModel, measured, background, used_indices) -> str:

@@ -125,7 +125,7 @@ class GaussNewton(AbstractSolver):
 
     def descent(self, max_steps, rtol):
         """Descent method without damping, with the arguments in place of settings that are None."""
-        return _descent_for(_or_default(self.max_steps, max_steps), _or_default(self.rtol, rtol))
+        return _create_descent(_or_default(self.max_steps, max_steps), _or_default(self.rtol, rtol))
 
 
 class LevenbergMarquardt(AbstractSolver):
@@ -161,7 +161,7 @@ class LevenbergMarquardt(AbstractSolver):
 
     def descent(self, max_steps, rtol):
         """Descent method with damping, with the arguments in place of settings that are None."""
-        return _descent_for(_or_default(self.max_steps, max_steps), _or_default(self.rtol, rtol), self.damping)
+        return _create_descent(_or_default(self.max_steps, max_steps), _or_default(self.rtol, rtol), self.damping)
 
 
 class LBFGSB(AbstractSolver):
@@ -308,8 +308,8 @@ def as_solver(
         return SOLVERS[solver]()
     if isinstance(solver, optx.AbstractLeastSquaresSolver):
         return LeastSquares(solver)
-    expected = f"one of jeit.inverse.nonlinear, such as GaussNewton(), a name ({', '.join(names)}), or optimistix's"
-    check_kind("solver", solver, AbstractSolver, f"{expected} least squares")
+    requirement = f"one of jeit.inverse.nonlinear, such as GaussNewton(), a name ({', '.join(names)}), or optimistix's"
+    check_kind("solver", solver, AbstractSolver, f"{requirement} least squares")
     return solver
 
 
@@ -352,7 +352,7 @@ def _least_squares(inversion: Inversion, start, solver, max_steps: int, options:
     return optx.least_squares(residual, solver, start, inversion, options=options, max_steps=max_steps, throw=False)
 
 
-def _descent_for(max_steps: int, rtol: float, damping: float = 0.0) -> Descent:
+def _create_descent(max_steps: int, rtol: float, damping: float = 0.0) -> Descent:
     """Descent of at most `max_steps` steps, with a history that also contains the start. `atol` ends the iteration when
     the objective tends to zero, as for an undisturbed frame, where no change is small relative to the objective."""
     return Descent(rtol=rtol, atol=0.5 * rtol, damping=damping, history=max_steps + 1)
@@ -391,12 +391,12 @@ def _minimise_in_box(minimise, inversion: Inversion, start, box, max_steps: int,
     lower, upper = box
     if not has_values(inversion, start, box):
         problem, frozen_start, *bounds = undifferentiated((inversion, start, lower, upper))
-        minimum = minimise_between(
+        minimum = minimise_within_bounds(
             problem, frozen_start, bounds[0], bounds[1], minimise, int(max_steps), float(tolerance)
         )
         status = jnp.where(minimum.converged, Status.CONVERGED.number, Status.STEP_LIMIT.number)
         return _traced_solution(inversion, start, minimum.x, minimum.steps, status, box)
-    minimum = minimise_between(inversion, start, lower, upper, minimise, int(max_steps), float(tolerance))
+    minimum = minimise_within_bounds(inversion, start, lower, upper, minimise, int(max_steps), float(tolerance))
     costs = _costs_at(inversion, start, minimum.x)
     if minimum.converged:
         reason = "No step between the bounds would change the image much."
@@ -406,16 +406,16 @@ def _minimise_in_box(minimise, inversion: Inversion, start, box, max_steps: int,
 
 
 @eqx.filter_jit
-def minimise_between(
+def minimise_within_bounds(
     inversion: Inversion,
     start: Float[Array, " n"],
-    lower: Float[Array, " n"],
-    upper: Float[Array, " n"],
+    lower_bounds: Float[Array, " n"],
+    upper_bounds: Float[Array, " n"],
     minimise,
     max_steps: int,
     tolerance: float,
 ) -> BoundedMinimum:
-    """Minimise the objective between `lower` and `upper` bounds with the function `minimise`, which is
+    """Minimise the objective between `lower_bounds` and `upper_bounds` with the function `minimise`, which is
     `jeit_solvers.lbfgsb` or `projected_gradient`.
 
     Coefficients are divided by a scale computed from the curvature of the objective. The iteration has converged when a
@@ -428,8 +428,8 @@ def minimise_between(
     minimum = minimise(
         lambda scaled_coefficients: inversion.cost(scale * scaled_coefficients) / start_cost,
         start / scale,
-        lower / scale,
-        upper / scale,
+        lower_bounds / scale,
+        upper_bounds / scale,
         max_steps=max_steps,
         tolerance=tolerance,
     )

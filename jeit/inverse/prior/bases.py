@@ -238,9 +238,9 @@ class Regions(Module):
             )
         if number > len(label):
             raise ValueError(f"regions: the label {number - 1} is more than there are cells; use all from 0.")
-        empty = np.setdiff1d(np.arange(number), label)
-        if empty.size:
-            raise ValueError(f"regions: no cell has the label {empty[0]}; use all from 0 to {number - 1}.")
+        empty_regions = np.setdiff1d(np.arange(number), label)
+        if empty_regions.size:
+            raise ValueError(f"regions: no cell has the label {empty_regions[0]}; use all from 0 to {number - 1}.")
         return cls(
             host.array(label), host.asarray(measures(mesh)), number
         )  # copied, so that the user's array can change

@@ -68,10 +68,10 @@ class NodalSystem(NamedTuple):
         fronts = find_fronts(pattern, np.asarray(mesh.points))
         row_starts = np.arange(0, cells.size + 1, nodes_per_cell)
         shape = mesh.num_cells, mesh.num_points
-        means = scipy.sparse.csr_array(
+        mean_matrix = scipy.sparse.csr_array(
             (np.full(cells.size, 1 / nodes_per_cell), cells.ravel(), row_starts), shape=shape
         )
-        return cls(mesh, on_host(pattern), fronts, means)
+        return cls(mesh, on_host(pattern), fronts, mean_matrix)
 
     def assemble(
         self, elements: Float[np.ndarray, "..."], diagonal: Float[np.ndarray, " n"]
@@ -87,7 +87,7 @@ class NodalSystem(NamedTuple):
         """Factorise the matrix A whose entries in the pattern's order are `values`, and return a function that solves A
         X = B for columns B (n, k)."""
         factor = factorise_fronts(self.fronts, values)
-        return lambda columns: by_columns(factor.solve, columns, len(columns))
+        return lambda columns: apply_to_columns(factor.solve, columns, len(columns))
 
 
 class FactorisedMatrix(NamedTuple):
@@ -108,8 +108,8 @@ def factorise_matrix(plan: FactorisationPlan, fronts: Fronts, values: Any) -> Fa
         )
     host_factor = factorise_fronts(fronts, values)
     return FactorisedMatrix(
-        lambda columns: by_columns(host_factor.solve, columns, len(columns)),
-        lambda columns: by_columns(host_factor.half_solve, columns, len(columns)),
+        lambda columns: apply_to_columns(host_factor.solve, columns, len(columns)),
+        lambda columns: apply_to_columns(host_factor.half_solve, columns, len(columns)),
     )
 
 
@@ -117,20 +117,22 @@ def solve_columns(plan: FactorisationPlan, factor: Factor, columns: Any) -> Any:
     """Solutions of a factorised system for right-hand sides `columns` (n, k). NumPy arrays are split over all cores."""
     if not isinstance(columns, np.ndarray):
         return solve(plan, factor, columns)
-    return by_columns(functools.partial(solve, plan, factor), columns, plan.size, _COLUMNS_BY_PLAN)
+    return apply_to_columns(functools.partial(solve, plan, factor), columns, plan.size, _COLUMNS_BY_PLAN)
 
 
-def by_columns(function: Callable[[Any], Any], columns: Any, rows: int, at_once: int = _COLUMNS_BY_FRONTS) -> Any:
-    """Apply `function` to blocks of `at_once` columns of a NumPy array (n, k), in parallel on all cores; returns (rows,
-    k). `function` may itself call `by_columns` with all its columns."""
+def apply_to_columns(
+    function: Callable[[Any], Any], columns: Any, rows: int, chunk_size: int = _COLUMNS_BY_FRONTS
+) -> Any:
+    """Apply `function` to blocks of `chunk_size` columns of a NumPy array (n, k), in parallel on all cores; returns
+    (rows, k). `function` may itself call `apply_to_columns` with all its columns."""
     num_columns = columns.shape[1]
     result = np.empty((rows, num_columns), columns.dtype)
 
     def apply_to_block(start: int) -> None:
-        block = np.ascontiguousarray(columns[:, start : start + at_once])
-        result[:, start : start + at_once] = function(block)
+        block = np.ascontiguousarray(columns[:, start : start + chunk_size])
+        result[:, start : start + chunk_size] = function(block)
 
-    on_cores(apply_to_block, range(0, num_columns, at_once))
+    on_cores(apply_to_block, range(0, num_columns, chunk_size))
     return result
 
 
@@ -217,31 +219,31 @@ _COLUMNS_AT_ONCE = 64
 
 
 class GriddedGaussian:
-    """Covariance Γ_ij = exp(-|x_i - x_j|² / 2 length²) between points `places` (m, d), approximated on a grid.
+    """Covariance Γ_ij = exp(-|x_i - x_j|² / 2 length²) between points `positions` (m, d), approximated on a grid.
 
-    `places` and `length` in metres. `variance` (m,): diagonal of the approximated covariance, 1 except for
+    `positions` and `length` in metres. `variance` (m,): diagonal of the approximated covariance, 1 except for
     interpolation errors.
     """
 
-    def __init__(self, places: Float[np.ndarray, "m d"], length: float):
+    def __init__(self, positions: Float[np.ndarray, "m d"], length: float):
         spacing = length / _GRID_POINTS_PER_LENGTH
-        lower_corner = places.min(axis=0) - 1.5 * spacing
-        self._shape = tuple(int(count) for count in np.ceil((places.max(axis=0) - lower_corner) / spacing) + 2)
+        lower_corner = positions.min(axis=0) - 1.5 * spacing
+        self._shape = tuple(int(count) for count in np.ceil((positions.max(axis=0) - lower_corner) / spacing) + 2)
         grid_indices = [np.arange(count) for count in self._shape]
         self._axis_covariances = [
             np.exp(-((indices[:, None] - indices) ** 2) / (2 * _GRID_POINTS_PER_LENGTH**2)) for indices in grid_indices
         ]
-        grid_positions = (places - lower_corner) / spacing
+        grid_positions = (positions - lower_corner) / spacing
         self._interpolation = _cubic_interpolation(grid_positions, self._shape)
         weights, nodes = _cubic_weights(grid_positions), np.arange(_CUBIC)
         grid_covariance = np.exp(-((nodes[:, None] - nodes) ** 2) / (2 * _GRID_POINTS_PER_LENGTH**2))
         self.variance = np.prod(np.einsum("mdi,ij,mdj->md", weights, grid_covariance, weights), axis=1)
 
     @staticmethod
-    def suits(places: Float[np.ndarray, "m d"], length: float) -> bool:
-        """Whether the grid for points `places` has few enough points to save time."""
-        extent = np.ptp(places, axis=0) / length * _GRID_POINTS_PER_LENGTH + 5
-        return bool(np.prod(extent) < min(_MAX_GRID_RATIO * len(places), _MAX_GRID_POINTS))
+    def is_efficient(positions: Float[np.ndarray, "m d"], length: float) -> bool:
+        """Whether the grid for points `positions` has few enough points to save time."""
+        num_grid_points = np.ptp(positions, axis=0) / length * _GRID_POINTS_PER_LENGTH + 5
+        return bool(np.prod(num_grid_points) < min(_MAX_GRID_RATIO * len(positions), _MAX_GRID_POINTS))
 
     def product(self, columns: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
         """Product of the approximated covariance Γ with `columns`."""
@@ -252,25 +254,27 @@ class GriddedGaussian:
                 grid = np.moveaxis(np.tensordot(axis_covariance, grid, axes=(1, axis)), 0, axis)
             return self._interpolation @ grid.reshape(int(np.prod(self._shape)), -1)
 
-        return by_columns(product_of_block, columns, len(columns), _COLUMNS_AT_ONCE)
+        return apply_to_columns(product_of_block, columns, len(columns), _COLUMNS_AT_ONCE)
 
 
-def _cubic_weights(place: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d 4"]:
+def _cubic_weights(positions: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d 4"]:
     """Weights of cubic Lagrange interpolation from the two grid points on either side, along every axis."""
-    offset = place - np.floor(place) + 1
+    offset = positions - np.floor(positions) + 1
     nodes = np.arange(_CUBIC)
     return np.stack([np.prod([(offset - j) / (i - j) for j in nodes if j != i], axis=0) for i in nodes], axis=-1)
 
 
-def _cubic_interpolation(place: Float[np.ndarray, "m d"], shape: tuple[int, ...]) -> scipy.sparse.csr_array:
-    """Sparse matrix (m, grid points) that interpolates from a grid of the given `shape` to points `place` (m, d), in
-    units of the grid spacing."""
-    first_nodes, nodes, axis_weights = np.floor(place).astype(int) - 1, np.arange(_CUBIC), _cubic_weights(place)
-    weight, index = np.ones((len(place), 1)), np.zeros((len(place), 1), int)
+def _cubic_interpolation(positions: Float[np.ndarray, "m d"], shape: tuple[int, ...]) -> scipy.sparse.csr_array:
+    """Sparse matrix (m, grid points) that interpolates from a grid of the given `shape` to points `positions` (m, d),
+    in units of the grid spacing."""
+    first_nodes, nodes, axis_weights = np.floor(positions).astype(int) - 1, np.arange(_CUBIC), _cubic_weights(positions)
+    weight, grid_indices = np.ones((len(positions), 1)), np.zeros((len(positions), 1), int)
     for axis, axis_size in enumerate(shape):
-        weight = (weight[:, :, None] * axis_weights[:, axis, None, :]).reshape(len(place), -1)
-        index = (index[:, :, None] * axis_size + (first_nodes[:, axis, None] + nodes)[:, None, :]).reshape(
-            len(place), -1
-        )
+        weight = (weight[:, :, None] * axis_weights[:, axis, None, :]).reshape(len(positions), -1)
+        grid_indices = (
+            grid_indices[:, :, None] * axis_size + (first_nodes[:, axis, None] + nodes)[:, None, :]
+        ).reshape(len(positions), -1)
     row_starts = np.arange(0, weight.size + 1, weight.shape[1])
-    return scipy.sparse.csr_array((weight.ravel(), index.ravel(), row_starts), shape=(len(place), int(np.prod(shape))))
+    return scipy.sparse.csr_array(
+        (weight.ravel(), grid_indices.ravel(), row_starts), shape=(len(positions), int(np.prod(shape)))
+    )

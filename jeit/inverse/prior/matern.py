@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from jeit.arguments import check_has_values
 from jeit.inverse.prior.bases import DenseBasis
-from jeit.inverse.prior.linear_algebra import NodalSystem, Solve, by_columns
+from jeit.inverse.prior.linear_algebra import NodalSystem, Solve, apply_to_columns
 from jeit.inverse.prior.priors import AbstractPrior, Gaussian, Laplace, Noser, Tikhonov, informed_shapes
 from jeit.mesh import Mesh, gradients, measures
 from jeit.mesh.mesh import facet_measures
@@ -89,9 +89,9 @@ class Matern(AbstractPrior):
         return informed_shapes(np.asarray(jacobian), field.product, field.variance())
 
     def _field(self, mesh: Mesh, jacobian) -> "_MaternField":
-        advice = "take Gaussian(length), which can be differentiated"
+        remedy = "take Gaussian(length), which can be differentiated"
         check_has_values(
-            "model, or the prior's length", (mesh, jacobian, self.length), "a Matérn field is made", advice
+            "model, or the prior's length", (mesh, jacobian, self.length), "a Matérn field is made", remedy
         )
         return _MaternField.create(mesh, float(self.length))
 
@@ -138,7 +138,7 @@ class _MaternField(NamedTuple):
             nodal_columns = self.scale[:, None] * (self.means.T @ column_slice)
             return self.means @ (self.scale[:, None] * self.solve(self.mass[:, None] * self.solve(nodal_columns)))
 
-        return by_columns(multiply_block, columns, len(columns))
+        return apply_to_columns(multiply_block, columns, len(columns))
 
     def shapes(self) -> Float[np.ndarray, "m n"]:
         """Shapes S with Γ = S Sᵀ, the covariance of the cells."""

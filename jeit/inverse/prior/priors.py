@@ -28,7 +28,7 @@ from jeit.inverse.prior.bases import AbstractBasis, DenseBasis, DiagonalBasis, R
 from jeit.inverse.prior.linear_algebra import (
     GriddedGaussian,
     NodalSystem,
-    by_columns,
+    apply_to_columns,
     pivoted_cholesky,
     traced_pivoted_cholesky,
 )
@@ -246,22 +246,24 @@ class Laplace(AbstractPrior):
         pairs, _ = interior_facets(mesh)
         num_cells = mesh.num_cells
         links = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), shape=(num_cells, num_cells))
-        adjacency = (links + links.T).tocsr()
-        return 2 * (scipy.sparse.diags_array(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency).tocsr()
+        adjacency_matrix = (links + links.T).tocsr()
+        return (
+            2 * (scipy.sparse.diags_array(np.asarray(adjacency_matrix.sum(axis=1)).ravel()) - adjacency_matrix).tocsr()
+        )
 
     def basis(self, mesh, jacobian):
         """Dense basis from a Cholesky factor of Q, with a very small penalty on constant images."""
         precision = self.precision(mesh, jacobian).toarray()
         precision[np.diag_indices_from(precision)] += _DIAGONAL_TERM
-        lower = scipy.linalg.cholesky(precision, lower=True)
-        return DenseBasis(scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True).T)
+        lower_factor = scipy.linalg.cholesky(precision, lower=True)
+        return DenseBasis(scipy.linalg.solve_triangular(lower_factor, np.eye(len(lower_factor)), lower=True).T)
 
     def informed_basis(self, mesh, jacobian):
         """Basis of the shapes that the data resolve (`informed_shapes`) in a solid, with a very small penalty on
         constant images; in a sheet, `basis`."""
         if mesh.dimension != 3:
             return self.basis(mesh, jacobian)
-        covariance_product = partial(_node_covariance_product, mesh, freedom=_DIAGONAL_TERM)
+        covariance_product = partial(_node_covariance_product, mesh, degrees_of_freedom=_DIAGONAL_TERM)
         return informed_shapes(np.asarray(jacobian), covariance_product, None)
 
     def null_space(self, mesh):
@@ -298,7 +300,7 @@ class Gaussian(AbstractPrior):
         scaled_centres = centroids(mesh) / (np.sqrt(2) * self.length)
         if not has_values(scaled_centres, jacobian):
             return _traced_product(jnp.asarray(scaled_centres), jnp.asarray(jacobian))
-        if mesh.num_cells > _LARGE_MESH_CELLS and GriddedGaussian.suits(
+        if mesh.num_cells > _LARGE_MESH_CELLS and GriddedGaussian.is_efficient(
             centres := np.asarray(centroids(mesh)), float(self.length)
         ):
             return host.asarray(GriddedGaussian(centres, float(self.length)).product(np.asarray(jacobian).T))
@@ -334,7 +336,7 @@ class Gaussian(AbstractPrior):
         """Basis of the shapes that the data resolve (`informed_shapes`), computed on a grid; `basis` if the grid would
         be too large."""
         centres = np.asarray(centroids(mesh))
-        if not GriddedGaussian.suits(centres, float(self.length)):
+        if not GriddedGaussian.is_efficient(centres, float(self.length)):
             return self.basis(mesh, jacobian)
         grid = GriddedGaussian(centres, float(self.length))
         return informed_shapes(np.asarray(jacobian), grid.product, grid.variance)
@@ -369,19 +371,21 @@ def informed_shapes(
     return DenseBasis(host.asarray(shapes), host.asarray(np.maximum(variance - shape_variance, 0)))
 
 
-def _node_covariance_product(mesh: Mesh, columns: Float[np.ndarray, "m k"], freedom: float) -> Float[np.ndarray, "m k"]:
+def _node_covariance_product(
+    mesh: Mesh, columns: Float[np.ndarray, "m k"], degrees_of_freedom: float
+) -> Float[np.ndarray, "m k"]:
     """Product of Γ with `columns`, where Γ is the inverse of twice the graph Laplacian of nodes that share an edge,
-    averaged over cells. `freedom` is added to the Laplacian's diagonal; if `freedom` is 0, the value of node 0 is set
-    to zero."""
+    averaged over cells. `degrees_of_freedom` is added to the Laplacian's diagonal; if `degrees_of_freedom` is 0, the
+    value of node 0 is set to zero."""
     system = NodalSystem.create(mesh)
     neighbours = system.pattern.to_scipy(np.ones(system.pattern.num_entries))
-    diagonal = 2 * (np.asarray(neighbours.sum(axis=1)).ravel() - 1) + freedom
-    if not freedom:
+    diagonal = 2 * (np.asarray(neighbours.sum(axis=1)).ravel() - 1) + degrees_of_freedom
+    if not degrees_of_freedom:
         diagonal[0] += 2
     values = np.full(system.pattern.num_entries, -2.0)
     values[: len(diagonal)] = diagonal
-    means, solve_system = system.means, system.inverse(values)
-    return by_columns(lambda block: means @ solve_system(means.T @ block), columns, mesh.num_cells)
+    mean_matrix, solve_system = system.means, system.inverse(values)
+    return apply_to_columns(lambda block: mean_matrix @ solve_system(mean_matrix.T @ block), columns, mesh.num_cells)
 
 
 @jax.jit
@@ -402,8 +406,8 @@ def _traced_product(scaled_centres, jacobian):
 
 def check_cells(mesh: Mesh) -> None:
     """Raise `ValueError` if the mesh's cells are traced, because the prior must know which cells are neighbours."""
-    advice = "close over the mesh, and put into it what varies: eqx.tree_at(lambda m: m.points, mesh, points)"
-    check_has_values("mesh: its cells", mesh.cells, "the prior's neighbours are found from", advice)
+    remedy = "close over the mesh, and put into it what varies: eqx.tree_at(lambda m: m.points, mesh, points)"
+    check_has_values("mesh: its cells", mesh.cells, "the prior's neighbours are found from", remedy)
 
 
 def cell_factorisation(mesh: Mesh, groups) -> tuple[SparsityPattern, FactorisationPlan]:

@@ -403,8 +403,8 @@ class TotalVariationPenalty(AbstractPenalty):
 
     def _divergence(self, flux):
         """Adjoint of `_jump`, applied to a `flux` across every facet."""
-        first, second = self.pairs[:, 0], self.pairs[:, 1]
-        return sum_into(self.level.shape, first, flux) - sum_into(self.level.shape, second, flux)
+        first_cells, second_cells = self.pairs[:, 0], self.pairs[:, 1]
+        return sum_into(self.level.shape, first_cells, flux) - sum_into(self.level.shape, second_cells, flux)
 
     def _split_coefficients(self, coefficients):
         """Coefficients of the image, and coefficients of further unknowns."""

@@ -161,9 +161,9 @@ class Imager(Module):
         _check_combination(frame_solver, prior, parametrisation, memory)
         background = check_background(model, background)
         predicted = model.voltages(background)
-        frame, used = check_frame(model, predicted if reference is None else reference, mask)
-        _check_reference(np.asarray(frame)[used], np.asarray(predicted)[used])
-        deviation = check_noise(noise, frame, used)
+        frame, is_used = check_frame(model, predicted if reference is None else reference, mask)
+        _check_reference(np.asarray(frame)[is_used], np.asarray(predicted)[is_used])
+        deviation = check_noise(noise, frame, is_used)
         channels = IndependentChannels.create(model.protocol)
         independent_model = model.with_protocol(model.protocol.subset(np.asarray(channels.index)))
         inversion, _ = pose(
@@ -172,7 +172,7 @@ class Imager(Module):
                 independent_model,
                 IntegratedElectrodes(model.electrodes, model.mesh),
             ),
-            channels.weigh(_masked_noise(deviation, used)).combine(predicted),
+            channels.weigh(_masked_noise(deviation, is_used)).combine(predicted),
             background,
             prior,
             hyperparameter,
@@ -186,9 +186,9 @@ class Imager(Module):
             channels=channels,
             inversion=inversion,
             noise=as_array(deviation),
-            mask=as_array(used),
-            expected=jnp.where(used, frame, predicted),
-            offset=jnp.where(used, predicted - frame, 0),
+            mask=as_array(is_used),
+            expected=jnp.where(is_used, frame, predicted),
+            offset=jnp.where(is_used, predicted - frame, 0),
             touching=jnp.asarray(
                 [model.protocol.channels_touching(electrode) for electrode in range(model.protocol.num_electrodes)]
             ),
@@ -205,19 +205,19 @@ class Imager(Module):
         `ValueError` for a reference that has the wrong shape, lacks a reading of a channel in use, or differs from the
         model's voltages by a factor of ten or in sign.
         """
-        frame, used = np.asarray(reference, float), np.asarray(self.mask)
-        if frame.shape != used.shape:
+        frame, is_used = np.asarray(reference, float), np.asarray(self.mask)
+        if frame.shape != is_used.shape:
             raise ValueError(
-                f"reference has shape {frame.shape}; give ({used.size},), a frame of the undisturbed body."
+                f"reference has shape {frame.shape}; give ({is_used.size},), a frame of the undisturbed body."
             )
-        if (missing_channels := np.flatnonzero(used & ~np.isfinite(frame))).size:
+        if (missing_channels := np.flatnonzero(is_used & ~np.isfinite(frame))).size:
             raise ValueError(
                 f"reference has no reading of {counted(missing_channels.size, 'channel')} in use, the first number "
                 f"{missing_channels[0]}."
             )
         predicted = np.asarray(self.expected) + np.asarray(self.offset)
-        _check_reference(frame[used], predicted[used])
-        new_fields = as_array(np.where(used, frame, predicted)), as_array(np.where(used, predicted - frame, 0))
+        _check_reference(frame[is_used], predicted[is_used])
+        new_fields = as_array(np.where(is_used, frame, predicted)), as_array(np.where(is_used, predicted - frame, 0))
         return eqx.tree_at(lambda imager: (imager.expected, imager.offset), self, new_fields)
 
     @property
@@ -272,9 +272,9 @@ def _check_reference(measured, predicted) -> None:
 
 
 @either_engine
-def _masked_noise(noise, used) -> Float[Array, " M"]:
-    xp = namespace(noise, used)
-    return xp.where(used, noise, _MASKED_NOISE_RATIO * xp.max(xp.where(used, noise, 0)))
+def _masked_noise(noise, is_used) -> Float[Array, " M"]:
+    xp = namespace(noise, is_used)
+    return xp.where(is_used, noise, _MASKED_NOISE_RATIO * xp.max(xp.where(is_used, noise, 0)))
 
 
 @either_engine
@@ -300,11 +300,11 @@ def _compute_linear_map(inversion: Inversion, weighing: Weighing, offset, persis
 def _estimate_frame(imager: Imager, frame, weighing: Weighing, start) -> FrameEstimate:
     data = weighing.combine(frame + imager.offset)
     inversion = eqx.tree_at(lambda inverse_problem: inverse_problem.data, imager.inversion, data)
-    expected = jnp.zeros_like(start)
+    zero_mean = jnp.zeros_like(start)
     if imager.persistence > 0:  # the prior mean follows the last image, and the coefficients are relative to this mean
-        expected, start = start, expected
+        zero_mean, start = start, zero_mean
         inversion = eqx.tree_at(
-            lambda inverse_problem: inverse_problem.reference, inversion, inversion.estimate(expected)
+            lambda inverse_problem: inverse_problem.reference, inversion, inversion.estimate(zero_mean)
         )
     descent = imager.solver.descent(FRAME_STEPS, _RTOL)
     solution = optx.least_squares(
@@ -319,7 +319,7 @@ def _estimate_frame(imager: Imager, frame, weighing: Weighing, start) -> FrameEs
     squared_misfit = 2 * (min_cost - penalty) + data.rest
     return FrameEstimate(
         conductivity=inversion.conductivity(coefficients),
-        coefficients=expected + coefficients,
+        coefficients=zero_mean + coefficients,
         misfit=jnp.sqrt(squared_misfit / jnp.sum(weighing.noise <= jnp.max(imager.noise))),
         iterations=state.num_accepted - 1 + is_trial_better,
         converged=state.converged | (min_cost <= descent.atol),  # no step can lower the cost by more than its value

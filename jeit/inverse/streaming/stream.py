@@ -72,16 +72,16 @@ class FrameCheck:
     def __init__(
         self,
         mask: Bool[np.ndarray, " M"],
-        expected: Float[np.ndarray, " M"],
+        expected_voltages: Float[np.ndarray, " M"],
         touching: Bool[np.ndarray, "L M"],
-        tied: tuple[Int[np.ndarray, "P 2"], Float[np.ndarray, " P"]],
+        reciprocal_channels: tuple[Int[np.ndarray, "P 2"], Float[np.ndarray, " P"]],
         noise: Float[np.ndarray, " M"],
     ):
-        self.mask, self.expected, self.touching = mask, expected, touching
-        self.first, self.second = tied[0].T
-        self.ratio = tied[1]
+        self.mask, self.expected_voltages, self.touching = mask, expected_voltages, touching
+        self.first, self.second = reciprocal_channels[0].T
+        self.ratio = reciprocal_channels[1]
         self.pair_weights = 1 / np.hypot(noise[self.first], noise[self.second] / self.ratio)
-        self.expected_norm = np.linalg.norm(expected[mask])
+        self.expected_norm = np.linalg.norm(expected_voltages[mask])
         self.max_ordinary_square = (_SUSPECT_FACTOR * self.expected_norm) ** 2
 
     @np.errstate(over="ignore")  # a frame whose square overflows is treated as faulty
@@ -91,7 +91,7 @@ class FrameCheck:
         values, usable, status, reason = self._inspect(frame)
         if status == FrameStatus.REFUSED:
             return values, usable, status, reason
-        change = np.where(usable, values - self.expected, 0)
+        change = np.where(usable, values - self.expected_voltages, 0)
         if np.linalg.norm(change) <= _EQUAL_TOLERANCE * self.expected_norm:
             return values, usable, FrameStatus.UNCHANGED, f"{reason} It equals an undisturbed frame.".lstrip()
         usable, noise_status, noise = self.judge_noise(change, usable)
@@ -108,20 +108,20 @@ class FrameCheck:
         noise, power = np.where(is_pair, (first - second) ** 2, 0), np.sum((first + second)[is_pair] ** 2)
         noise_power, num_pairs = noise.sum(), np.count_nonzero(is_pair)
         has_signal = (power - noise_power) * np.sqrt(num_pairs) > 2 * _MIN_EVIDENCE * noise_power
-        level = 2 * np.sum((self.pair_weights * self.expected[self.first])[is_pair] ** 2)
+        level = 2 * np.sum((self.pair_weights * self.expected_voltages[self.first])[is_pair] ** 2)
         if noise_power > _LARGEST_NOISE**2 * level:
-            share = np.sqrt(noise_power / level)
-            num_others = np.maximum((is_pair & ~self.touching[:, self.first]).sum(axis=1), 1)
-            others = (noise * ~self.touching[:, self.first]).sum(axis=1) / num_others
-            electrode = int(np.argmin(others))
-            remaining = usable & ~self.touching[electrode]
-            if others[electrode] < _MAX_REMAINING_SHARE**2 * noise_power / num_pairs and np.count_nonzero(
-                remaining
+            noise_fractions = np.sqrt(noise_power / level)
+            num_pairs_of_others = np.maximum((is_pair & ~self.touching[:, self.first]).sum(axis=1), 1)
+            noise_of_others = (noise * ~self.touching[:, self.first]).sum(axis=1) / num_pairs_of_others
+            electrode = int(np.argmin(noise_of_others))
+            remaining_channels = usable & ~self.touching[electrode]
+            if noise_of_others[electrode] < _MAX_REMAINING_SHARE**2 * noise_power / num_pairs and np.count_nonzero(
+                remaining_channels
             ) >= _MIN_CHANNELS * np.count_nonzero(self.mask):
                 reason = f"Electrode {electrode + 1} breaks reciprocity: its contact is bad. Its channels are left out."
-                return remaining, FrameStatus.PARTIAL, reason
+                return remaining_channels, FrameStatus.PARTIAL, reason
             if not has_signal:
-                reason = f"Noise is {share:.0%} of the voltages, by reciprocity, and hides every change."
+                reason = f"Noise is {noise_fractions:.0%} of the voltages, by reciprocity, and hides every change."
                 return usable, FrameStatus.REFUSED, reason
         if has_signal:
             return usable, None, ""
@@ -129,26 +129,31 @@ class FrameCheck:
         return usable, FrameStatus.UNCHANGED, reason
 
     def _inspect(self, frame):
-        no_channels = np.zeros_like(self.mask)
+        no_usable_channels = np.zeros_like(self.mask)
         if np.ma.isMaskedArray(frame):
             frame = np.ma.filled(frame.astype(float), np.nan)
         try:
             values = np.asarray(frame)
         except ValueError:
             return (
-                no_channels,
-                no_channels,
+                no_usable_channels,
+                no_usable_channels,
                 FrameStatus.REFUSED,
                 f"The frame is ragged, not {self.mask.size} real voltages.",
             )
         if values.dtype.kind in "US":
-            return values, no_channels, FrameStatus.REFUSED, f"The frame is text, not {self.mask.size} real voltages."
+            return (
+                values,
+                no_usable_channels,
+                FrameStatus.REFUSED,
+                f"The frame is text, not {self.mask.size} real voltages.",
+            )
         if values.shape != self.mask.shape or values.dtype.kind not in "iuf":
             is_row = values.ndim == 1 and values.dtype.kind in "iuf"
-            found = f"has {values.size} numbers" if is_row else f"is {values.dtype} of shape {values.shape}"
-            reason = f"The frame {found}, not {self.mask.size} real voltages."
-            return values, no_channels, FrameStatus.REFUSED, reason
-        change = (values - self.expected)[self.mask]
+            shape_text = f"has {values.size} numbers" if is_row else f"is {values.dtype} of shape {values.shape}"
+            reason = f"The frame {shape_text}, not {self.mask.size} real voltages."
+            return values, no_usable_channels, FrameStatus.REFUSED, reason
+        change = (values - self.expected_voltages)[self.mask]
         if change @ change < self.max_ordinary_square:  # False for frames with NaN and for frames of zeros
             return values, self.mask, FrameStatus.IMAGED, ""
         finite = np.isfinite(values)
@@ -162,8 +167,13 @@ class FrameCheck:
                 f"Only {num_usable} of {np.count_nonzero(self.mask)} channels can be used.",
             )
         if not values[usable].any():
-            return values, no_channels, FrameStatus.REFUSED, "All channels read zero; the current source has failed."
-        difference = np.where(usable, values - self.expected, 0)
+            return (
+                values,
+                no_usable_channels,
+                FrameStatus.REFUSED,
+                "All channels read zero; the current source has failed.",
+            )
+        difference = np.where(usable, values - self.expected_voltages, 0)
         relative_change = np.linalg.norm(difference) / self.expected_norm
         if relative_change > _SUSPECT_FACTOR:
             usable, reason = self._remove_dead_electrode(difference, usable)
@@ -173,7 +183,7 @@ class FrameCheck:
                 return self._remove_saturated_channels(values, difference, usable, is_saturated)
             if relative_change > _LARGEST_DIFFERENCE:
                 reason = f"It differs by {relative_change:.0%} from an undisturbed frame: another sensor's, or a fault."
-                return values, no_channels, FrameStatus.REFUSED, reason
+                return values, no_usable_channels, FrameStatus.REFUSED, reason
         if num_usable < np.count_nonzero(self.mask):
             num_missing = int(np.count_nonzero(self.mask) - num_usable)
             reason = f"Left out: {counted(num_missing, 'channel')} without a reading."
@@ -190,11 +200,11 @@ class FrameCheck:
         electrode = int(np.argmin(remaining_changes))
         if not np.isfinite(remaining_changes[electrode]):
             return usable, ""
-        electrode_channels, other_channels = usable & self.touching[electrode], usable & ~self.touching[electrode]
-        expected_channels = electrode_channels & (self.expected != 0)
+        electrode_channels, channels_of_others = usable & self.touching[electrode], usable & ~self.touching[electrode]
+        expected_channels = electrode_channels & (self.expected_voltages != 0)
         is_dead = (
             expected_channels.any()
-            and np.median(np.abs(difference[expected_channels]) / np.abs(self.expected[expected_channels]))
+            and np.median(np.abs(difference[expected_channels]) / np.abs(self.expected_voltages[expected_channels]))
             > _MIN_DEAD_CHANGE
         )
         explains_change = remaining_changes[electrode] <= min(
@@ -202,23 +212,24 @@ class FrameCheck:
         )
         if not (is_dead and explains_change):
             return usable, ""
-        return other_channels, f"Electrode {electrode + 1} seems to be dead; its channels are left out."
+        return channels_of_others, f"Electrode {electrode + 1} seems to be dead; its channels are left out."
 
     def _saturated_channels(self, values, usable):
         """Mask (M,) of the channels at which the amplifier is saturated."""
-        is_far = np.abs(values - self.expected) > _SUSPECT_FACTOR * np.abs(self.expected)
+        is_far = np.abs(values - self.expected_voltages) > _SUSPECT_FACTOR * np.abs(self.expected_voltages)
         is_saturated = np.zeros_like(usable)
-        for extreme in (values[usable].max(), values[usable].min()):
-            at_extreme = usable & (values == extreme)
-            if np.count_nonzero(at_extreme) < _MIN_SATURATED or not extreme:
+        for extreme_value in (values[usable].max(), values[usable].min()):
+            is_at_extreme = usable & (values == extreme_value)
+            if np.count_nonzero(is_at_extreme) < _MIN_SATURATED or not extreme_value:
                 continue
             # Channels whose readings are equal by symmetry, as in simulated frames, are also equal in the undisturbed
             # frame.
             if (
-                is_far[at_extreme].all()
-                and np.ptp(self.expected[at_extreme]) > _EQUAL_EXPECTED * np.abs(self.expected[at_extreme]).max()
+                is_far[is_at_extreme].all()
+                and np.ptp(self.expected_voltages[is_at_extreme])
+                > _EQUAL_EXPECTED * np.abs(self.expected_voltages[is_at_extreme]).max()
             ):
-                is_saturated |= at_extreme
+                is_saturated |= is_at_extreme
         return is_saturated
 
     def _remove_saturated_channels(self, values, difference, usable, is_saturated):
@@ -380,14 +391,14 @@ class StreamState:
         self.usable = usable
         self.weighing = self.imager.weighing(jnp.asarray(usable))
         if self.imager.solver.is_linear:
-            linear = self.imager.linear_map(self.weighing)
+            linear_map = self.imager.linear_map(self.weighing)
             # Reading the matrix takes most of the time of a linear image. The matrix multiplies differences, so single
             # precision suffices; BLAS reads the matrix in half the time in column-major order.
-            self.matrix = np.asfortranarray(linear.matrix, np.float32)
-            self.estimator = np.asarray(linear.estimator)
+            self.matrix = np.asfortranarray(linear_map.matrix, np.float32)
+            self.estimator = np.asarray(linear_map.estimator)
             self.expected_weights = self.estimator @ self.expected
-            self.carry_matrix = np.asarray(linear.carry)
-            self.level = np.asarray(linear.level) + np.asarray(linear.matrix) @ self.expected_weights
+            self.carry_matrix = np.asarray(linear_map.carry)
+            self.level = np.asarray(linear_map.level) + np.asarray(linear_map.matrix) @ self.expected_weights
 
     def _estimate(self, frame):
         """Image a checked frame. Returns the conductivity, the misfit, the number of iterations, and whether the image

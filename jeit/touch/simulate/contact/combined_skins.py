@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from jeit.arguments import is_number, real_array
 from jeit.forward import ForwardModel
 from jeit.forward.model import channel_voltages, check_model
-from jeit.forward.system import cell_conductivity, check_conductivity, ground_conductance, stiffness, with_ground
+from jeit.forward.system import append_ground, cell_conductivity, check_conductivity, ground_conductance, stiffness
 from jeit.forward.transfer import contact_resistance, electrode_impedance
 from jeit.mesh import measures
 from jeit.touch.simulate.contact.indenters import AbstractIndenter, check_indenter
@@ -101,7 +101,7 @@ class TwoSheets(Module):
         ground_conductances = ground_conductance(self.pattern.diagonal(matrix), loads)
         matrix = matrix + self.pattern.assemble(None, *contact.mass)
         matrix[: len(ground_conductances)] += ground_conductances
-        admittance = quadratic_form(self.plan, factorise(self.plan, matrix), with_ground(loads, ground_conductances))
+        admittance = quadratic_form(self.plan, factorise(self.plan, matrix), append_ground(loads, ground_conductances))
         impedance = electrode_impedance(admittance, contact_resistance(electrodes, contact))
         return np.asarray(channel_voltages(on_host(self.model.protocol), impedance))
 
