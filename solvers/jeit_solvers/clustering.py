@@ -103,17 +103,17 @@ def _check_count(name: str, count: int) -> None:
 
 
 @partial(jax.jit, static_argnums=(3, 4))
-def _kmeans(points, key, stop: tuple[Any, Any], num_clusters: int, restarts: int) -> KMeans:
+def _kmeans(points, key, stopping_criteria: tuple[Any, Any], num_clusters: int, restarts: int) -> KMeans:
     # Labels have no derivative. The derivative of the means for constant labels needs no loop.
     find_best = in_turn(partial(_best_restart, num_clusters, restarts))
-    best_state = find_best(jax.lax.stop_gradient(points), key, stop)
+    best_state = find_best(jax.lax.stop_gradient(points), key, stopping_criteria)
     centres = _cluster_means(points, best_state.labels, best_state.centres)
     return KMeans(
         centres=centres,
         labels=best_state.labels,
         inertia=jnp.sum((points - centres[best_state.labels]) ** 2),
         steps=best_state.steps,
-        converged=best_state.settled,
+        converged=best_state.is_converged,
     )
 
 
@@ -126,11 +126,11 @@ class _State(Module):
     distance: Float[Array, " n"]
     inertia: Float[Array, ""]
     steps: Int[Array, ""]
-    settled: Bool[Array, ""]
+    is_converged: Bool[Array, ""]
 
 
-def _best_restart(num_clusters: int, restarts: int, points, key, stop) -> _State:
-    """Result of the restart with the smallest inertia. `stop`: maximum number of steps, and tolerance."""
+def _best_restart(num_clusters: int, restarts: int, points, key, stopping_criteria) -> _State:
+    """Result of the restart with the smallest inertia. `stopping_criteria`: maximum number of steps, and tolerance."""
     mean = jnp.mean(points, axis=0)
     centred = points - mean
     squares = jnp.sum(centred**2, axis=1)
@@ -140,8 +140,8 @@ def _best_restart(num_clusters: int, restarts: int, points, key, stop) -> _State
     draws = jax.random.uniform(key, (restarts, num_clusters, _num_candidates(num_clusters)), points.dtype)
     starts = jax.vmap(lambda draws: _kmeans_plus_plus(centred, squares, draws))(draws)
     descend = in_turn(_lloyd)
-    ends = jax.vmap(lambda start: descend(start, centred, squares, stop))(starts)
-    best_end = jax.tree.map(lambda array: array[jnp.argmin(ends.inertia)], ends)
+    final_states = jax.vmap(lambda start: descend(start, centred, squares, stopping_criteria))(starts)
+    best_end = jax.tree.map(lambda array: array[jnp.argmin(final_states.inertia)], final_states)
     return eqx.tree_at(lambda state: state.centres, best_end, best_end.centres + mean)
 
 
@@ -156,8 +156,8 @@ def _kmeans_plus_plus(points, squares, draws: Float[Array, "k trials"]) -> Float
     numbers from 0 to 1."""
     last_index = len(points) - 1
 
-    def squared_distances(index):
-        return jnp.maximum(squares[index][:, None] - 2 * points[index] @ points.T + squares, 0)
+    def squared_distances(point_indices):
+        return jnp.maximum(squares[point_indices][:, None] - 2 * points[point_indices] @ points.T + squares, 0)
 
     def add_centre(nearest_distances, draws):
         cumulative_weights = jnp.cumsum(nearest_distances)
@@ -169,31 +169,33 @@ def _kmeans_plus_plus(points, squares, draws: Float[Array, "k trials"]) -> Float
         best_index = jnp.argmin(jnp.sum(lowered_distances, axis=1))
         return lowered_distances[best_index], candidates[best_index]
 
-    first = jnp.minimum((draws[0, :1] * len(points)).astype(int), last_index)
-    _, others = jax.lax.scan(add_centre, squared_distances(first)[0], draws[1:])
-    return points[jnp.concatenate([first, others])]
+    first_index = jnp.minimum((draws[0, :1] * len(points)).astype(int), last_index)
+    _, other_indices = jax.lax.scan(add_centre, squared_distances(first_index)[0], draws[1:])
+    return points[jnp.concatenate([first_index, other_indices])]
 
 
-def _lloyd(start, points, squares, stop) -> _State:
+def _lloyd(start, points, squares, stopping_criteria) -> _State:
     """Alternate between computing the means of the clusters and assigning points to the nearest means, until nothing
-    changes. `stop`: maximum number of steps, and tolerance."""
+    changes. `stopping_criteria`: maximum number of steps, and tolerance."""
     num_clusters = len(start)
-    max_steps, tolerance = stop
+    max_steps, tolerance = stopping_criteria
     max_moved = -(-num_clusters // 3)
 
-    def score(centres):
+    def compute_scores(centres):
         """Squared distances between `centres` and points, minus the squared norms of the points."""
         return jnp.sum(centres**2, axis=1)[:, None] - 2 * centres @ points.T
 
-    def score_moved(scores, centres, moved):
+    def update_scores(scores, centres, is_moved):
         """Update the scores of the centres that moved. After a few steps most centres do not move, and their scores do
         not change."""
 
-        def score_some():
-            index = jnp.nonzero(moved, size=max_moved, fill_value=num_clusters)[0]
-            return scores.at[index].set(score(jnp.take(centres, index, axis=0, mode="clip")), mode="drop")
+        def score_moved_centres():
+            centre_indices = jnp.nonzero(is_moved, size=max_moved, fill_value=num_clusters)[0]
+            return scores.at[centre_indices].set(
+                compute_scores(jnp.take(centres, centre_indices, axis=0, mode="clip")), mode="drop"
+            )
 
-        return jax.lax.cond(jnp.sum(moved) <= max_moved, score_some, lambda: score(centres))
+        return jax.lax.cond(jnp.sum(is_moved) <= max_moved, score_moved_centres, lambda: compute_scores(centres))
 
     def assign(scores):
         """Labels, distances and inertia for the nearest centres; of several equally near centres the first is used.
@@ -213,15 +215,15 @@ def _lloyd(start, points, squares, stop) -> _State:
             lambda: _fill_empty_clusters(state.labels, state.distance, counts),
         )
         centres = _cluster_means(points, labels, state.centres)
-        scores = score_moved(scores, centres, jnp.any(centres != state.centres, axis=1))
+        scores = update_scores(scores, centres, jnp.any(centres != state.centres, axis=1))
         labels, distances, inertia = assign(scores)
         settled = jnp.all(labels == state.labels) | (state.inertia - inertia <= tolerance * state.inertia)
         return _State(centres, labels, distances, inertia, state.steps + 1, settled), scores
 
     def is_unfinished(loop):
-        return ~loop[0].settled & (loop[0].steps < max_steps)
+        return ~loop[0].is_converged & (loop[0].steps < max_steps)
 
-    scores = score(start)
+    scores = compute_scores(start)
     first_state = _State(start, *assign(scores), jnp.zeros((), int), jnp.zeros((), bool))
     return jax.lax.while_loop(is_unfinished, step, (first_state, scores))[0]
 
@@ -230,8 +232,8 @@ def _fill_empty_clusters(labels, distance, counts) -> Int[Array, " n"]:
     """Assign the points that lie farthest from their centres to the empty clusters, and return the new labels."""
     is_empty = counts == 0
     spare_distances = jnp.where(counts[labels] > 1, distance, -1)
-    farthest = jax.lax.top_k(spare_distances, len(counts))[1]
-    moved_points = jnp.where(is_empty, farthest[jnp.cumsum(is_empty) - 1], len(labels))
+    farthest_points = jax.lax.top_k(spare_distances, len(counts))[1]
+    moved_points = jnp.where(is_empty, farthest_points[jnp.cumsum(is_empty) - 1], len(labels))
     return labels.at[moved_points].set(jnp.arange(len(counts)), mode="drop")
 
 
@@ -239,9 +241,9 @@ def _cluster_sizes(labels, num_clusters: int) -> Int[Array, " k"]:
     return jax.ops.segment_sum(jnp.ones_like(labels), labels, num_clusters)
 
 
-def _cluster_means(points, labels, otherwise) -> Float[Array, "k d"]:
-    """Mean of the points of each cluster; for empty clusters the rows of `otherwise` (k, d)."""
-    num_clusters = len(otherwise)
+def _cluster_means(points, labels, default_means) -> Float[Array, "k d"]:
+    """Mean of the points of each cluster; for empty clusters the rows of `default_means` (k, d)."""
+    num_clusters = len(default_means)
 
     def scattered(points, labels):
         return jax.ops.segment_sum(points, labels, num_clusters)
@@ -253,4 +255,4 @@ def _cluster_means(points, labels, otherwise) -> Float[Array, "k d"]:
     # rounding, is random.
     totals = jax.lax.platform_dependent(points, labels, cpu=scattered, default=multiplied)
     counts = _cluster_sizes(labels, num_clusters)[:, None]
-    return jnp.where(counts > 0, totals / jnp.maximum(counts, 1), otherwise)
+    return jnp.where(counts > 0, totals / jnp.maximum(counts, 1), default_means)

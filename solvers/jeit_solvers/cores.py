@@ -110,7 +110,7 @@ def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
         if len(parts) <= 1 or is_nested or not call.take_core():
             call.process_parts()
         with call.free_cores.lend() if is_nested else contextlib.nullcontext():
-            call.wait()
+            call.wait_until_done()
     if call.errors:
         raise call.errors[0]
 
@@ -120,7 +120,7 @@ class _Call:
     of the parts in memory."""
 
     def __init__(self, function: Callable[[Any], Any], parts: Sequence[Any]):
-        self.function, self.remaining = function, collections.deque(parts)
+        self.function, self.remaining_parts = function, collections.deque(parts)
         self.errors: list[BaseException] = []
         self.threads: list[Any] = []
         # A part is abandoned with the call that it belongs to, and with the calls around that.
@@ -130,7 +130,7 @@ class _Call:
 
     def take_core(self) -> bool:
         """Start a thread that processes parts, if a core is free."""
-        is_free = self.free_cores.take()
+        is_free = self.free_cores.acquire()
         if is_free:
             self.threads.append(_thread_pool(os.getpid()).submit(self._process_parts_on_core))
         return is_free
@@ -140,11 +140,11 @@ class _Call:
         calls_around, _thread.abandoned_calls = getattr(_thread, "abandoned_calls", ()), self.abandoned_calls
         try:
             with np.errstate(all="ignore"):  # every thread has its own error state
-                while self.remaining and not self.abandoned.is_set():
-                    if len(self.remaining) > 1:
+                while self.remaining_parts and not self.abandoned.is_set():
+                    if len(self.remaining_parts) > 1:
                         self.take_core()
                     try:
-                        part = self.remaining.popleft()
+                        part = self.remaining_parts.popleft()
                     except IndexError:  # another thread has taken the last part
                         break
                     self.function(part)
@@ -159,9 +159,9 @@ class _Call:
         try:
             self.process_parts()
         finally:
-            self.free_cores.give_back()
+            self.free_cores.release()
 
-    def wait(self) -> None:
+    def wait_until_done(self) -> None:
         """Wait until all threads have ended, or one of them with an error."""
         try:
             while not self.errors and (running := [thread for thread in self.threads if not thread.done()]):
@@ -187,8 +187,8 @@ def results_on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> li
     """
     results: list[Any] = [None] * len(parts)
 
-    def store(index: int) -> None:
-        results[index] = function(parts[index])
+    def store(part_index: int) -> None:
+        results[part_index] = function(parts[part_index])
 
     on_cores(store, range(len(parts)))
     return results
@@ -212,8 +212,8 @@ def check_not_abandoned() -> None:
 
 def parts_for_cores(number: int) -> list[slice]:
     """The indices 0 … `number` - 1 split into slices of about equal size, one for each core."""
-    ends = np.linspace(0, number, min(number_of_cores(), _MAX_THREADS, number) + 1).astype(int).tolist()
-    return [slice(start, stop) for start, stop in itertools.pairwise(ends)]
+    boundaries = np.linspace(0, number, min(number_of_cores(), _MAX_THREADS, number) + 1).astype(int).tolist()
+    return [slice(start, end) for start, end in itertools.pairwise(boundaries)]
 
 
 class _FreeCores:
@@ -224,7 +224,7 @@ class _FreeCores:
         self._number, self._max_threads, self._num_threads = number, number + 1, 0
         self._lock = threading.Lock()
 
-    def take(self) -> bool:
+    def acquire(self) -> bool:
         """Take a core for a thread, if one is free."""
         with self._lock:
             if self._number <= 0 or self._num_threads == self._max_threads:
@@ -232,7 +232,7 @@ class _FreeCores:
             self._number, self._num_threads = self._number - 1, self._num_threads + 1
             return True
 
-    def give_back(self) -> None:
+    def release(self) -> None:
         """Return the core of a thread that has ended."""
         with self._lock:
             self._number, self._num_threads = self._number + 1, self._num_threads - 1
@@ -294,10 +294,10 @@ def one_thread_of_blas() -> Iterator[None]:
         yield
     finally:
         with _limits_lock:
-            limit = _active_limits.pop()
-            if limit is not None:  # the first context stores the original limits, and is removed last
+            thread_limit = _active_limits.pop()
+            if thread_limit is not None:  # the first context stores the original limits, and is removed last
                 _take_control()
-                limit.restore_original_limits()
+                thread_limit.restore_original_limits()
                 _take_control()
 
 

@@ -124,8 +124,8 @@ def _inverse_cholesky_lapack(matrices: Any) -> Any:
     diagonal = np.diagonal(matrices, axis1=-2, axis2=-1)
     scale = np.ldexp(1.0, -(np.frexp(diagonal)[1] // 2)).astype(matrices.dtype)
     try:
-        lower = np.linalg.cholesky(matrices * scale[:, None] * scale[..., None])
-        return np.tril(np.linalg.inv(lower)) * scale[:, None]
+        lower_factor = np.linalg.cholesky(matrices * scale[:, None] * scale[..., None])
+        return np.tril(np.linalg.inv(lower_factor)) * scale[:, None]
     except np.linalg.LinAlgError:
         return np.full_like(matrices, np.nan)
 
@@ -160,9 +160,11 @@ def _inverse_cholesky_recursive(matrices: Inexact[Array, "batch s s"]) -> Inexac
         return _inverse_cholesky_by_rows(matrices) if is_loop else _inverse_cholesky_unrolled(matrices)
     first_size = block * -(-size // (2 * block))
     first_inverse = _inverse_cholesky_recursive(matrices[:, :first_size, :first_size])
-    lower = matrices[:, first_size:, :first_size] @ _transposed(first_inverse)
-    second_inverse = _inverse_cholesky_recursive(matrices[:, first_size:, first_size:] - lower @ _transposed(lower))
-    lower_left = -(second_inverse @ (lower @ first_inverse))
+    lower_block = matrices[:, first_size:, :first_size] @ _transposed(first_inverse)
+    second_inverse = _inverse_cholesky_recursive(
+        matrices[:, first_size:, first_size:] - lower_block @ _transposed(lower_block)
+    )
+    lower_left = -(second_inverse @ (lower_block @ first_inverse))
     xp = namespace(matrices)
     upper_rows = xp.concatenate(
         [first_inverse, xp.zeros((*first_inverse.shape[:-1], size - first_size), matrices.dtype)], axis=-1
@@ -216,10 +218,10 @@ def _inverse_cholesky_by_block_rows(matrices: Inexact[Array, "batch s s"]) -> In
     def next_rows(inverse, block_index):
         start = block_index * block
         rows = jax.lax.dynamic_slice_in_dim(matrices, start, block, axis=1)
-        lower = rows @ _transposed(inverse)
-        pivot = jax.lax.dynamic_slice_in_dim(rows, start, block, axis=2) - lower @ _transposed(lower)
-        remainder = jax.lax.dynamic_slice_in_dim(identity, start, block, axis=0) - lower @ inverse
-        new_rows = _inverse_cholesky_recursive(pivot) @ remainder
+        lower_block = rows @ _transposed(inverse)
+        pivot = jax.lax.dynamic_slice_in_dim(rows, start, block, axis=2) - lower_block @ _transposed(lower_block)
+        identity_rows = jax.lax.dynamic_slice_in_dim(identity, start, block, axis=0) - lower_block @ inverse
+        new_rows = _inverse_cholesky_recursive(pivot) @ identity_rows
         return jax.lax.dynamic_update_slice_in_dim(inverse, new_rows, start, axis=1), None
 
     inverse, _ = jax.lax.scan(next_rows, jnp.zeros_like(matrices), jnp.arange((size + padding) // block))

@@ -94,14 +94,14 @@ def _is_zero_tangent(tangent: Any) -> bool:
 
 
 def one_by_one(
-    batchable: Callable[..., Any], plain: Callable[..., Any], axis_size: int, batched: Any, *arguments: Any
+    batchable: Callable[..., Any], unbatched: Callable[..., Any], axis_size: int, batched: Any, *arguments: Any
 ) -> Any:
     """Call a function for each element of a batch: one after the other on a CPU, all at once on accelerators."""
     del axis_size
     leaves, structure = jax.tree.flatten(arguments)
     flags = jax.tree.leaves(batched)
-    batched_leaves = [leaf for leaf, flag in zip(leaves, flags, strict=True) if flag]
-    shared_leaves = [leaf for leaf, flag in zip(leaves, flags, strict=True) if not flag]
+    batched_leaves = [leaf for leaf, is_batched in zip(leaves, flags, strict=True) if is_batched]
+    shared_leaves = [leaf for leaf, is_batched in zip(leaves, flags, strict=True) if not is_batched]
 
     def call(function, own_values, constants):
         own_values, constants = iter(own_values), iter(constants)
@@ -113,7 +113,7 @@ def one_by_one(
         return jax.lax.map(lambda own_values: call(batchable, own_values, shared_leaves), batched_leaves)
 
     def call_together(batched_leaves, shared_leaves):
-        return jax.vmap(lambda own_values: call(plain, own_values, shared_leaves))(batched_leaves)
+        return jax.vmap(lambda own_values: call(unbatched, own_values, shared_leaves))(batched_leaves)
 
     return jax.lax.platform_dependent(batched_leaves, shared_leaves, cpu=call_in_turn, default=call_together)
 
@@ -259,18 +259,18 @@ class Recent:
         """Return the result of `make` for these arguments, computed now or taken from the cache."""
         cached = self._cached[::-1]
         for cached_key, _, _, result in cached:
-            if _identical(cached_key, trees):
+            if _are_identical(cached_key, trees):
                 return result
         leaves, structure = jax.tree.flatten(trees)
         for _, cached_key, treedef, result in cached:
-            if _identical(cached_key, leaves) and treedef == structure:  # structures take far longer to compare
+            if _are_identical(cached_key, leaves) and treedef == structure:  # structures take far longer to compare
                 return result
         result = self._make(*trees)
         self._cached = [*self._cached, (trees, leaves, structure, result)][-self._size :]
         return result
 
 
-def _identical(first: Sequence[Any], second: Sequence[Any]) -> bool:
+def _are_identical(first: Sequence[Any], second: Sequence[Any]) -> bool:
     return len(first) == len(second) and all(left is right for left, right in zip(first, second, strict=True))
 
 
@@ -372,9 +372,9 @@ def sum_into(shape: tuple[int, ...], index: Any, values: Inexact[Array, "*i"]) -
 def set_at(total: Shaped[Array, "*n"], index: Any, values: Any) -> Shaped[Array, "*n"]:
     """Copy of `total` with the entries at `index` replaced by `values`; JAX ignores indices beyond the end."""
     if isinstance(total, np.ndarray):
-        replaced: Any = np.array(total)
-        replaced[index] = values
-        return replaced
+        result: Any = np.array(total)
+        result[index] = values
+        return result
     return total.at[index].set(values, mode="drop")
 
 

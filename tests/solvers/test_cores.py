@@ -113,25 +113,25 @@ def test_a_free_core_helps_with_the_parts_of_a_part(monkeypatch):
 
 def test_a_thread_that_waits_lends_its_core():
     free_cores = cores._FreeCores(1)
-    assert free_cores.take()
-    assert not free_cores.take()
+    assert free_cores.acquire()
+    assert not free_cores.acquire()
     with free_cores.lend():
-        assert free_cores.take()
-        free_cores.give_back()
-    assert not free_cores.take()
+        assert free_cores.acquire()
+        free_cores.release()
+    assert not free_cores.acquire()
 
 
 def test_there_is_at_most_one_more_thread_than_cores():
     free = cores._FreeCores(2)
     for _ in range(3):  # after threads have ended, as many may begin
-        assert [free.take(), free.take(), free.take()] == [True, True, False]
+        assert [free.acquire(), free.acquire(), free.acquire()] == [True, True, False]
         with free.lend():
-            assert free.take()
+            assert free.acquire()
             with free.lend():
-                assert not free.take()
-            free.give_back()
-        free.give_back()
-        free.give_back()
+                assert not free.acquire()
+            free.release()
+        free.release()
+        free.release()
 
 
 def test_arrays_of_parts_are_freed_at_once():

@@ -123,7 +123,7 @@ def test_empty_clusters_take_the_farthest_points():
         labels, expected = lloyd(points, start, int(ended.steps))
         np.testing.assert_array_equal(ended.labels, labels)
         np.testing.assert_allclose(centres, expected, rtol=1e-10, atol=1e-12)
-    assert ended.settled
+    assert ended.is_converged
     assert set(np.asarray(ended.labels)) == set(range(10))
 
 

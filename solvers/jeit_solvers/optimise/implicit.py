@@ -140,12 +140,18 @@ def _refine(
     become shorter in the norm of the Hessian."""
 
     def step(state):
-        trial, last_point, length, num_steps, _ = state
-        trial_gradient, hessian = jax.linearize(lambda x: gradient(x, problem), trial)
+        trial_point, last_point, length, num_steps, _ = state
+        trial_gradient, hessian = jax.linearize(lambda x: gradient(x, problem), trial_point)
         direction = _conjugate_gradients(hessian, -trial_gradient, preconditioner)
         new_length = jnp.sqrt(jnp.abs(trial_gradient @ direction))
         is_shorter = new_length < length
-        return jnp.where(is_shorter, trial + direction, last_point), trial, new_length, num_steps + 1, is_shorter
+        return (
+            jnp.where(is_shorter, trial_point + direction, last_point),
+            trial_point,
+            new_length,
+            num_steps + 1,
+            is_shorter,
+        )
 
     def is_unfinished(state):
         _, _, length, num_steps, is_shorter = state

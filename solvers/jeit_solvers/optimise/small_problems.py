@@ -67,15 +67,15 @@ def solve_small(matrix: Float[Array, "n n F"], right_hand_sides: Float[Array, "n
     solve_small(small, jnp.ones((3, 100)))
     ```
     """
-    num_unknowns, lower = matrix.shape[0], _cholesky(matrix)
+    num_unknowns, lower_factor = matrix.shape[0], _cholesky(matrix)
     forward: list[Array] = []
     for i in range(num_unknowns):
-        remainder = right_hand_sides[i] - sum(lower[i, k] * forward[k] for k in range(i))
-        forward.append(remainder / lower[i, i])
+        residual = right_hand_sides[i] - sum(lower_factor[i, k] * forward[k] for k in range(i))
+        forward.append(residual / lower_factor[i, i])
     solution: dict[int, Array] = {}
     for i in reversed(range(num_unknowns)):
-        remainder = forward[i] - sum(lower[k, i] * solution[k] for k in range(i + 1, num_unknowns))
-        solution[i] = remainder / lower[i, i]
+        residual = forward[i] - sum(lower_factor[k, i] * solution[k] for k in range(i + 1, num_unknowns))
+        solution[i] = residual / lower_factor[i, i]
     return namespace(matrix, right_hand_sides).stack([solution[i] for i in range(num_unknowns)])
 
 
@@ -116,10 +116,10 @@ def hessian_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Fl
         differences = _DIFFERENCE_STEP * np.eye(len(x))[:, :, None]
 
         def second_derivative(k: int, m: int) -> Any:
-            slope_ahead, slope_behind = (
+            forward_gradient, backward_gradient = (
                 complex_slope(value, points, m) for points in (x + differences[k], x - differences[k])
             )
-            return (slope_ahead - slope_behind) / (2 * _DIFFERENCE_STEP)
+            return (forward_gradient - backward_gradient) / (2 * _DIFFERENCE_STEP)
 
         return symmetric_small([[second_derivative(k, m) for m in range(k + 1)] for k in range(len(x))])
     directions = jnp.eye(len(x))[:, :, None] * jnp.ones_like(x)
@@ -139,18 +139,18 @@ def definite_small(matrix: Float[Array, "n n F"]) -> Bool[Array, " F"]:
     definite_small(small)
     ```
     """
-    lower, xp = _cholesky(matrix), namespace(matrix)
-    diagonal = xp.stack([lower[i, i] for i in range(len(matrix))])
+    lower_factor, xp = _cholesky(matrix), namespace(matrix)
+    diagonal = xp.stack([lower_factor[i, i] for i in range(len(matrix))])
     return xp.all(xp.isfinite(diagonal) & (diagonal > 0), axis=0)
 
 
 def _cholesky(matrix: Float[Array, "n n F"]) -> dict[tuple[int, int], Array]:
-    lower: dict[tuple[int, int], Array] = {}
+    lower_factor: dict[tuple[int, int], Array] = {}
     for j in range(matrix.shape[0]):
         for i in range(j, matrix.shape[0]):
-            remainder = matrix[i, j] - sum(lower[i, k] * lower[j, k] for k in range(j))
-            lower[i, j] = namespace(matrix).sqrt(remainder) if i == j else remainder / lower[j, j]
-    return lower
+            schur_entry = matrix[i, j] - sum(lower_factor[i, k] * lower_factor[j, k] for k in range(j))
+            lower_factor[i, j] = namespace(matrix).sqrt(schur_entry) if i == j else schur_entry / lower_factor[j, j]
+    return lower_factor
 
 
 def symmetric_small(rows: Sequence[Sequence[Array]]) -> Float[Array, "n n F"]:
@@ -261,7 +261,7 @@ def minimise_small(
     xp = namespace(start, data, lower, upper)
     clipped_start = xp.clip(start, lower, upper)
     num_functions = clipped_start.shape[1]
-    no_functions = xp.zeros(num_functions, bool)
+    none_done = xp.zeros(num_functions, bool)
     state = _State(
         x=clipped_start,
         value=xp.full(num_functions, xp.inf),
@@ -269,8 +269,8 @@ def minimise_small(
         matrix=xp.eye(len(clipped_start))[:, :, None] * xp.ones_like(clipped_start),
         damping=xp.full(num_functions, 1e-2),
         num_taken=xp.zeros(num_functions, int),
-        is_done=no_functions if skip is None else skip,
-        converged=no_functions,
+        is_done=none_done if skip is None else skip,
+        converged=none_done,
     )
     num_gathered = num_functions if xp is np else num_functions // 4
     if num_gathered < _MIN_GATHERED:
@@ -280,13 +280,15 @@ def minimise_small(
             state = _take_steps(state, data, _WHOLE_BATCH_STEPS + 1, expand, limits)
 
         def continue_unfinished(state: _State) -> _State:
-            index = _first_true_indices(~state.is_done, num_gathered)
+            unfinished_indices = _first_true_indices(~state.is_done, num_gathered)
             gathered, gathered_data = jax.tree.map(
-                lambda array: xp.take(array, index, axis=-1, mode="clip"), (state, data)
+                lambda array: xp.take(array, unfinished_indices, axis=-1, mode="clip"), (state, data)
             )
-            gathered = replace(gathered, is_done=gathered.is_done | (index == num_functions))
+            gathered = replace(gathered, is_done=gathered.is_done | (unfinished_indices == num_functions))
             new_state = _take_steps(gathered, gathered_data, max_steps + 1, finish or expand, limits)
-            return jax.tree.map(lambda array, new_values: set_at(array, (..., index), new_values), state, new_state)
+            return jax.tree.map(
+                lambda array, new_values: set_at(array, (..., unfinished_indices), new_values), state, new_state
+            )
 
         state = while_loop(lambda state: ~xp.all(state.is_done), continue_unfinished, state)
     return Minimum(state.x, state.value, state.converged, xp.max(state.num_taken, initial=0))
@@ -322,8 +324,8 @@ def _take_steps(state: _State, data, steps: int, expand: Expansion, limits: _Lim
         num_iterations, state = loop
         # The first iteration only evaluates the start, from which no step has been computed yet.
         is_start = xp.isinf(state.value)
-        trial, predicted_decrease = _next_step(state, limits)
-        value, gradient, matrix = expand(trial, data)
+        trial_point, predicted_decrease = _next_step(state, limits)
+        value, gradient, matrix = expand(trial_point, data)
         is_lower = (value <= state.value) & ~state.is_done
         # A step that is clipped at a bound may increase the value; then a more damped step, closer to the negative
         # gradient, is tried.
@@ -336,7 +338,7 @@ def _take_steps(state: _State, data, steps: int, expand: Expansion, limits: _Lim
         converged = state.converged | (~state.is_done & (is_settled | (damping > _MAX_DAMPING)))
         is_invalid = is_start & ~xp.isfinite(value)
         return num_iterations + 1, _State(
-            x=xp.where(is_lower, trial, state.x),
+            x=xp.where(is_lower, trial_point, state.x),
             value=xp.where(is_lower, value, state.value),
             gradient=xp.where(is_lower, gradient, state.gradient),
             matrix=xp.where(is_lower, matrix, state.matrix),

@@ -77,18 +77,18 @@ class ConjugateGradient(MatrixSolver):
         """Iterate until the tolerance is reached. The number of steps is returned as `stats["num_steps"]`."""
         del options
         max_steps = self.max_steps or min(10 * state.pattern.size, 10_000)
-        last = conjugate_gradient(state, vector, self.tolerance, max_steps)
+        last_iterate = conjugate_gradient(state, vector, self.tolerance, max_steps)
         results = lineax.RESULTS
-        result = results.where(last.converged, results.successful, results.max_steps_reached)
-        result = results.where(last.broken_down, results.breakdown, result)
-        stats = {"num_steps": last.step, "max_steps": max_steps}
-        return last.solution, result, stats
+        result = results.where(last_iterate.converged, results.successful, results.max_steps_reached)
+        result = results.where(last_iterate.has_broken_down, results.breakdown, result)
+        stats = {"num_steps": last_iterate.step, "max_steps": max_steps}
+        return last_iterate.solution, result, stats
 
 
 class Iterate(NamedTuple):
     """State of a conjugate gradient iteration for A x = b. **Fields**: `solution`: x; `residual`: r = b - A x;
     `direction`: search direction p; `weight`: r^T M^-1 r with the preconditioner M; `step`: number of steps;
-    `converged`, `broken_down`: whether the iteration ended because it converged, or because of a breakdown."""
+    `converged`, `has_broken_down`: whether the iteration ended because it converged, or because of a breakdown."""
 
     solution: Inexact[Array, " n"]
     residual: Inexact[Array, " n"]
@@ -96,7 +96,7 @@ class Iterate(NamedTuple):
     weight: Inexact[Array, ""]
     step: Int[Array, ""]
     converged: Bool[Array, ""]
-    broken_down: Bool[Array, ""]
+    has_broken_down: Bool[Array, ""]
 
 
 def conjugate_gradient(
@@ -109,7 +109,7 @@ def conjugate_gradient(
     target = tolerance * jnp.linalg.norm(direction)
 
     def is_unfinished(iterate: Iterate):
-        return ~iterate.converged & ~iterate.broken_down & (iterate.step < max_steps)
+        return ~iterate.converged & ~iterate.has_broken_down & (iterate.step < max_steps)
 
     def one_step(iterate: Iterate) -> Iterate:
         image = operator.mv(iterate.direction)
@@ -301,8 +301,8 @@ def choose_solver(
         if factor_memory > allowed_memory:
             cg_note = "; without pyamg (pip install 'jeit[large]') conjugate gradients take several times as long"
             return ConjugateGradient(tolerance, reason=f"iterative: {comparison}{cg_note}")
-    on_cpu = jax.default_backend() == "cpu"
-    if fronts.num_operations > (_MAX_COMPILED_OPERATIONS_CPU if on_cpu else _MAX_COMPILED_OPERATIONS):
+    is_on_cpu = jax.default_backend() == "cpu"
+    if fronts.num_operations > (_MAX_COMPILED_OPERATIONS_CPU if is_on_cpu else _MAX_COMPILED_OPERATIONS):
         return FrontalCholesky(fronts, f"direct: {cost}")
     return SparseCholesky(analyse(pattern, coordinates), reason=f"direct: {cost}")
 

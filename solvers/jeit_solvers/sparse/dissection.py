@@ -30,59 +30,61 @@ def nested_dissection(graph: csr_array, depth: int, coordinates: np.ndarray | No
     distances.
     """
     size = _num_nodes(graph)
-    owner, halving = np.zeros(size, dtype=np.int64), np.arange(size)
+    front_indices, parts_to_halve = np.zeros(size, dtype=np.int64), np.arange(size)
     if coordinates is not None:
-        low, extent = coordinates.min(axis=0), max(np.ptp(coordinates, axis=0).max(), np.finfo(float).tiny)
-        coordinates = np.round((coordinates - low) / extent, _COORDINATE_DECIMALS)
+        low, bounding_size = coordinates.min(axis=0), max(np.ptp(coordinates, axis=0).max(), np.finfo(float).tiny)
+        coordinates = np.round((coordinates - low) / bounding_size, _COORDINATE_DECIMALS)
     entries = graph.tocoo()
     rows, columns = entries.coords
     for _ in range(depth):
         # All parts of a level are halved at once; a separator belongs to the tree node that it separates.
-        inside = np.full(size, -1)
-        tree_nodes, inside[halving] = np.unique(owner[halving], return_inverse=True)
-        rows, columns = _edges_within_parts(inside, rows, columns)
-        side = _halve_parts(graph, rows, columns, inside, tree_nodes.size, coordinates)
-        halving = halving[side[halving] < 2]
-        owner[halving] = 2 * owner[halving] + 1 + side[halving]
-    return owner
+        local_indices = np.full(size, -1)
+        tree_nodes, local_indices[parts_to_halve] = np.unique(front_indices[parts_to_halve], return_inverse=True)
+        rows, columns = _edges_within_parts(local_indices, rows, columns)
+        side = _halve_parts(graph, rows, columns, local_indices, tree_nodes.size, coordinates)
+        parts_to_halve = parts_to_halve[side[parts_to_halve] < 2]
+        front_indices[parts_to_halve] = 2 * front_indices[parts_to_halve] + 1 + side[parts_to_halve]
+    return front_indices
 
 
-def _edges_within_parts(part: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _edges_within_parts(
+    part_of_node: np.ndarray, rows: np.ndarray, columns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Edges, as `rows` and `columns`, that connect two nodes of the same part of a graph."""
-    is_inside = (part[rows] == part[columns]) & (part[rows] >= 0)
+    is_inside = (part_of_node[rows] == part_of_node[columns]) & (part_of_node[rows] >= 0)
     return rows[is_inside], columns[is_inside]
 
 
 def _halve_parts(
-    graph: csr_array, rows: np.ndarray, columns: np.ndarray, part: np.ndarray, num_parts: int, coordinates
+    graph: csr_array, rows: np.ndarray, columns: np.ndarray, part_of_node: np.ndarray, num_parts: int, coordinates
 ) -> np.ndarray:
     """Halve every part of a graph. Returns for every node (n,) 0 or 1 for the halves, 2 for the separator between them.
 
-    `part`: (n,) index of the part of each node, -1 for none; `num_parts`: number of parts; `rows`, `columns`: edges
-    within parts. Several separators are tried for each part; the best separator minimises its number of nodes plus a
-    penalty for imbalance of the halves.
+    `part_of_node`: (n,) index of the part of each node, -1 for none; `num_parts`: number of parts; `rows`, `columns`:
+    edges within parts. Several separators are tried for each part; the best separator minimises its number of nodes
+    plus a penalty for imbalance of the halves.
     """
-    nodes = np.flatnonzero(part >= 0)
-    node_parts = part[nodes]
+    nodes = np.flatnonzero(part_of_node >= 0)
+    node_parts = part_of_node[nodes]
     counts = np.bincount(node_parts, minlength=num_parts)
     # Fronts are padded to the largest front of their stage. The smaller the part, the more an even split is worth, and
     # the less an additional node in the separator costs.
     is_small = counts < 400
     price_of_imbalance = np.where(is_small, 0.5, 0.1)
-    best_side, best_cost = np.full(part.size, 2), np.full(num_parts, np.inf)
+    best_side, best_cost = np.full(part_of_node.size, 2), np.full(num_parts, np.inf)
     for key in _splitting_functions(graph, nodes, node_parts, num_parts, coordinates):
-        order = np.lexsort((key, node_parts))
+        sort_order = np.lexsort((key, node_parts))
         rank = np.empty(nodes.size, dtype=np.int64)
-        rank[order] = np.arange(nodes.size) - np.repeat(np.cumsum(counts) - counts, counts)
+        rank[sort_order] = np.arange(nodes.size) - np.repeat(np.cumsum(counts) - counts, counts)
         for off_middle in (-1, 0, 1):
-            share = 0.5 + off_middle * np.where(is_small, 0.04, 0.05)
-            below = np.maximum(1, np.rint(share * counts)).astype(np.int64)
-            side = np.zeros(part.size, dtype=np.int64)
-            side[nodes] = rank >= below[node_parts]
-            crossing = side[columns] > side[rows]
-            side[_minimum_vertex_cover(rows[crossing], columns[crossing])] = 2
-            halves = np.bincount(3 * node_parts + side[nodes], minlength=3 * num_parts).reshape(-1, 3)
-            cost = halves[:, 2] + price_of_imbalance * np.abs(halves[:, 0] - halves[:, 1])
+            lower_fraction = 0.5 + off_middle * np.where(is_small, 0.04, 0.05)
+            num_below = np.maximum(1, np.rint(lower_fraction * counts)).astype(np.int64)
+            side = np.zeros(part_of_node.size, dtype=np.int64)
+            side[nodes] = rank >= num_below[node_parts]
+            is_crossing = side[columns] > side[rows]
+            side[_minimum_vertex_cover(rows[is_crossing], columns[is_crossing])] = 2
+            side_counts = np.bincount(3 * node_parts + side[nodes], minlength=3 * num_parts).reshape(-1, 3)
+            cost = side_counts[:, 2] + price_of_imbalance * np.abs(side_counts[:, 0] - side_counts[:, 1])
             is_better = cost < best_cost
             best_cost[is_better] = cost[is_better]
             changed_nodes = nodes[is_better[node_parts]]
@@ -91,33 +93,33 @@ def _halve_parts(
 
 
 def _splitting_functions(
-    graph: csr_array, nodes: np.ndarray, part: np.ndarray, num_parts: int, coordinates
+    graph: csr_array, nodes: np.ndarray, part_of_node: np.ndarray, num_parts: int, coordinates
 ) -> list[np.ndarray]:
     """Functions on `nodes` (k,) by which parts can be split, into the nodes where a function is below a value and the
     nodes where the function is above this value."""
     if coordinates is not None:
-        return _projected_coordinates(coordinates[nodes], part, num_parts)
-    order = np.argsort(part, kind="stable")
+        return _projected_coordinates(coordinates[nodes], part_of_node, num_parts)
+    sort_order = np.argsort(part_of_node, kind="stable")
     key = np.empty(nodes.size)
-    for members in np.split(order, np.cumsum(np.bincount(part, minlength=num_parts))[:-1]):
+    for members in np.split(sort_order, np.cumsum(np.bincount(part_of_node, minlength=num_parts))[:-1]):
         part_nodes = nodes[members]
         key[members] = _distance_function(graph[part_nodes][:, part_nodes])
     return [key]
 
 
-def _projected_coordinates(coordinates: np.ndarray, part: np.ndarray, num_parts: int) -> list[np.ndarray]:
+def _projected_coordinates(coordinates: np.ndarray, part_of_node: np.ndarray, num_parts: int) -> list[np.ndarray]:
     """Coordinates of the nodes along the long axis of their part, and along two directions at an angle to this axis,
     because nearly square parts have no clear long axis."""
     dimension = coordinates.shape[1]
 
-    def sums(values):
-        return np.stack([np.bincount(part, column, num_parts) for column in values.T], axis=1)
+    def sum_over_parts(values):
+        return np.stack([np.bincount(part_of_node, column, num_parts) for column in values.T], axis=1)
 
-    counts = np.maximum(np.bincount(part, minlength=num_parts), 1)[:, None]
-    centred = coordinates - (sums(coordinates) / counts)[part]
-    spread = sums((centred[:, :, None] * centred[:, None]).reshape(-1, dimension**2))
-    _, axes = np.linalg.eigh(spread.reshape(num_parts, dimension, dimension))
-    projected = np.einsum("ni,nij->nj", centred, axes[part][:, :, ::-1])
+    counts = np.maximum(np.bincount(part_of_node, minlength=num_parts), 1)[:, None]
+    centred = coordinates - (sum_over_parts(coordinates) / counts)[part_of_node]
+    covariances = sum_over_parts((centred[:, :, None] * centred[:, None]).reshape(-1, dimension**2))
+    _, axes = np.linalg.eigh(covariances.reshape(num_parts, dimension, dimension))
+    projected = np.einsum("ni,nij->nj", centred, axes[part_of_node][:, :, ::-1])
     if dimension == 1:
         return [projected[:, 0]]
     long_axis, next_axis = projected[:, 0], projected[:, 1]
@@ -136,11 +138,11 @@ def _distance_function(graph: csr_array) -> np.ndarray:
     sizes = np.bincount(label)
     rank = np.empty(count, dtype=np.int64)
     rank[np.argsort(-sizes, kind="stable")] = np.arange(count)
-    largest = np.flatnonzero(rank[label] == 0)
-    if 2 * largest.size <= size:
+    largest_components = np.flatnonzero(rank[label] == 0)
+    if 2 * largest_components.size <= size:
         return rank[label].astype(float)
     key = np.full(size, np.inf)
-    key[largest] = _distance_difference(graph[largest][:, largest])
+    key[largest_components] = _distance_difference(graph[largest_components][:, largest_components])
     return key
 
 
@@ -148,40 +150,40 @@ def _distance_difference(graph: csr_array) -> np.ndarray:
     """Difference of each node's graph distances to two nodes that lie far apart. Nodes with equal differences lie
     nearly on a straight line."""
     start = breadth_first_order(graph, 0, directed=False, return_predecessors=False)[-1]
-    from_start = _graph_distances(graph, start)
-    end = int(np.argmax(from_start))
-    from_end = _graph_distances(graph, end)
-    return (from_start - from_end) + 1e-3 * from_start
+    distances_from_start = _graph_distances(graph, start)
+    end = int(np.argmax(distances_from_start))
+    distances_from_end = _graph_distances(graph, end)
+    return (distances_from_start - distances_from_end) + 1e-3 * distances_from_start
 
 
 def _graph_distances(graph: csr_array, start: int) -> np.ndarray:
     """Number of edges between `start` and every node of a connected graph."""
-    order, predecessor = breadth_first_order(graph, start, directed=False)
+    visit_order, predecessor = breadth_first_order(graph, start, directed=False)
     position = np.empty(_num_nodes(graph), dtype=np.int64)
-    position[order] = np.arange(order.size)
+    position[visit_order] = np.arange(visit_order.size)
     # Breadth-first order lists layer after layer, and parents before children: a layer ends where the parents leave the
     # previous layer.
-    parent = position[predecessor[order[1:]]]
-    distance = np.zeros(order.size)
+    parent = position[predecessor[visit_order[1:]]]
+    distance = np.zeros(visit_order.size)
     layer_start, layer = 1, 1
-    while layer_start < order.size:
+    while layer_start < visit_order.size:
         layer_end = layer_start + int(np.searchsorted(parent[layer_start - 1 :], layer_start, side="left"))
         distance[layer_start:layer_end] = layer
         layer_start, layer = layer_end, layer + 1
-    result = np.empty(order.size)
-    result[order] = distance
+    result = np.empty(visit_order.size)
+    result[visit_order] = distance
     return result
 
 
-def _minimum_vertex_cover(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+def _minimum_vertex_cover(lower_nodes: np.ndarray, upper_nodes: np.ndarray) -> np.ndarray:
     """Smallest set of nodes that contains at least one end of every edge (lower[i], upper[i]). By König's theorem this
     set has as many nodes as a maximum matching has edges."""
-    if lower.size == 0:
+    if lower_nodes.size == 0:
         return np.empty(0, dtype=np.int64)
-    left_nodes, left_local = np.unique(lower, return_inverse=True)
-    right_nodes, right_local = np.unique(upper, return_inverse=True)
+    left_nodes, left_local = np.unique(lower_nodes, return_inverse=True)
+    right_nodes, right_local = np.unique(upper_nodes, return_inverse=True)
     edges = csr_array(
-        (np.ones(lower.size, dtype=np.int8), (left_local, right_local)), shape=(left_nodes.size, right_nodes.size)
+        (np.ones(lower_nodes.size, dtype=np.int8), (left_local, right_local)), shape=(left_nodes.size, right_nodes.size)
     )
     match_of_left = maximum_bipartite_matching(edges, perm_type="column")
     match_of_right = np.full(right_nodes.size, -1)

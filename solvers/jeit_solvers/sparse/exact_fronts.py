@@ -148,8 +148,8 @@ def _build_fronts(
     size: int, rows: np.ndarray, columns: np.ndarray, coordinates: np.ndarray | None, key: bytes
 ) -> Fronts:
     depth = max(0, int(np.ceil(np.log2(size / _LEAF_SIZE))))
-    owner = nested_dissection(graph_of(rows, columns, size), depth, coordinates)
-    nodes, owner = np.unique(owner, return_inverse=True)
+    front_indices = nested_dissection(graph_of(rows, columns, size), depth, coordinates)
+    nodes, front_indices = np.unique(front_indices, return_inverse=True)
     level = np.floor(np.log2(nodes + 1)).astype(int)
     top_levels = min(_LEVELS_ABOVE_SUBTREES, depth)
     # Steps: the subtrees are number 0, the levels above them 1, 2, …
@@ -157,10 +157,10 @@ def _build_fronts(
     subtree = np.where(steps_of_nodes, 0, (nodes + 1) >> np.maximum(level - top_levels, 0))
     old_numbers = np.lexsort((_post_order_positions(nodes, level, depth), subtree, steps_of_nodes))
     new_numbers = np.argsort(old_numbers)
-    tree = _EliminationTree(size, rows, columns, new_numbers[owner], level[old_numbers], coordinates)
+    tree = _EliminationTree(size, rows, columns, new_numbers[front_indices], level[old_numbers], coordinates)
     part_of_front = np.where(steps_of_nodes, nodes, subtree)[old_numbers]
     starts = np.flatnonzero(np.diff(part_of_front, prepend=-1))
-    slices = [slice(start, stop) for start, stop in itertools.pairwise([*starts.tolist(), len(nodes)])]
+    slices = [slice(start, end) for start, end in itertools.pairwise([*starts.tolist(), len(nodes)])]
     step_of = steps_of_nodes[old_numbers][starts]
     steps = tuple(tuple(itertools.compress(slices, step_of == step_number)) for step_number in range(top_levels + 1))
     top = int(tree.pivots[: np.count_nonzero(steps_of_nodes == 0)].sum())
@@ -193,14 +193,14 @@ class _EliminationTree:
         self.front = front_of_row[self.order]
         count = len(level)
         self.pivots = np.bincount(self.front, minlength=count)
-        self.first = np.cumsum(self.pivots) - self.pivots
-        first, second = number[rows], number[columns]
-        self.early, self.late = np.minimum(first, second), np.maximum(first, second)
+        self.first_pivots = np.cumsum(self.pivots) - self.pivots
+        first_pivots, second = number[rows], number[columns]
+        self.earlier_rows, self.later_rows = np.minimum(first_pivots, second), np.maximum(first_pivots, second)
         self._find_borders(count)
         self.border = np.bincount(self.border_front, minlength=count)
         self.border_first = np.cumsum(self.border) - self.border
         self.rows_in_parent = self._local_indices(self.parent[self.border_front], self.border_row)
-        holder = self.front[self.early]
+        holder = self.front[self.earlier_rows]
         self.entry_order = np.argsort(holder, kind="stable")
 
     def _find_borders(self, count: int) -> None:
@@ -208,8 +208,8 @@ class _EliminationTree:
         and the border rows of its children that are not its pivots. The parent is the front that eliminates the first
         border row."""
         size, front = self.size, self.front
-        first, second = front[self.early], front[self.late]
-        pending = np.unique((first * size + self.late)[first != second])
+        first_fronts, second_fronts = front[self.earlier_rows], front[self.later_rows]
+        pending = np.unique((first_fronts * size + self.later_rows)[first_fronts != second_fronts])
         self.parent, borders = np.full(count, -1), [np.zeros(0, dtype=np.int64)]
         for level in range(int(self.level.max()), -1, -1):
             is_in_level = self.level[pending // size] == level
@@ -225,15 +225,17 @@ class _EliminationTree:
 
     def _local_indices(self, fronts: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Index of each matrix row within the given front, in which the pivots come first and then the border."""
-        in_border = np.searchsorted(self.keys, fronts * self.size + rows) - self.border_first[fronts]
+        border_positions = np.searchsorted(self.keys, fronts * self.size + rows) - self.border_first[fronts]
         is_pivot = self.front[rows] == fronts
-        return np.where(is_pivot, rows - self.first[fronts], self.pivots[fronts] + in_border)
+        return np.where(is_pivot, rows - self.first_pivots[fronts], self.pivots[fronts] + border_positions)
 
     def fronts(self, top: int) -> tuple[Front, ...]:
         """All fronts of the tree; `top`: number of the first row that a front above the subtrees eliminates."""
-        holder = self.front[self.early]
+        holder = self.front[self.earlier_rows]
         height = self.pivots + self.border
-        panel_indices = (self.early - self.first[holder]) * height[holder] + self._local_indices(holder, self.late)
+        panel_indices = (self.earlier_rows - self.first_pivots[holder]) * height[holder] + self._local_indices(
+            holder, self.later_rows
+        )
         panel_indices = panel_indices[self.entry_order]
         entry_offsets = np.searchsorted(holder[self.entry_order], np.arange(len(height) + 1)).tolist()
         is_parent_pivot = self.rows_in_parent < self.pivots[self.parent[self.border_front]]
@@ -245,7 +247,7 @@ class _EliminationTree:
                 children[parent].append(child)
         starts, counts = self.border_first.tolist(), self.border.tolist()
         fronts = []
-        for number, (pivots, first) in enumerate(zip(self.pivots.tolist(), self.first.tolist(), strict=True)):
+        for number, (pivots, first) in enumerate(zip(self.pivots.tolist(), self.first_pivots.tolist(), strict=True)):
             rows = slice(starts[number], starts[number] + counts[number])
             entries = slice(entry_offsets[number], entry_offsets[number + 1])
             front = Front(
@@ -259,8 +261,8 @@ class _EliminationTree:
 def _morton_positions(coordinates: np.ndarray) -> np.ndarray:
     """Positions of points along a space-filling curve (Morton order). Rows that are near each other in space are then
     near each other in a front, so that the rows of a child are nearly consecutive rows of its parent."""
-    extent = max(np.ptp(coordinates, axis=0).max(), np.finfo(float).tiny)
-    cells = ((coordinates - coordinates.min(axis=0)) / extent * (2**_CURVE_BITS - 1)).astype(np.int64)
+    bounding_size = max(np.ptp(coordinates, axis=0).max(), np.finfo(float).tiny)
+    cells = ((coordinates - coordinates.min(axis=0)) / bounding_size * (2**_CURVE_BITS - 1)).astype(np.int64)
     position = np.zeros(len(cells), dtype=np.int64)
     for bit in range(_CURVE_BITS - 1, -1, -1):
         for axis in cells.T:

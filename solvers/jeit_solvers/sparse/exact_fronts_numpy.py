@@ -79,8 +79,8 @@ class FrontalFactor(NamedTuple):
     def quadratic_form(self, right_hand_sides: Inexact[np.ndarray, "n k"]) -> Inexact[np.ndarray, "k k"]:
         """Quadratic form bᵀ A⁻¹ b of `right_hand_sides` b (complex values are not conjugated), computed from
         `half_solve` alone."""
-        half = self.half_solve(right_hand_sides)
-        return half.T @ half
+        half_solution = self.half_solve(right_hand_sides)
+        return half_solution.T @ half_solution
 
     def half_solve(self, right_hand_sides: Inexact[np.ndarray, "n k"]) -> Inexact[np.ndarray, "n k"]:
         """Forward half of a solve: Y = L⁻¹ P b for `right_hand_sides` b, where P sorts rows into the order of
@@ -118,10 +118,10 @@ class FrontalFactor(NamedTuple):
     def _num_operations(self, vectors: np.ndarray) -> float:
         return float(vectors.shape[1] * self.fronts.num_factor_entries)
 
-    def _eliminate_forward(self, vectors: np.ndarray, later: np.ndarray, front_slice: slice) -> None:
+    def _eliminate_forward(self, vectors: np.ndarray, later_values: np.ndarray, front_slice: slice) -> None:
         """Forward elimination for the fronts `front_slice`: replace the rows of `vectors` at the pivots by the same
         rows of L⁻¹ P b, and subtract the contributions of the pivots from the rows of the borders. Border rows above
-        the subtrees are in `later`."""
+        the subtrees are in `later_values`."""
         assert self.panels is not None
         top = self.fronts.top
         for front, panel in zip(self.fronts.fronts[front_slice], self.panels[front_slice], strict=True):
@@ -132,7 +132,7 @@ class FrontalFactor(NamedTuple):
             if front.border:
                 contributions, num_inside = panel[:, front.pivots :].T @ pivot_rows, front.num_subtree_rows
                 vectors[front.rows[:num_inside]] -= contributions[:num_inside]
-                later[front.rows[num_inside:] - top] -= contributions[num_inside:]
+                later_values[front.rows[num_inside:] - top] -= contributions[num_inside:]
 
     def _substitute_back(self, vectors: np.ndarray, front_slice: slice) -> None:
         """Back substitution for the fronts `front_slice`: replace the rows of `vectors` at the pivots by the rows of
@@ -200,8 +200,8 @@ def solve_with_cached_factor(
 
 def _solve_in_numpy(fronts: Fronts, dtype: Any, values: Any, columns: Any) -> np.ndarray:
     with np.errstate(all="ignore"):
-        values, keep = np.asarray(values), fronts.num_factor_entries < _MAX_CACHED_ENTRIES
-        factor = _LAST_FACTOR.get_or_compute(fronts.key, values, lambda: factorise_fronts(fronts, values), keep=keep)
+        values, is_kept = np.asarray(values), fronts.num_factor_entries < _MAX_CACHED_ENTRIES
+        factor = _LAST_FACTOR.get_or_compute(fronts.key, values, lambda: factorise_fronts(fronts, values), keep=is_kept)
         return factor.solve(np.asarray(columns)).astype(dtype)
 
 
@@ -224,10 +224,12 @@ def _eliminate_front(
         if num_parent_pivots:
             _add_rows(panel, parent_rows[:num_parent_pivots], parent_rows, schur[:num_parent_pivots])
         parent_rows = parent_rows[num_parent_pivots:] - num_pivots
-        for first in range(0, len(parent_rows), _ADDED_ROWS):
-            last, start = min(first + _ADDED_ROWS, len(parent_rows)), parent_rows[first]
-            lower_rows = schur[num_parent_pivots + first : num_parent_pivots + last, num_parent_pivots + first :]
-            _add_rows(corner[:, start:], parent_rows[first:last], parent_rows[first:] - start, lower_rows)
+        for first_row in range(0, len(parent_rows), _ADDED_ROWS):
+            last_row, start = min(first_row + _ADDED_ROWS, len(parent_rows)), parent_rows[first_row]
+            lower_rows = schur[
+                num_parent_pivots + first_row : num_parent_pivots + last_row, num_parent_pivots + first_row :
+            ]
+            _add_rows(corner[:, start:], parent_rows[first_row:last_row], parent_rows[first_row:] - start, lower_rows)
     if not eliminate(panel, corner):
         return False
     panels[front_index] = panel
@@ -237,16 +239,16 @@ def _eliminate_front(
 
 def _add_rows(matrix: np.ndarray, rows: np.ndarray, columns: np.ndarray, block: np.ndarray) -> None:
     """Add a `block` (r, c) to the given rows (r,) and columns (c,) of a matrix, both in ascending order."""
-    first, last = int(rows[0]), int(rows[-1]) + 1
-    start, stop = int(columns[0]), int(columns[-1]) + 1
-    if stop - start > len(columns):
-        spread = np.zeros((len(rows), stop - start), matrix.dtype)
-        spread[:, columns - start] = block
-        block = spread
-    if last - first == len(rows):
-        matrix[first:last, start:stop] += block
+    first_row, last_row = int(rows[0]), int(rows[-1]) + 1
+    column_start, column_end = int(columns[0]), int(columns[-1]) + 1
+    if column_end - column_start > len(columns):
+        spread_rows = np.zeros((len(rows), column_end - column_start), matrix.dtype)
+        spread_rows[:, columns - column_start] = block
+        block = spread_rows
+    if last_row - first_row == len(rows):
+        matrix[first_row:last_row, column_start:column_end] += block
     else:
-        matrix[rows, start:stop] += block
+        matrix[rows, column_start:column_end] += block
 
 
 def _for_each_slice(function: Any, slices: tuple[slice, ...], operations: float) -> None:

@@ -75,13 +75,13 @@ class PaddedSum(NamedTuple):
     ) -> "PaddedSum":
         """Plan the addition of contribution `source[i]` of `num_sources` to sum `target[i]` of `num_sums`, for all
         i."""
-        order = np.argsort(target, kind="stable")
-        target, source = target[order], source[order]
+        sort_order = np.argsort(target, kind="stable")
+        target, source = target[sort_order], source[sort_order]
         counts = np.bincount(target, minlength=num_sums)
         rank = np.arange(target.size) - np.repeat(np.cumsum(counts) - counts, counts)
         # Number of contributions beyond each width; the width with the shortest predicted time is chosen.
-        left_over = target.size - np.concatenate([[0], np.cumsum(np.bincount(rank, minlength=1))])
-        width = int(np.argmin(np.arange(left_over.size) * num_sums + _SCATTER_COST * left_over))
+        num_beyond_width = target.size - np.concatenate([[0], np.cumsum(np.bincount(rank, minlength=1))])
+        width = int(np.argmin(np.arange(num_beyond_width.size) * num_sums + _SCATTER_COST * num_beyond_width))
         gather = np.full((width, num_sums), num_sources, dtype=np.int32)
         is_gathered = rank < width
         gather[rank[is_gathered], target[is_gathered]] = source[is_gathered]
@@ -97,17 +97,17 @@ class PaddedSum(NamedTuple):
         shape = self.gather.shape[1], *contributions.shape[1:]
         total = namespace(contributions).zeros(shape, contributions.dtype)
         if isinstance(contributions, np.ndarray):
-            self.add_some(indices, contributions, total, 0, shape[0])
+            self.add_range(indices, contributions, total, 0, shape[0])
             return total
         gathered = self.gather.read(indices)
         for layer in range(len(gathered)):
             total += gather_or_zero(contributions, gathered[layer])
         if self.overflow_sum.shape[0]:
-            overflow = gather(contributions, self.overflow_source.read(indices))
-            total = add_into(total, self.overflow_sum.read(indices), overflow)
+            overflow_values = gather(contributions, self.overflow_source.read(indices))
+            total = add_into(total, self.overflow_sum.read(indices), overflow_values)
         return total
 
-    def add_some(
+    def add_range(
         self, indices: Any, contributions: Inexact[Array, "sources *k"], total: Any, start: int, stop: int
     ) -> None:
         """In NumPy, add the sums with indices from `start` up to, but not including, `stop` to `total` (sums, k) in
@@ -118,26 +118,26 @@ class PaddedSum(NamedTuple):
             chunk = slice(first, min(first + chunk_size, stop))
             for layer in gathered:
                 total[chunk] += gather_or_zero(contributions, layer[chunk])
-        sums: Any = self.overflow_sum.read(indices)
+        overflow_sums: Any = self.overflow_sum.read(indices)
         sources: Any = self.overflow_source.read(indices)
         for round_start, round_end in zip((0, *self.rounds), self.rounds, strict=False):
-            first, last = round_start + np.searchsorted(sums[round_start:round_end], (start, stop))
+            first, last = round_start + np.searchsorted(overflow_sums[round_start:round_end], (start, stop))
             for chunk_start in range(first, last, chunk_size):
                 chunk = slice(chunk_start, min(chunk_start + chunk_size, last))
-                total[sums[chunk]] += gather(contributions, sources[chunk])
+                total[overflow_sums[chunk]] += gather(contributions, sources[chunk])
 
-    def read_back(
-        self, indices: Int[Array, " total"], sums: Inexact[Array, " sums"], into: Inexact[Array, " sources"]
+    def replace_by_sums(
+        self, indices: Int[Array, " total"], sums: Inexact[Array, " sums"], values: Inexact[Array, " sources"]
     ) -> Inexact[Array, " sources"]:
-        """Return `into` with the entry of each contribution replaced by the sum to which the contribution is added (by
-        one of these sums if there are several). `into` must have one more entry than there are contributions; the last
-        entry is overwritten."""
+        """Return `values` with the entry of each contribution replaced by the sum to which the contribution is added
+        (by one of these sums if there are several). `values` must have one more entry than there are contributions; the
+        last entry is overwritten."""
         for layer in self.gather.read(indices):
-            into = set_at(into, layer, sums)
+            values = set_at(values, layer, sums)
         if self.overflow_sum.shape[0]:
-            overflow = gather(sums, self.overflow_sum.read(indices))
-            into = set_at(into, self.overflow_source.read(indices), overflow)
-        return into
+            overflow_values = gather(sums, self.overflow_sum.read(indices))
+            values = set_at(values, self.overflow_source.read(indices), overflow_values)
+        return values
 
 
 # Cost of a scattered contribution relative to a gathered contribution, measured on two Zen 4 cores.

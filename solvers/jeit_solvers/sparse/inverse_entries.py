@@ -58,8 +58,8 @@ class Strips(Module):
     ) -> "Strips":
         """Partition the unknowns into strips perpendicular to the longest extent of their `coordinates` (n, d).
         `selected` (n,): the unknowns between which the inverse is needed."""
-        longest, *other_axes = coordinates.T[np.argsort(-np.ptp(coordinates, axis=0))]
-        strip = _breadth_first_levels(pattern, longest)
+        longest_axis, *other_axes = coordinates.T[np.argsort(-np.ptp(coordinates, axis=0))]
+        strip = _breadth_first_levels(pattern, longest_axis)
         # Sort the unknowns of a strip by their other coordinates, so that neighbours in space are neighbours in memory.
         order = np.lexsort((*other_axes[::-1], ~selected, strip))
         counts = np.bincount(strip)
@@ -157,7 +157,7 @@ def near_inverse(strips: Strips, operator: SparseSymmetric, max_distance: int) -
         weights = pivot @ coupling
         return coupling.T @ weights, (pivot, weights)
 
-    def substitute(following_blocks, strip):
+    def substitute_strip(following_blocks, strip):
         pivot, weights = strip
         later_blocks = -weights @ following_blocks
         diagonal_block = pivot - later_blocks[:, :strip_size] @ weights.T
@@ -174,9 +174,9 @@ def near_inverse(strips: Strips, operator: SparseSymmetric, max_distance: int) -
     zero_block = jnp.zeros((strip_size, strip_size), operator.values.dtype)
     _, eliminated = jax.lax.scan(eliminate, zero_block, (blocks, couplings))
     zero_block = jnp.zeros((strip_size, strip_size + (max_distance - 1) * num_selected), operator.values.dtype)
-    _, upper = jax.lax.scan(substitute, zero_block, eliminated, reverse=True)
-    no_factors = jnp.zeros((strips.num_strips * num_selected, 0), upper.dtype)
-    return NearInverse(upper, no_factors, no_factors)
+    _, upper_blocks = jax.lax.scan(substitute_strip, zero_block, eliminated, reverse=True)
+    empty_factors = jnp.zeros((strips.num_strips * num_selected, 0), upper_blocks.dtype)
+    return NearInverse(upper_blocks, empty_factors, empty_factors)
 
 
 def _strip_blocks(strips: Strips, operator: SparseSymmetric):
@@ -185,10 +185,14 @@ def _strip_blocks(strips: Strips, operator: SparseSymmetric):
     shape = strips.num_strips, strips.strip_size, strips.strip_size
     position = jnp.asarray(strips.position)
     rows, columns = position[operator.pattern.rows], position[operator.pattern.columns]
-    first, last = jnp.minimum(rows, columns), jnp.maximum(rows, columns)
-    strip, row, column = first // strips.strip_size, first % strips.strip_size, last % strips.strip_size
-    own_strip = jnp.where(last // strips.strip_size == strip, strip, strips.num_strips)
-    coupling_strip = jnp.where(last // strips.strip_size == strip, strips.num_strips, strip)
+    smaller_indices, larger_indices = jnp.minimum(rows, columns), jnp.maximum(rows, columns)
+    strip, row, column = (
+        smaller_indices // strips.strip_size,
+        smaller_indices % strips.strip_size,
+        larger_indices % strips.strip_size,
+    )
+    own_strip = jnp.where(larger_indices // strips.strip_size == strip, strip, strips.num_strips)
+    coupling_strip = jnp.where(larger_indices // strips.strip_size == strip, strips.num_strips, strip)
     is_filler = jnp.ones(strips.num_strips * strips.strip_size).at[position].set(0).reshape(shape[:2])
     blocks = jnp.eye(strips.strip_size, dtype=operator.values.dtype) * is_filler[:, None]
     blocks = blocks.at[own_strip, row, column].set(operator.values, mode="drop")

@@ -172,23 +172,23 @@ class NumpySolver(MatrixSolver):
         pattern, dtype = state.pattern, jnp.result_type(state.values, columns)
         shape = jax.ShapeDtypeStruct(columns.shape, dtype)
 
-        def solve_with(pattern: SparsityPattern, values: Any, columns: Any) -> np.ndarray:
+        def solve_with_pattern(pattern: SparsityPattern, values: Any, columns: Any) -> np.ndarray:
             solutions = self.solve_in_numpy(pattern, np.asarray(values), np.asarray(columns))
             return solutions.astype(dtype, copy=False)
 
         if has_values(pattern):  # constants, not stored in the compiled program because they are large
             host_pattern = on_host(pattern)
             if has_values(state, columns):
-                return host.asarray(solve_with(host_pattern, state.values, columns))
+                return host.asarray(solve_with_pattern(host_pattern, state.values, columns))
             return call_numpy(
-                lambda values, columns: solve_with(host_pattern, values, columns), shape, state.values, columns
+                lambda values, columns: solve_with_pattern(host_pattern, values, columns), shape, state.values, columns
             )
 
-        def solve_any(indices: np.ndarray, values: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        def solve_flattened(indices: np.ndarray, values: np.ndarray, columns: np.ndarray) -> np.ndarray:
             traced_pattern = SparsityPattern(indices, pattern.layout, pattern.size)  # pyright: ignore[reportArgumentType]
-            return solve_with(traced_pattern, values, columns)
+            return solve_with_pattern(traced_pattern, values, columns)
 
-        return call_numpy(solve_any, shape, pattern.indices, state.values, columns)
+        return call_numpy(solve_flattened, shape, pattern.indices, state.values, columns)
 
     def compute(
         self, state: SparseSymmetric, vector: Inexact[Array, " n"], options: dict[str, Any]
@@ -208,17 +208,17 @@ class LastMatrixCache:
     matrix again."""
 
     def __init__(self) -> None:
-        self._last: tuple[bytes, Any] | None = None
+        self._last_result: tuple[bytes, Any] | None = None
 
     def get_or_compute(self, key: bytes, values: np.ndarray, compute: Callable[[], Any], *, keep: bool = True) -> Any:
         """Return the result of `compute` for the matrix with the given values (nnz,), from the cache if the last call
         was for the same matrix. `key` distinguishes sparsity patterns; with `keep` False the result is not cached."""
         digest = hashlib.blake2b(np.ascontiguousarray(values).tobytes(), digest_size=16).digest()
         key += values.dtype.str.encode() + digest
-        cached = self._last  # another thread may replace it meanwhile
+        cached = self._last_result  # another thread may replace it meanwhile
         if cached is not None and cached[0] == key:
             return cached[1]
-        self._last = cached = None  # frees the memory for the next result
+        self._last_result = cached = None  # frees the memory for the next result
         result = compute()
-        self._last = (key, result) if keep else None
+        self._last_result = (key, result) if keep else None
         return result

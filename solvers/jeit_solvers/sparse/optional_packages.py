@@ -114,12 +114,18 @@ class Multigrid(NumpySolver):
             right_hand_sides = right_hand_sides.view(float)  # real and imaginary parts are columns of their own
         solution = np.empty_like(right_hand_sides)
 
-        def solve(part: slice) -> None:
-            group = np.ascontiguousarray(right_hand_sides[:, part])
-            solution[:, part] = _conjugate_gradients(matrix_hierarchy, group, self.tolerance, self.max_steps)
+        def solve(column_slice: slice) -> None:
+            group = np.ascontiguousarray(right_hand_sides[:, column_slice])
+            solution[:, column_slice] = _conjugate_gradients(matrix_hierarchy, group, self.tolerance, self.max_steps)
 
-        together = max(1, min(_MAX_COLUMNS, -(-right_hand_sides.shape[1] // number_of_cores())))
-        on_cores(solve, [slice(start, start + together) for start in range(0, right_hand_sides.shape[1], together)])
+        num_columns_at_once = max(1, min(_MAX_COLUMNS, -(-right_hand_sides.shape[1] // number_of_cores())))
+        on_cores(
+            solve,
+            [
+                slice(start, start + num_columns_at_once)
+                for start in range(0, right_hand_sides.shape[1], num_columns_at_once)
+            ],
+        )
         return solution.view(dtype)
 
 
@@ -185,9 +191,9 @@ def _precondition(levels: list[Level], residual: np.ndarray, norms: np.ndarray) 
     """Apply a multigrid V-cycle to residuals (n, k). The residuals are first divided by their `norms` (k,), because
     single precision has a limited range."""
     scale = np.where(norms > 0, norms, 1) / np.sqrt(len(residual))
-    single = np.complex64 if np.iscomplexobj(residual) else np.float32
-    scaled = np.multiply(residual, 1 / scale, out=np.empty(residual.shape, single), casting="unsafe")
-    return _v_cycle(levels, scaled.view(np.float32)).view(single) * scale
+    single_precision = np.complex64 if np.iscomplexobj(residual) else np.float32
+    scaled = np.multiply(residual, 1 / scale, out=np.empty(residual.shape, single_precision), casting="unsafe")
+    return _v_cycle(levels, scaled.view(np.float32)).view(single_precision) * scale
 
 
 def _conjugate_gradients(
@@ -281,17 +287,17 @@ class _PardisoFactor:
             # The equations (A + iB)(x + iy) = f + ig in real form, with the second row negated.
             real, imaginary = matrix.real, matrix.imag
             matrix = csr_array(block_array([[real, -imaginary], [-imaginary, -real]]))
-        upper = csr_matrix(triu(matrix, format="csr"), dtype=np.float64)
-        upper.sort_indices()
+        upper_triangle = csr_matrix(triu(matrix, format="csr"), dtype=np.float64)
+        upper_triangle.sort_indices()
         package = importlib.import_module("pypardiso")
-        self.upper = upper
+        self.upper_triangle = upper_triangle
         self.solver = package.PyPardisoSolver(mtype=_INDEFINITE if self.is_complex else _DEFINITE)
         self.failure: type[Exception] = package.pardiso_wrapper.PyPardisoError
         self.lock = Lock()  # a solver serves one thread at a time
         weakref.finalize(self, self.solver.free_memory, everything=True)
         try:
-            self.solver.factorize(upper)
-            self.failed = not np.isfinite(upper.data).all()
+            self.solver.factorize(upper_triangle)
+            self.failed = not np.isfinite(upper_triangle.data).all()
         except self.failure:
             self.failed = True
 
@@ -311,7 +317,7 @@ class _PardisoFactor:
 
     def _solve(self, columns: np.ndarray) -> np.ndarray:
         with self.lock:
-            return self.solver.solve(self.upper, np.asfortranarray(columns, np.float64))
+            return self.solver.solve(self.upper_triangle, np.asfortranarray(columns, np.float64))
 
 
 _LAST_PARDISO_FACTOR = LastMatrixCache()

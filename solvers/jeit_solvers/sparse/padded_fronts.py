@@ -51,13 +51,16 @@ class EliminationTree:
         rows, columns = np.asarray(pattern.rows, dtype=np.int64), np.asarray(pattern.columns, dtype=np.int64)
         self.size = size
         depth = 0 if size <= _MAX_SINGLE_FRONT else int(np.ceil(np.log2(size / _LEAF_SIZE)))
-        owner = nested_dissection(graph_of(rows, columns, size), depth, coordinates)
-        self._make_fronts(owner, depth)
-        order = np.argsort(self.front, kind="stable")
+        front_indices = nested_dissection(graph_of(rows, columns, size), depth, coordinates)
+        self._make_fronts(front_indices, depth)
+        sort_order = np.argsort(self.front, kind="stable")
         self.place = np.empty(size, dtype=np.int64)
-        self.place[order] = rank_within(self.front[order])
-        rows_first = self.stage[self.front[rows]] <= self.stage[self.front[columns]]
-        self.early, self.late = np.where(rows_first, rows, columns), np.where(rows_first, columns, rows)
+        self.place[sort_order] = rank_within(self.front[sort_order])
+        is_row_first = self.stage[self.front[rows]] <= self.stage[self.front[columns]]
+        self.earlier_rows, self.later_rows = (
+            np.where(is_row_first, rows, columns),
+            np.where(is_row_first, columns, rows),
+        )
         self._find_borders()
         self.pivot_count = np.bincount(self.front, minlength=self.parent.size)
         stages = range(self.num_stages)
@@ -65,13 +68,13 @@ class EliminationTree:
         self.pivots = [max(1, int(self.pivot_count[self.stage == stage].max())) for stage in stages]
         self.border = [int(rank_within(keys // size).max(initial=-1)) + 1 for keys in self.borders]
 
-    def _make_fronts(self, owner: np.ndarray, depth: int) -> None:
+    def _make_fronts(self, front_indices: np.ndarray, depth: int) -> None:
         """Form the fronts from the nodes of the dissection: small separators are eliminated together with the
         separators below them."""
         nodes = np.arange(2 ** (depth + 1) - 1)
         level = np.floor(np.log2(nodes + 1)).astype(int)
         max_separators = np.zeros(depth + 1, dtype=int)
-        np.maximum.at(max_separators, level, np.bincount(owner, minlength=nodes.size))
+        np.maximum.at(max_separators, level, np.bincount(front_indices, minlength=nodes.size))
         heights = _merged_levels(max_separators)
         first_level = depth + 1 - np.cumsum(heights)
         stage_of_level = np.searchsorted(-first_level, -np.arange(depth + 1), side="left")
@@ -81,7 +84,7 @@ class EliminationTree:
                 level[top_nodes] > first_level[stage_of_level[level[top_nodes]]], (top_nodes - 1) // 2, top_nodes
             )
         front_nodes, front_of_node = np.unique(top_nodes, return_inverse=True)
-        self.front = front_of_node[owner]
+        self.front = front_of_node[front_indices]
         self.parent = np.where(front_nodes > 0, front_of_node[(front_nodes - 1) // 2], -1)
         self.stage = stage_of_level[level[front_nodes]]
         self.num_stages = len(heights)
@@ -92,8 +95,10 @@ class EliminationTree:
     def _find_borders(self) -> None:
         """Find the border of each front: the later rows of the front's entries, and the borders of its children without
         its own pivots."""
-        first, second = self.front[self.early], self.front[self.late]
-        pending = np.unique(first[first != second] * self.size + self.late[first != second])
+        first_fronts, second_fronts = self.front[self.earlier_rows], self.front[self.later_rows]
+        pending = np.unique(
+            first_fronts[first_fronts != second_fronts] * self.size + self.later_rows[first_fronts != second_fronts]
+        )
         self.borders = []
         for stage in range(self.num_stages):
             is_in_stage = self.stage[pending // self.size] == stage
@@ -108,8 +113,8 @@ class EliminationTree:
         """Local indices of matrix rows within fronts of one stage, in which the pivots come first and then the
         border."""
         keys, border = fronts * self.size + rows, self.borders[stage]
-        in_border = np.searchsorted(border, keys) - np.searchsorted(border, fronts * self.size)
-        return np.where(self.front[rows] == fronts, self.place[rows], self.pivots[stage] + in_border)
+        border_positions = np.searchsorted(border, keys) - np.searchsorted(border, fronts * self.size)
+        return np.where(self.front[rows] == fronts, self.place[rows], self.pivots[stage] + border_positions)
 
 
 def _merged_levels(largest_separators: np.ndarray) -> list[int]:
@@ -336,16 +341,16 @@ def _plan_matrix_entries(
     """Sums that add the entries of the matrix to the fronts that eliminate them, and ones to the diagonal of padded
     pivots."""
     batch, pivots = int(tree.batch[stage]), tree.pivots[stage]
-    entries = np.flatnonzero(tree.stage[tree.front[tree.early]] == stage)
-    early, late = tree.early[entries], tree.late[entries]
+    entries = np.flatnonzero(tree.stage[tree.front[tree.earlier_rows]] == stage)
+    early, late = tree.earlier_rows[entries], tree.later_rows[entries]
     front = tree.front[early]
     column, row = tree.place[early], tree.position(front, late, stage)
     # Pivot blocks of the fronts are filled on both sides of the diagonal.
     is_mirrored = (row < pivots) & (row != column)
-    first = tree.slot[front] * height
+    first_positions = tree.slot[front] * height
     members = np.argsort(np.where(tree.stage == stage, tree.slot, tree.parent.size), kind="stable")[:batch]
     padded_fronts, padded_pivots = np.nonzero(np.arange(pivots) >= tree.pivot_count[members][:, None])
-    target = [(first + row) * pivots + column, ((first + column) * pivots + row)[is_mirrored]]
+    target = [(first_positions + row) * pivots + column, ((first_positions + column) * pivots + row)[is_mirrored]]
     target.append((padded_fronts * height + padded_pivots) * pivots + padded_pivots)
     source = [entries, entries[is_mirrored], np.full(padded_fronts.size, pattern.num_entries)]
     return PaddedSum.create(
@@ -363,7 +368,7 @@ def _plan_link(store: IndexStore, tree: EliminationTree, source: int, stage: int
     parent_rows[tree.slot[child], border_indices] = tree.position(front, row, stage)
     parent_slot = np.zeros(count, dtype=np.int64)
     parent_slot[tree.slot[child]] = tree.slot[front]
-    flat = np.arange(count * width * width).reshape(count, width, width)
+    flat_indices = np.arange(count * width * width).reshape(count, width, width)
     first, second, base = np.broadcast_arrays(
         parent_rows[:, :, None], parent_rows[:, None, :], parent_slot[:, None, None]
     )
@@ -375,7 +380,7 @@ def _plan_link(store: IndexStore, tree: EliminationTree, source: int, stage: int
     is_used = parent_rows >= 0
     return Link(
         source,
-        PaddedSum.create(store, panel_targets, flat[panel], batch * height * pivots, flat.size),
-        PaddedSum.create(store, corner_targets, flat[corner], batch * border * border, flat.size),
+        PaddedSum.create(store, panel_targets, flat_indices[panel], batch * height * pivots, flat_indices.size),
+        PaddedSum.create(store, corner_targets, flat_indices[corner], batch * border * border, flat_indices.size),
         PaddedSum.create(store, row_targets[is_used], np.flatnonzero(is_used), batch * height, count * width),
     )

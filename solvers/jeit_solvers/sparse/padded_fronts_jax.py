@@ -57,8 +57,8 @@ class Factor(Module):
     def require_positive_definite(self) -> None:
         """Raise `ValueError` if the matrix is not positive definite. The check is omitted inside `jax.jit`, `jax.grad`
         or `jax.vmap`, where values are not known yet."""
-        verdict = self.positive_definite
-        if has_values(verdict) and not verdict.all():
+        is_positive_definite = self.positive_definite
+        if has_values(is_positive_definite) and not is_positive_definite.all():
             raise ValueError(
                 "factorise: the matrix is not positive definite, so it has no Cholesky factor. In a finite-element "
                 "system the usual reasons are: a coefficient that is zero, negative or NaN somewhere; no boundary "
@@ -112,11 +112,11 @@ def _factorise_stages(layout: IndexLayout, indices: Int[Array, " total"], values
             corner += link.corner.apply(indices, schur)
         panel = panel.reshape(stage.batch, pivots + border, pivots)
         inverse = inverse_cholesky(panel[:, :pivots])
-        lower = panel[:, pivots:] @ _transposed(inverse)
+        lower_block = panel[:, pivots:] @ _transposed(inverse)
         inverses.append(inverse)
-        lowers.append(lower)
+        lowers.append(lower_block)
         corner = corner.reshape(stage.batch, border, border)
-        corner -= lower @ _transposed(lower)
+        corner -= lower_block @ _transposed(lower_block)
         schur_complements.append(corner)
     return Factor(tuple(inverses), tuple(lowers))
 
@@ -137,27 +137,27 @@ def _factorise_in_numpy(
         batch, pivots, border = stage.batch, stage.pivots, stage.border
         panel = np.zeros((batch, pivots + border, pivots), values.dtype)
         corner = np.zeros((batch, border, border), values.dtype)
-        inverse, lower = np.empty_like(panel, shape=(batch, pivots, pivots)), np.empty_like(panel[:, pivots:])
+        inverse, lower_blocks = np.empty_like(panel, shape=(batch, pivots, pivots)), np.empty_like(panel[:, pivots:])
         eliminate_slice = partial(
-            _eliminate_fronts, stage, indices, extended, schur_complements, panel, corner, inverse, lower
+            _eliminate_fronts, stage, indices, extended, schur_complements, panel, corner, inverse, lower_blocks
         )
         is_large = batch * (pivots + border) ** 2 > _MIN_PARALLEL_ENTRIES
         on_cores(eliminate_slice, parts_for_cores(batch) if is_large else [slice(0, batch)])
         inverses.append(inverse)
-        lowers.append(lower)
+        lowers.append(lower_blocks)
         schur_complements.append(corner)
     return Factor(tuple(inverses), tuple(lowers))
 
 
 def _eliminate_fronts(
-    stage: Stage, indices, extended, schur_complements, panel, corner, inverse, lower, front_slice: slice
+    stage: Stage, indices, extended, schur_complements, panel, corner, inverse, lower_blocks, front_slice: slice
 ) -> None:
     """Assemble and eliminate the fronts `front_slice` of a stage, in place. `schur_complements`: Schur complements of
     all earlier stages."""
 
     def add_contributions(padded_sum, contributions, target):
         size = target[0].size
-        padded_sum.add_some(
+        padded_sum.add_range(
             indices, contributions, target.reshape(-1), front_slice.start * size, front_slice.stop * size
         )
 
@@ -167,11 +167,11 @@ def _eliminate_fronts(
         add_contributions(link.panel, schur, panel)
         add_contributions(link.corner, schur, corner)
     inverse[front_slice] = inverse_cholesky(panel[front_slice, : stage.pivots])
-    np.matmul(panel[front_slice, stage.pivots :], _transposed(inverse[front_slice]), out=lower[front_slice])
-    num_together = max(1, _UPDATED_ENTRIES // max(stage.border**2, 1))
-    for first in range(front_slice.start, front_slice.stop, num_together):
-        update_slice = slice(first, min(first + num_together, front_slice.stop))
-        corner[update_slice] -= lower[update_slice] @ _transposed(lower[update_slice])
+    np.matmul(panel[front_slice, stage.pivots :], _transposed(inverse[front_slice]), out=lower_blocks[front_slice])
+    num_fronts_at_once = max(1, _UPDATED_ENTRIES // max(stage.border**2, 1))
+    for first in range(front_slice.start, front_slice.stop, num_fronts_at_once):
+        update_slice = slice(first, min(first + num_fronts_at_once, front_slice.stop))
+        corner[update_slice] -= lower_blocks[update_slice] @ _transposed(lower_blocks[update_slice])
 
 
 def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
@@ -202,18 +202,18 @@ def _solve_stages(
     layout: IndexLayout, indices: Int[Array, " total"], factor: Factor, vectors: Inexact[Array, "n k"]
 ) -> Inexact[Array, "n k"]:
     stages, solution = layout.content
-    reduced = _forward_stages(layout, indices, factor, vectors)
-    return _backward_stages(stages, indices, factor, reduced)[solution.read(indices)]
+    reduced_vectors = _forward_stages(layout, indices, factor, vectors)
+    return _backward_stages(stages, indices, factor, reduced_vectors)[solution.read(indices)]
 
 
 _solve = jax.jit(_solve_stages, static_argnums=0)
 
 
-def _solve_batch(batchable, plain, axis_size, batched, indices, factor, vectors):
+def _solve_batch(batchable, unbatched, axis_size, batched, indices, factor, vectors):
     """Batching rule of `solve`: a batch of right-hand sides for one factor is solved as additional columns, and a batch
     of factors one by one."""
     if any(jax.tree.leaves(batched[:2])):
-        return one_by_one(batchable, plain, axis_size, batched, indices, factor, vectors)
+        return one_by_one(batchable, unbatched, axis_size, batched, indices, factor, vectors)
     size, count = vectors.shape[1:]
     columns = jnp.moveaxis(vectors, 0, 1).reshape(size, axis_size * count)
     return jnp.moveaxis(batchable(indices, factor, columns).reshape(size, axis_size, count), 1, 0)
@@ -242,8 +242,8 @@ def half_solve(
     """
     vectors = _check_columns(plan, right_hand_sides, "half_solve")
     forward = _forward_stages if isinstance(vectors, np.ndarray) else _compiled_forward
-    reduced = forward(plan.layout, plan.indices, factor, vectors)
-    return namespace(vectors).concatenate([rows.reshape(-1, rows.shape[-1]) for rows in reduced])
+    reduced_vectors = forward(plan.layout, plan.indices, factor, vectors)
+    return namespace(vectors).concatenate([rows.reshape(-1, rows.shape[-1]) for rows in reduced_vectors])
 
 
 def quadratic_form(
@@ -261,8 +261,8 @@ def quadratic_form(
     energy = quadratic_form(plan, factor, loads)
     ```
     """
-    half = half_solve(plan, factor, right_hand_sides)
-    return half.T @ half
+    half_solution = half_solve(plan, factor, right_hand_sides)
+    return half_solution.T @ half_solution
 
 
 def inverse_root(plan: FactorisationPlan, factor: Factor, rows: Inexact[Array, "rows k"]) -> Inexact[Array, "n k"]:
@@ -339,7 +339,7 @@ def _inverse_entries(
             front_block = xp.concatenate(
                 [panel, xp.concatenate([-_transposed(border_columns), corner], axis=1)], axis=2
             )
-        entries = stage.entries.read_back(indices, front_block[:, :, : stage.pivots].reshape(-1), entries)
+        entries = stage.entries.replace_by_sums(indices, front_block[:, :, : stage.pivots].reshape(-1), entries)
         if number in first_child:
             fronts[number] = front_block
         if stage.border and first_child[stage.parent] == number:
@@ -400,7 +400,7 @@ def _forward_stages(
     children."""
     stages, _ = layout.content
     count = vectors.shape[1]
-    reduced, updates = [], []
+    reduced_vectors, updates = [], []
     for stage, inverse, lower in zip(stages, factor.inverses, factor.lowers, strict=True):
         rows = gather_or_zero(vectors, stage.right_hand_side.read(indices))
         child_updates = [link.rows.apply(indices, updates[link.source].reshape(-1, count)) for link in stage.links]
@@ -410,9 +410,9 @@ def _forward_stages(
         border_update = functools.reduce(
             operator.add, [update[:, stage.pivots :] for update in child_updates] or [zero]
         )
-        reduced.append(inverse @ rows)
-        updates.append(border_update - lower @ reduced[-1])
-    return reduced
+        reduced_vectors.append(inverse @ rows)
+        updates.append(border_update - lower @ reduced_vectors[-1])
+    return reduced_vectors
 
 
 _compiled_forward = jax.jit(_forward_stages, static_argnums=0)
@@ -422,15 +422,15 @@ def _backward_stages(
     stages: tuple[Stage, ...],
     indices: Int[Array, " total"],
     factor: Factor,
-    reduced: list[Inexact[Array, "batch pivots k"]],
+    reduced_vectors: list[Inexact[Array, "batch pivots k"]],
 ) -> Inexact[Array, "rows k"]:
-    """Product of L^-T with the vectors `reduced`, computed from the root down; returns the rows at the pivots of all
-    stages. The solution at the border of a front is read from the parent front."""
-    count, xp = reduced[0].shape[-1], namespace(reduced)
+    """Product of L^-T with the vectors `reduced_vectors`, computed from the root down; returns the rows at the pivots
+    of all stages. The solution at the border of a front is read from the parent front."""
+    count, xp = reduced_vectors[0].shape[-1], namespace(reduced_vectors)
     fronts: dict[int, Inexact[Array, "rows k"]] = {}
     pivot_values = []
     for number in reversed(range(len(stages))):
-        stage, pivot_residual = stages[number], reduced[number]
+        stage, pivot_residual = stages[number], reduced_vectors[number]
         border_values = xp.zeros((stage.batch, 0, count), pivot_residual.dtype)
         if stage.border:
             border_values = gather_or_zero(fronts[stage.parent], stage.above.read(indices))

@@ -95,16 +95,16 @@ class SparsityPattern(Module):
                     f"got {elements.shape}."
                 )
             _check_range(elements, size, f"from_elements: `groups[{number}]`")
-            in_order = np.sort(elements, axis=1)
-            twice = np.flatnonzero((in_order[:, 1:] == in_order[:, :-1]).any(axis=1))
-            if twice.size:
+            sorted_elements = np.sort(elements, axis=1)
+            repeated_indices = np.flatnonzero((sorted_elements[:, 1:] == sorted_elements[:, :-1]).any(axis=1))
+            if repeated_indices.size:
                 raise ValueError(
-                    f"from_elements: element {twice[0]} of `groups[{number}]` names a node twice: "
-                    f"{elements[twice[0]].tolist()}. Remove degenerate elements from the mesh."
+                    f"from_elements: element {repeated_indices[0]} of `groups[{number}]` names a node twice: "
+                    f"{elements[repeated_indices[0]].tolist()}. Remove degenerate elements from the mesh."
                 )
-            first, second = np.tril_indices(elements.shape[1])
-            row_lists.append(elements[:, first].T.ravel())
-            column_lists.append(elements[:, second].T.ravel())
+            first_corners, second_corners = np.tril_indices(elements.shape[1])
+            row_lists.append(elements[:, first_corners].T.ravel())
+            column_lists.append(elements[:, second_corners].T.ravel())
             shapes.append(elements.shape)
         return cls._from_contributions(row_lists, column_lists, shapes, size, "from_elements", "belong to no element")
 
@@ -144,21 +144,21 @@ class SparsityPattern(Module):
         if not np.isfinite(full.data).all():
             raise ValueError("from_matrix: `matrix` has entries that are NaN or infinite; remove them first.")
         skew = abs(full - full.T)
-        largest = abs(full).max() if full.nnz else 0.0
-        if skew.nnz and skew.max() > 1e-12 * largest:
+        max_magnitude = abs(full).max() if full.nnz else 0.0
+        if skew.nnz and skew.max() > 1e-12 * max_magnitude:
             raise ValueError(
                 f"from_matrix: `matrix` is not symmetric: |A - A^T| is up to {skew.max():.3g}, "
-                f"and its largest entry is {largest:.3g}. Give both triangles, or (matrix + matrix.T) / 2 if the "
+                f"and its largest entry is {max_magnitude:.3g}. Give both triangles, or (matrix + matrix.T) / 2 if the "
                 "difference is noise."
             )
         entries = coo_array(full)
         rows, columns = entries.coords
-        lower = rows >= columns
-        pattern = cls.from_entries(rows[lower], columns[lower], matrix.shape[0])
-        return pattern, pattern.assemble(jnp.asarray(entries.data[lower]))
+        is_lower = rows >= columns
+        pattern = cls.from_entries(rows[is_lower], columns[is_lower], matrix.shape[0])
+        return pattern, pattern.assemble(jnp.asarray(entries.data[is_lower]))
 
     @classmethod
-    def _from_contributions(cls, row_lists, column_lists, shapes, size, caller, reason) -> Self:
+    def _from_contributions(cls, row_lists, column_lists, shapes, size, caller_name, reason) -> Self:
         """Pattern of the unique entries of all groups of contributions; it also stores the index of the entry of each
         contribution."""
         keys = []
@@ -167,14 +167,14 @@ class SparsityPattern(Module):
             # Entries on the diagonal get negative keys, so that these entries come first, in the order of rows.
             keys.append(np.where(above == below, above - size, above * size + below))
         unique, entry_of_value = np.unique(np.concatenate(keys), return_inverse=True)
-        on_diagonal = np.zeros(size, dtype=bool)
-        on_diagonal[unique[unique < 0] + size] = True
-        if not on_diagonal.all():
-            missing_rows = np.flatnonzero(~on_diagonal)
+        has_diagonal_entry = np.zeros(size, dtype=bool)
+        has_diagonal_entry[unique[unique < 0] + size] = True
+        if not has_diagonal_entry.all():
+            missing_rows = np.flatnonzero(~has_diagonal_entry)
             raise ValueError(
-                f"{caller}: {missing_rows.size} of {size} rows {reason}, the first are {missing_rows[:5].tolist()}. "
-                "A matrix with this pattern cannot be positive definite: leave these unknowns out, and number the rest "
-                "0..n-1."
+                f"{caller_name}: {missing_rows.size} of {size} rows {reason}, the first are "
+                f"{missing_rows[:5].tolist()}. A matrix with this pattern cannot be positive definite: leave these "
+                "unknowns out, and number the rest 0..n-1."
             )
         below = unique[size:]
         rows = np.concatenate([np.arange(size), below // size])
@@ -203,7 +203,7 @@ class SparsityPattern(Module):
                 f"and {len(element_matrices)} arrays were given; use None for a group that adds nothing."
             )
         contributions = [
-            group.apply(self.indices, _as_numeric(matrices), f"assemble: argument {number}")
+            group.apply(self.indices, _convert_to_numeric(matrices), f"assemble: argument {number}")
             for number, (group, matrices) in enumerate(zip(self._assembly, element_matrices, strict=True))
             if matrices is not None
         ]
@@ -242,8 +242,8 @@ class SparsityPattern(Module):
         row_ends = np.searchsorted(np.asarray(self.rows)[below], np.arange(self.size + 1))  # rows are in order
         columns = np.asarray(self.columns)[below]
         below_diagonal = csr_array((values[below], columns, row_ends), shape=(self.size, self.size))
-        half = vectors.T @ (below_diagonal @ vectors + values[: self.size, None] / 2 * vectors)
-        return half + half.T
+        half_product = vectors.T @ (below_diagonal @ vectors + values[: self.size, None] / 2 * vectors)
+        return half_product + half_product.T
 
     def to_scipy(self, values: Any) -> csr_array:
         """The matrix as a SciPy sparse array (n, n), both triangles."""
@@ -255,7 +255,7 @@ class SparsityPattern(Module):
         return csr_array(coo_array((data, coordinates), shape=(self.size, self.size)))
 
 
-def _as_numeric(values: Any) -> Any:
+def _convert_to_numeric(values: Any) -> Any:
     return values if isinstance(values, np.ndarray) else jnp.asarray(values)
 
 
@@ -297,10 +297,12 @@ class AssemblyMap(NamedTuple):
         """Create the map of a group. `entry`: index of the matrix entry of each packed value (pairs, m), row by row, or
         of each value (m,)."""
         source = np.arange(entry.size)
-        on_diagonal = entry < size
+        is_on_diagonal = entry < size
         return cls(
-            PaddedSum.create(store, entry[on_diagonal], source[on_diagonal], size, entry.size),
-            PaddedSum.create(store, entry[~on_diagonal] - size, source[~on_diagonal], num_entries - size, entry.size),
+            PaddedSum.create(store, entry[is_on_diagonal], source[is_on_diagonal], size, entry.size),
+            PaddedSum.create(
+                store, entry[~is_on_diagonal] - size, source[~is_on_diagonal], num_entries - size, entry.size
+            ),
             shape,
         )
 
@@ -315,9 +317,9 @@ class AssemblyMap(NamedTuple):
         """Read the matrix entry to which each packed value is added; see `SparsityPattern.entries_between`."""
         packed = (len(np.tril_indices(self.shape[1])[0]), self.shape[0]) if len(self.shape) > 1 else self.shape
         size = self.diagonal.gather.shape[1]
-        into = namespace(values).zeros(math.prod(packed) + 1, values.dtype)
-        into = self.diagonal.read_back(indices, values[:size], into)
-        return self.below.read_back(indices, values[size:], into)[:-1].reshape(packed)
+        packed_indices = namespace(values).zeros(math.prod(packed) + 1, values.dtype)
+        packed_indices = self.diagonal.replace_by_sums(indices, values[:size], packed_indices)
+        return self.below.replace_by_sums(indices, values[size:], packed_indices)[:-1].reshape(packed)
 
     def _packed(self, matrices: Inexact[Array, "..."], name: str) -> Inexact[Array, "..."]:
         """Element matrices as packed lower triangles, with one row of m values for each entry of a triangle."""
@@ -326,12 +328,14 @@ class AssemblyMap(NamedTuple):
                 raise ValueError(f"{name} must be the entries' values, shape {self.shape}; got {matrices.shape}.")
             return matrices
         count, nodes = self.shape
-        first, second = np.tril_indices(nodes)
-        if matrices.shape == (first.size, count):
+        first_corners, second_corners = np.tril_indices(nodes)
+        if matrices.shape == (first_corners.size, count):
             return matrices
         if matrices.shape != (count, nodes, nodes):
             raise ValueError(
                 f"{name} must hold {count} symmetric matrices, shape {(count, nodes, nodes)}, or their packed lower "
-                f"triangles, shape {(first.size, count)}; got {matrices.shape}."
+                f"triangles, shape {(first_corners.size, count)}; got {matrices.shape}."
             )
-        return namespace(matrices).stack([matrices[:, i, j] for i, j in zip(first, second, strict=True)])
+        return namespace(matrices).stack(
+            [matrices[:, i, j] for i, j in zip(first_corners, second_corners, strict=True)]
+        )
