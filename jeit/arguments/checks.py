@@ -178,9 +178,9 @@ def check_name(argument: str, value: Any, names: Iterable[str], otherwise: str =
 def did_you_mean(value: Any, names: Iterable[str]) -> str:
     """Question, in brackets, that proposes the name most similar to `value`, or a name that begins with `value`; empty
     if no name is similar."""
-    known_names, word = list(names), value.lower() if isinstance(value, str) else ""
-    completions = [name for name in known_names if word and name.startswith(word)]
-    matches = difflib.get_close_matches(word, known_names, n=1) or completions
+    known_names, lowercase_value = list(names), value.lower() if isinstance(value, str) else ""
+    completions = [name for name in known_names if lowercase_value and name.startswith(lowercase_value)]
+    matches = difflib.get_close_matches(lowercase_value, known_names, n=1) or completions
     return f" (did you mean {matches[0]!r}?)" if matches else ""
 
 
@@ -189,8 +189,8 @@ def names_text(names: Iterable[Any], max_names: int = 8) -> str:
     remaining names."""
     texts = [str(name) for name in names]
     shown_texts = [name if len(name) <= 24 else f"{name[:23]}…" for name in texts[:max_names]]
-    remainder = f" and {len(texts) - max_names} more" if len(texts) > max_names else ""
-    return (", ".join(shown_texts) or "nothing") + remainder
+    remainder_text = f" and {len(texts) - max_names} more" if len(texts) > max_names else ""
+    return (", ".join(shown_texts) or "nothing") + remainder_text
 
 
 def check_has_values(name: str, tree: Any, purpose: str, instead: str) -> None:

@@ -81,7 +81,7 @@ def faults_message(origin: str, sentences: list[str], keys: Sequence[str] = ()) 
     """Combine several faults in the file `origin` into one error message. It contains the first of the `sentences`, as
     many of the following sentences as fit, and the `keys` of up to ten of the remaining faults."""
     first_sentence = shorten(f"{shorten(origin, 2 * MAX_KEY_LENGTH)}: {sentences[0]}", _MAX_MESSAGE - 20)
-    num_shown = 1
+    num_listed = 1
     for num_sentences in range(min(len(sentences), _MAX_SENTENCES), 0, -1):
         # If a message proposes a valid word, its list of all valid words is omitted first to save room.
         short_sentences = [
@@ -99,11 +99,11 @@ def faults_message(origin: str, sentences: list[str], keys: Sequence[str] = ()) 
             if len(message) <= _MAX_MESSAGE:
                 return message
     while (
-        len(" ".join([first_sentence, *_further_faults(keys[1:], len(sentences) - 1, num_shown)])) <= _MAX_MESSAGE
-        and num_shown < _MAX_KEYS
+        len(" ".join([first_sentence, *_further_faults(keys[1:], len(sentences) - 1, num_listed)])) <= _MAX_MESSAGE
+        and num_listed < _MAX_KEYS
     ):
-        num_shown += 1
-    return " ".join([first_sentence, *_further_faults(keys[1:], len(sentences) - 1, num_shown - 1)])
+        num_listed += 1
+    return " ".join([first_sentence, *_further_faults(keys[1:], len(sentences) - 1, num_listed - 1)])
 
 
 def _further_faults(keys: Sequence[str], num_faults: int, max_keys: int) -> list[str]:
@@ -163,9 +163,9 @@ def read_text(path: str | Path, *, encoding: str = "utf-8", max_bytes: int | Non
     """
     path = Path(path)
     check_size(path, max_bytes)
-    content = path.read_bytes()
+    data = path.read_bytes()
     try:
-        return content.decode(encoding)
+        return data.decode(encoding)
     except UnicodeDecodeError:
         raise UnicodeError(f"{path.name} is no text in UTF-8.") from None
 
@@ -203,8 +203,8 @@ def _max_dots(line: str) -> int:
     """Maximum number of dots in a key on a line of TOML: the parser's time grows with the square of that number."""
     if "=" not in line:
         return line.count(".") if line.lstrip().startswith("[") and "," not in line else 0
-    prefixes = [part.rpartition("{")[2].rpartition(",")[2] for part in line.split("=")[:-1]]
-    return max(part.count(".") for part in prefixes)
+    prefixes = [key_part.rpartition("{")[2].rpartition(",")[2] for key_part in line.split("=")[:-1]]
+    return max(key_part.count(".") for key_part in prefixes)
 
 
 def read_json(path: str | Path, *, max_bytes: int = 2**26) -> Any:

@@ -94,21 +94,21 @@ def load(path: Path, *names: str) -> dict[str, np.ndarray]:
     return {"": np.array(sorted({variable.name for variable in variables}), dtype=str)} | values
 
 
-def numbers(content: dict[str, np.ndarray], key: str, path: Path) -> np.ndarray:
+def numbers(variables: dict[str, np.ndarray], key: str, path: Path) -> np.ndarray:
     """The numeric variable `key` of a .mat file. Raises `ValueError` if the variable is missing or not numeric."""
-    if key not in content and key in content[""]:
+    if key not in variables and key in variables[""]:
         raise ValueError(f"{path.name}: variable '{key}' holds other things, not numbers.")
-    if key not in content:
-        raise ValueError(f"{path.name}: there is no variable '{key}'; the file has {names_text(content[''])}.")
-    value = content[key]
+    if key not in variables:
+        raise ValueError(f"{path.name}: there is no variable '{key}'; the file has {names_text(variables[''])}.")
+    value = variables[key]
     if value.dtype.kind not in "fiuc" or value.size == 0:
         raise ValueError(f"{path.name}: variable '{key}' holds {value.dtype} of shape {value.shape}, not numbers.")
     return value
 
 
-def _dense_arrays(content: dict, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+def _dense_arrays(variables: dict, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Arrays `names` that SciPy read from a .mat file of format 4; sparse matrices are converted to dense arrays."""
-    arrays = {name: content[name] for name in names if name in content}
+    arrays = {name: variables[name] for name in names if name in variables}
     return {name: value.toarray() if hasattr(value, "toarray") else value for name, value in arrays.items()}
 
 
@@ -126,83 +126,83 @@ def _is_format_4(path: Path) -> bool:
 
 def _variables(path: Path) -> list[_Variable]:
     """Headers of the variables in a .mat file of format 5. Raises `ValueError` for other formats."""
-    content = path.read_bytes()
-    if len(content) >= _HEADER_BYTES and (content[:8] == b"\x89HDF\r\n\x1a\n" or 2 in content[124:126]):
+    data = path.read_bytes()
+    if len(data) >= _HEADER_BYTES and (data[:8] == b"\x89HDF\r\n\x1a\n" or 2 in data[124:126]):
         raise ValueError(
             f"{path.name} was saved in MATLAB's version 7.3 (HDF5). Save it again with `save(name, '-v7')`."
         )
     with read_as(_unreadable_message(path)):
-        return [*_elements(content)]
+        return [*_elements(data)]
 
 
-def _elements(content: bytes) -> Iterator[_Variable]:
+def _elements(data: bytes) -> Iterator[_Variable]:
     """Headers of the arrays in a .mat file, in the order of the file; only the beginning of a compressed array is
     decompressed."""
-    if len(content) < _HEADER_BYTES or content[126:128] not in (b"IM", b"MI"):
+    if len(data) < _HEADER_BYTES or data[126:128] not in (b"IM", b"MI"):
         raise ValueError("it is of another kind")
-    order = "<" if content[126:128] == b"IM" else ">"
+    byte_order = "<" if data[126:128] == b"IM" else ">"
     offset = _HEADER_BYTES
-    while offset + 8 <= len(content):
-        kind, size = struct.unpack_from(f"{order}II", content, offset)
+    while offset + 8 <= len(data):
+        kind, size = struct.unpack_from(f"{byte_order}II", data, offset)
         start, is_compressed = offset + 8, kind == _COMPRESSED_TYPE
-        if start + size > len(content):
+        if start + size > len(data):
             raise ValueError("it is cut short")
-        element = content[start : start + size]
+        element = data[start : start + size]
         if is_compressed:
-            prefix = zlib.decompressobj().decompress(element, _PREFIX_BYTES)
-            kind, prefix = struct.unpack_from(f"{order}I", prefix)[0], prefix[8:]
+            first_bytes = zlib.decompressobj().decompress(element, _PREFIX_BYTES)
+            kind, first_bytes = struct.unpack_from(f"{byte_order}I", first_bytes)[0], first_bytes[8:]
         else:
-            prefix = element[:_PREFIX_BYTES]
+            first_bytes = element[:_PREFIX_BYTES]
         if kind == _MATRIX_TYPE:
-            yield _Variable(*_header(prefix, order), element, is_compressed, order)
+            yield _Variable(*_header(first_bytes, byte_order), element, is_compressed, byte_order)
         offset = start + size
 
 
-def _header(prefix: bytes, order: str) -> tuple[str, tuple[int, ...], int, bool, int]:
+def _header(first_bytes: bytes, byte_order: str) -> tuple[str, tuple[int, ...], int, bool, int]:
     """Read the name, the shape, the class number, whether the array is complex, and the offset of its numbers in bytes,
     from the first three sub-elements of an array in a .mat file."""
-    _, flags, offset = _sub_element(prefix, 0, order)
-    _, shape, offset = _sub_element(prefix, offset, order)
-    _, name, offset = _sub_element(prefix, offset, order)
-    flag_bits = struct.unpack_from(f"{order}I", flags)[0]
-    lengths = struct.unpack(f"{order}{len(shape) // 4}i", shape)
+    _, flags, offset = _sub_element(first_bytes, 0, byte_order)
+    _, shape, offset = _sub_element(first_bytes, offset, byte_order)
+    _, name, offset = _sub_element(first_bytes, offset, byte_order)
+    flag_bits = struct.unpack_from(f"{byte_order}I", flags)[0]
+    lengths = struct.unpack(f"{byte_order}{len(shape) // 4}i", shape)
     if len(lengths) < 2 or any(length < 0 for length in lengths):
         raise ValueError("an array of it has no length, or a negative one")
     return name.decode("latin-1"), lengths, flag_bits & 0xFF, bool(flag_bits & _COMPLEX_FLAG), offset
 
 
-def _sub_element(content: bytes, offset: int, order: str) -> tuple[int, bytes, int]:
+def _sub_element(data: bytes, offset: int, byte_order: str) -> tuple[int, bytes, int]:
     """Type number and bytes of a sub-element of a .mat file, and the offset of the next sub-element. A sub-element of
     at most four bytes is stored inside its own tag."""
-    kind = struct.unpack_from(f"{order}I", content, offset)[0]
+    kind = struct.unpack_from(f"{byte_order}I", data, offset)[0]
     if kind >> 16:
         kind, size, start, next_offset = kind & 0xFFFF, kind >> 16, offset + 4, offset + 8
     else:
-        size, start = struct.unpack_from(f"{order}I", content, offset + 4)[0], offset + 8
+        size, start = struct.unpack_from(f"{byte_order}I", data, offset + 4)[0], offset + 8
         next_offset = start + -(-size // 8) * 8
-    if start + size > len(content):
+    if start + size > len(data):
         raise ValueError("what it says of an array is cut short, or too long")
-    return kind, content[start : start + size], next_offset
+    return kind, data[start : start + size], next_offset
 
 
-def _numbers(content: bytes, offset: int, order: str) -> tuple[np.ndarray, int]:
+def _numbers(data: bytes, offset: int, byte_order: str) -> tuple[np.ndarray, int]:
     """Numbers of a sub-element of a .mat file, and the offset of the next sub-element."""
-    kind, raw_bytes, offset = _sub_element(content, offset, order)
+    kind, raw_bytes, offset = _sub_element(data, offset, byte_order)
     if kind not in _STORED_TYPES:
         raise ValueError(f"an array of it is stored as type {kind}")
-    return np.frombuffer(raw_bytes, np.dtype(order + _STORED_TYPES[kind])), offset
+    return np.frombuffer(raw_bytes, np.dtype(byte_order + _STORED_TYPES[kind])), offset
 
 
 def _values(variable: _Variable) -> np.ndarray:
     """The numbers of a variable of a .mat file as an array; a sparse matrix is converted to a dense array."""
-    content, offset, order = _decompressed(variable), variable.numbers_start, variable.order
+    data, offset, byte_order = _decompressed(variable), variable.numbers_start, variable.order
     rows = column_starts = None
     if variable.kind == _SPARSE_CLASS:
-        rows, offset = _numbers(content, offset, order)
-        column_starts, offset = _numbers(content, offset, order)
-    values, offset = _numbers(content, offset, order)
+        rows, offset = _numbers(data, offset, byte_order)
+        column_starts, offset = _numbers(data, offset, byte_order)
+    values, offset = _numbers(data, offset, byte_order)
     if variable.complex:
-        values = values + 1j * _numbers(content, offset, order)[0]
+        values = values + 1j * _numbers(data, offset, byte_order)[0]
     if rows is None or column_starts is None:
         values = values.reshape(variable.shape, order="F")
         return values if variable.complex else values.astype(_NUMERIC_CLASSES[variable.kind])

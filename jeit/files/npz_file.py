@@ -48,7 +48,7 @@ def npz_arrays(
     Raises `ValueError` for files that are not NPZ files (with the text `otherwise`), damaged files, arrays of objects,
     and arrays that exceed the memory limit (`check_memory`). Raises `OSError` if the file does not exist.
     """
-    with _opened(path, otherwise) as archive:
+    with _open_archive(path, otherwise) as archive:
         members = _members(archive)
         requested = {name: info for name, info in members.items() if read_all or name in keys}
         headers = {name: _member_header(archive, name, info) for name, info in requested.items()}
@@ -64,7 +64,7 @@ def npz_shapes(path: Path) -> dict[str, tuple[int, ...]]:
     """Shapes of the arrays of numbers in an NPZ file, read from their headers; arrays of text or objects are omitted.
     Raises the errors of `npz_arrays`."""
     shapes = {}
-    with _opened(path) as archive:
+    with _open_archive(path) as archive:
         for name, info in _members(archive).items():
             with contextlib.suppress(ValueError):  # of an array of objects, or of a file of another kind
                 header = _member_header(archive, name, info)
@@ -74,15 +74,15 @@ def npz_shapes(path: Path) -> dict[str, tuple[int, ...]]:
 
 
 @contextlib.contextmanager
-def _opened(path: Path, otherwise: str = "not an NPZ file") -> Iterator[zipfile.ZipFile]:
+def _open_archive(path: Path, otherwise: str = "not an NPZ file") -> Iterator[zipfile.ZipFile]:
     """Open an NPZ file, and convert the errors of reading it. Arguments and errors as in `npz_arrays`."""
     with path.open("rb") as file:
-        mark = file.read(4)
-        if mark == _NPY_MARK:
+        signature = file.read(4)
+        if signature == _NPY_MARK:
             raise ValueError(
                 "it holds a single array without names; save it with numpy.savez and the names of its arrays."
             )
-        if mark != _ZIP_MARK:
+        if signature != _ZIP_MARK:
             raise ValueError(f"{otherwise}; save the arrays with numpy.savez.")
         file.seek(0)
         try:
@@ -197,5 +197,5 @@ def _read_array(file: IO[bytes]) -> np.ndarray:
 
 
 def _unreadable_error(kind: str, error: Exception) -> ValueError:
-    hint = "" if "object" not in str(error).lower() else " as numbers and text, not objects"
-    return ValueError(f"not a readable {kind} ({error_text(error)}); write it again{hint}.")
+    object_hint = "" if "object" not in str(error).lower() else " as numbers and text, not objects"
+    return ValueError(f"not a readable {kind} ({error_text(error)}); write it again{object_hint}.")

@@ -74,7 +74,7 @@ class Table(BaseModel):
         replaced by the allowed word."""
         key_annotations = {key: field.annotation for key, field in cls.model_fields.items()}
         return {
-            key: spelled(value, _allowed_words(key_annotations[key])) if key in key_annotations else value
+            key: match_spelling(value, _allowed_words(key_annotations[key])) if key in key_annotations else value
             for key, value in table.items()
         }
 
@@ -122,12 +122,12 @@ Words = Annotated[list[Word], FailFast()]
 """A list of lines of text."""
 
 
-def spelled(value: Any, words: Iterable[str]) -> Any:
-    """Return the word in `words` that differs from `value` only by hyphens and underscores; `value` if there is no such
-    word."""
+def match_spelling(value: Any, allowed_words: Iterable[str]) -> Any:
+    """Return the word in `allowed_words` that differs from `value` only by hyphens and underscores; `value` if there is
+    no such word."""
     if not isinstance(value, str):
         return value
-    return next((word for word in words if word.replace("_", "-") == value.replace("_", "-")), value)
+    return next((word for word in allowed_words if word.replace("_", "-") == value.replace("_", "-")), value)
 
 
 def _allowed_words(annotation: Any) -> list[str]:
@@ -173,14 +173,16 @@ class Number:
     def read(self, value: Any, is_integer: bool = False, otherwise: str = "") -> float:
         """Check a value and convert it to a number. Raises an error created by `fault` for invalid values."""
         if not _is_number(value, is_integer):
-            expected = "a whole number" if is_integer else "a number"
-            raise fault(f"must be {expected}{otherwise}, {self.span}; it is {describe(value)}.")
+            requirement = "a whole number" if is_integer else "a number"
+            raise fault(f"must be {requirement}{otherwise}, {self.span}; it is {describe(value)}.")
         if value > _MAX_FLOAT and math.isinf(self.high):
             raise fault(f"is {describe(value)}, beyond double precision.")
         if not self.low <= value <= self.high:
             value_text = f"{value:g}" if isinstance(value, float) else describe(value)
-            hint = f" {self.beyond}" if self.beyond and value > self.high else "" if is_integer else self._hint(value)
-            raise fault(f"is {value_text}, and must be {self.span}.{hint}")
+            range_hint = (
+                f" {self.beyond}" if self.beyond and value > self.high else "" if is_integer else self._hint(value)
+            )
+            raise fault(f"is {value_text}, and must be {self.span}.{range_hint}")
         return int(value) if is_integer else float(value)
 
     @property
@@ -332,10 +334,10 @@ class OneOf:
             return self.alternative_table.model_validate(value)
         if self.key not in value:
             if self.default_table is None:
-                ending = f", or {self.alternative_key}" if self.alternative_key else ""
-                raise fault(f"is missing; give it, one of {_list_names(self.tables)}{ending}.", self.key)
+                alternative_text = f", or {self.alternative_key}" if self.alternative_key else ""
+                raise fault(f"is missing; give it, one of {_list_names(self.tables)}{alternative_text}.", self.key)
             return self.default_table.model_validate(value)
-        word = spelled(value[self.key], self.tables)
+        word = match_spelling(value[self.key], self.tables)
         if not (isinstance(word, str) and word in self.tables):
             raise fault(not_among(word, self.tables, self._suggestion(word)), self.key)
         return self.tables[word].model_validate({**value, self.key: word})

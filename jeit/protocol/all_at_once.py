@@ -65,9 +65,9 @@ def measurement_patterns(num_electrodes: int, measurement: Reading, reference: i
         return np.eye(count) - 1 / count
     if measurement == "mean":
         return np.eye(count) - (1 - np.eye(count)) / (count - 1)
-    last = count - 1 if reference is None else int(electrode_indices(reference, count)[0])
-    others = np.delete(np.arange(count), last)
-    return pair_patterns(np.stack([others, np.full(count - 1, last)], axis=1), count)
+    reference_index = count - 1 if reference is None else int(electrode_indices(reference, count)[0])
+    other_indices = np.delete(np.arange(count), reference_index)
+    return pair_patterns(np.stack([other_indices, np.full(count - 1, reference_index)], axis=1), count)
 
 
 def from_matrices(
@@ -99,7 +99,7 @@ def from_matrices(
     protocol = from_matrices(1e-3 * pairs, pairs)
     ```
     """
-    drive, measurement = _as_matrix(drive, "drive"), _as_matrix(measurement, "measurement")
+    drive, measurement = _convert_to_matrix(drive, "drive"), _convert_to_matrix(measurement, "measurement")
     if not large_currents:
         _check_currents(drive, "from_matrices")
     shape = (drive.shape[0], measurement.shape[0])
@@ -144,26 +144,26 @@ def from_channels(
     protocol = from_channels(known.drive, known.channel_measurement, known.drive_index)
     ```
     """
-    drive, rows = _as_matrix(drive, "drive"), _as_matrix(channel_measurement, "measurement")
+    drive, rows = _convert_to_matrix(drive, "drive"), _convert_to_matrix(channel_measurement, "measurement")
     if not large_currents:
         _check_currents(drive, "from_channels")
-    index = np.asarray(drive_index)
-    if index.shape != (len(rows),):
+    drive_indices = np.asarray(drive_index)
+    if drive_indices.shape != (len(rows),):
         raise ValueError(
-            f"from_channels: drive_index has shape {index.shape}; give one drive number for each of the "
+            f"from_channels: drive_index has shape {drive_indices.shape}; give one drive number for each of the "
             f"{len(rows)} channels."
         )
     if not np.all(np.isfinite(rows)):
         raise ValueError("from_channels: the measurement patterns contain NaN or infinity. Mask channels instead.")
-    _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    _, first_rows, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     # Keep the order of first appearance, so that a file's numbering of its patterns is preserved.
-    appearance = np.argsort(first)
+    appearance = np.argsort(first_rows)
     rank = np.empty_like(appearance)
     rank[appearance] = np.arange(len(appearance))
-    return Protocol(drive, rows[first[appearance]], index, rank[inverse.ravel()], name)
+    return Protocol(drive, rows[first_rows[appearance]], drive_indices, rank[inverse.ravel()], name)
 
 
-def _as_matrix(values: Any, pattern_kind: str) -> np.ndarray:
+def _convert_to_matrix(values: Any, pattern_kind: str) -> np.ndarray:
     if not has_values(values):
         return values
     if hasattr(values, "toarray"):  # a scipy.sparse matrix, as loadmat returns for EIDORS patterns
@@ -255,11 +255,11 @@ def haar(
     groups, drives = [np.arange(count)], []
     while groups:
         group = groups.pop(0)
-        first, second = np.array_split(group, 2)
+        first_half, second_half = np.array_split(group, 2)
         pattern = np.zeros(count)
-        pattern[first], pattern[second] = len(second), -len(first)
-        drives.append(pattern / len(first))  # the first half is at least as large as the second
-        groups += [half for half in (first, second) if len(half) > 1]
+        pattern[first_half], pattern[second_half] = len(second_half), -len(first_half)
+        drives.append(pattern / len(first_half))  # the first half is at least as large as the second
+        groups += [half for half in (first_half, second_half) if len(half) > 1]
     drive = np.array(drives)
     return _all_combinations("haar", drive / np.abs(drive).max(axis=1, keepdims=True), measurement, reference, current)
 
@@ -333,10 +333,10 @@ def optimal(
     return _all_combinations("optimal for a given power", drive, measurement, reference, 1.0)
 
 
-def _drives_for_power(dissipated, change, power: float, alone: bool) -> tuple[np.ndarray, np.ndarray]:
+def _drives_for_power(dissipated, change, power: float, has_one_body: bool) -> tuple[np.ndarray, np.ndarray]:
     """Directions of the drives that maximise distinguishability for fixed power, and their squared
     distinguishabilities, the largest first."""
-    if alone:
+    if has_one_body:
         raise ValueError("power needs other: with one body alone the currents for a given power are those of no power.")
     if isinstance(power, bool) or not isinstance(power, int | float) or not 0 < power < np.inf:
         raise ValueError(f"power must be a positive number of watts; it is {power!r}.")

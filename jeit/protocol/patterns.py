@@ -87,13 +87,13 @@ class CrossedPairs:
         # Channels are selected with NumPy at unit current, so that the argument `current` may be traced.
         drive = pair_patterns(self.drive, self.num_electrodes)
         measurement = pair_patterns(self.measurement, self.num_electrodes)
-        keep = np.ones(len(drive_index), dtype=bool)
+        is_kept = np.ones(len(drive_index), dtype=bool)
         if not driven_electrodes:
-            keep &= ~shares_electrode(drive, measurement)[drive_index, measurement_index]
+            is_kept &= ~shares_electrode(drive, measurement)[drive_index, measurement_index]
         if reciprocal == "half":
             pairs, _ = reciprocal_channel_pairs(drive, measurement, drive_index, measurement_index)
-            keep[pairs[:, 1]] = False
-        if not keep.any():
+            is_kept[pairs[:, 1]] = False
+        if not is_kept.any():
             raise ValueError(
                 f"{self.where}: every channel measures on a driven electrode, so none is left. Pass "
                 "driven_electrodes=True, or measure other pairs."
@@ -101,8 +101,8 @@ class CrossedPairs:
         return Protocol(
             drive=current * drive,
             measurement=measurement,
-            drive_index=drive_index[keep],
-            measurement_index=measurement_index[keep],
+            drive_index=drive_index[is_kept],
+            measurement_index=measurement_index[is_kept],
             name=name,
         )
 
@@ -279,8 +279,8 @@ def all_against_one(
     pairs = np.array([(k, common) for k in range(count) if k != common])
     if driven_electrodes is None:
         driven_electrodes = measurement == "common"
-    read = pairs if measurement == "common" else ring_pairs(count, 1)
-    return CrossedPairs("all_against_one", count, pairs, read).protocol(
+    measurement_pairs = pairs if measurement == "common" else ring_pairs(count, 1)
+    return CrossedPairs("all_against_one", count, pairs, measurement_pairs).protocol(
         f"all against electrode {common}, {measurement} measurement, {count} electrodes",
         current=current,
         driven_electrodes=driven_electrodes,

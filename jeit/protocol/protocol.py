@@ -141,25 +141,25 @@ def check_pairs(pairs, num_electrodes: int, argument_name: str) -> np.ndarray:
 def check_choice(value, choices: tuple[str, ...], function_name: str, name: str) -> None:
     """Raise `ValueError` unless the value of the argument `name` is one of `choices`."""
     if value not in choices:
-        meant = did_you_mean(value, choices)
+        suggestion = did_you_mean(value, choices)
         raise ValueError(
-            f"{function_name}: {name} must be one of {', '.join(map(repr, choices))}; got {value!r}{meant}."
+            f"{function_name}: {name} must be one of {', '.join(map(repr, choices))}; got {value!r}{suggestion}."
         )
 
 
-def _as_float(values) -> Array:
+def _convert_to_float(values) -> Array:
     return as_array(values, float)
 
 
-def _as_index(values) -> Array:
+def _convert_to_indices(values) -> Array:
     if not isinstance(values, jax.Array) and np.asarray(values).dtype.kind not in "iub":
         raise ValueError("Protocol: drive_index and measurement_index must be integers (0-based).")
     return as_array(values, np.int32)
 
 
 @either_engine
-def _select_rows(patterns, index):
-    return patterns[index]
+def _select_rows(patterns, row_indices):
+    return patterns[row_indices]
 
 
 class Protocol(Module):
@@ -190,10 +190,10 @@ class Protocol(Module):
     ```
     """
 
-    drive: Float[Array, "S L"] = eqx.field(converter=_as_float)
-    measurement: Float[Array, "K L"] = eqx.field(converter=_as_float)
-    drive_index: Int[Array, " M"] = eqx.field(converter=_as_index)
-    measurement_index: Int[Array, " M"] = eqx.field(converter=_as_index)
+    drive: Float[Array, "S L"] = eqx.field(converter=_convert_to_float)
+    measurement: Float[Array, "K L"] = eqx.field(converter=_convert_to_float)
+    drive_index: Int[Array, " M"] = eqx.field(converter=_convert_to_indices)
+    measurement_index: Int[Array, " M"] = eqx.field(converter=_convert_to_indices)
     name: str = eqx.field(static=True, default="custom")
 
     def __check_init__(self):
@@ -320,14 +320,14 @@ class Protocol(Module):
         )
         # Differences of two electrodes are independent, so only drives with other measurements need be examined.
         has_many_electrodes = np.count_nonzero(rows, axis=1) > 2
-        num_repeated, ranks = 0, {}
+        num_redundant, ranks = 0, {}
         for drive_number in np.unique(drive[has_many_electrodes[measurement]]):
             drive_rows = np.sort(measurement[drive == drive_number])
             key = drive_rows.tobytes()
             if key not in ranks:
                 ranks[key] = int(np.linalg.matrix_rank(rows[drive_rows], tol=1e-9))
-            num_repeated += len(drive_rows) - ranks[key]
-        return num_repeated
+            num_redundant += len(drive_rows) - ranks[key]
+        return num_redundant
 
     def reciprocal_pairs(self) -> tuple[Int[np.ndarray, "P 2"], Float[np.ndarray, " P"]]:
         """Pairs of channels whose voltages are proportional by reciprocity, and the ratios of their voltages.
@@ -365,10 +365,10 @@ class Protocol(Module):
         )
 
 
-def _pattern_rows(patterns, index) -> np.ndarray:
-    """Pattern of each channel: the rows `index` of `patterns`. NumPy is used, because JAX would compile the
+def _pattern_rows(patterns, pattern_indices) -> np.ndarray:
+    """Pattern of each channel: the rows `pattern_indices` of `patterns`. NumPy is used, because JAX would compile the
     indexing."""
-    return np.asarray(patterns)[np.asarray(index)]
+    return np.asarray(patterns)[np.asarray(pattern_indices)]
 
 
 def shares_electrode(drive: Float[np.ndarray, "S L"], measurement: Float[np.ndarray, "K L"]) -> Bool[np.ndarray, "S K"]:
