@@ -124,12 +124,12 @@ def _replace_voltages(measurement: Measurement, values, note: str) -> Measuremen
 def _signs(measurement: Measurement) -> Float[np.ndarray, " M"] | None:
     """Signs (channels,) of the voltages of a passive body, 0 for signs that depend on the body; None if electrodes are
     not known to follow each other along an edge, or around a solid at one height."""
-    order = boundary_order(measurement)
-    if order is None and isinstance(measurement.domain, Solid) and measurement.electrodes is not None:
+    electrode_order = boundary_order(measurement)
+    if electrode_order is None and isinstance(measurement.domain, Solid) and measurement.electrodes is not None:
         height = np.asarray(getattr(measurement.electrodes, "position", np.zeros((0, 3))))[:, -1]
         if len(height) and np.ptp(height) < 1e-9:
-            order = np.arange(len(height))
-    return None if order is None else expected_signs(measurement.protocol, order)
+            electrode_order = np.arange(len(height))
+    return None if electrode_order is None else expected_signs(measurement.protocol, electrode_order)
 
 
 def channel_gains(measurement: Measurement) -> tuple[Float[np.ndarray, " K"] | None, float | None]:

@@ -144,19 +144,19 @@ def estimate_noise(measurement: Measurement) -> NoiseEstimate | None:
     return NoiseEstimate(deviation, deviation / size if size > 0 else float("inf"), method)
 
 
-def expected_signs(protocol: Protocol, order: Int[np.ndarray, " L"]) -> Int[np.ndarray, " M"]:
+def expected_signs(protocol: Protocol, electrode_order: Int[np.ndarray, " L"]) -> Int[np.ndarray, " M"]:
     """Sign (M,) that the voltage of each of the M channels has on every passive body; 0 if the sign depends on the
     body.
 
     On the boundary of a simply connected sheet the potential falls monotonically from source to sink along both arcs
     between them: a local extremum elsewhere would contradict the maximum principle, for any (positive) conductivity.
-    The sign of a voltage between two electrodes of the same arc is therefore known. `order` (L,) lists the L electrodes
-    as they follow each other along the boundary. The sign is 0 for channels that do not drive and measure by pairs of
-    electrodes.
+    The sign of a voltage between two electrodes of the same arc is therefore known. `electrode_order` (L,) lists the L
+    electrodes as they follow each other along the boundary. The sign is 0 for channels that do not drive and measure by
+    pairs of electrodes.
     """
     num_electrodes = protocol.num_electrodes
     rank = np.empty(num_electrodes, dtype=int)
-    rank[order] = np.arange(len(order))
+    rank[electrode_order] = np.arange(len(electrode_order))
     drive, measurement = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
     uses_pairs = (np.count_nonzero(drive, axis=1) == 2) & (np.count_nonzero(measurement, axis=1) == 2)
     source = rank[drive.argmax(axis=1)]
@@ -375,16 +375,17 @@ def describe_electrode_order(measurement: Measurement) -> str | None:
     )
 
 
-def is_cyclic_sequence(order: Int[np.ndarray, " L"]) -> bool:
-    """Whether the electrode numbers in the cyclic `order` increase by one at every step, or decrease by one."""
-    steps = (np.roll(order, -1) - order) % len(order)
-    return bool((steps == 1).all() or (steps == len(order) - 1).all())
+def is_cyclic_sequence(electrode_order: Int[np.ndarray, " L"]) -> bool:
+    """Whether the electrode numbers in the cyclic `electrode_order` increase by one at every step, or decrease by
+    one."""
+    steps = (np.roll(electrode_order, -1) - electrode_order) % len(electrode_order)
+    return bool((steps == 1).all() or (steps == len(electrode_order) - 1).all())
 
 
-def _rotate_to_first(order: Int[np.ndarray, " L"]) -> Int[np.ndarray, " L"]:
-    """The cyclic `order` of electrodes rotated to begin at the first electrode, in the direction in which most numbers
-    increase."""
-    steps = (np.roll(order, -1) - order) % len(order)
-    if (steps == len(order) - 1).sum() > (steps == 1).sum():
-        order = order[::-1]
-    return np.roll(order, -int(np.flatnonzero(order == 0)[0]))
+def _rotate_to_first(electrode_order: Int[np.ndarray, " L"]) -> Int[np.ndarray, " L"]:
+    """The cyclic `electrode_order` of electrodes rotated to begin at the first electrode, in the direction in which
+    most numbers increase."""
+    steps = (np.roll(electrode_order, -1) - electrode_order) % len(electrode_order)
+    if (steps == len(electrode_order) - 1).sum() > (steps == 1).sum():
+        electrode_order = electrode_order[::-1]
+    return np.roll(electrode_order, -int(np.flatnonzero(electrode_order == 0)[0]))

@@ -278,16 +278,16 @@ class _PlanePen:
     def __init__(self):
         self.polygons: list[list[np.ndarray]] = []
 
-    def lines(self, pieces: list[np.ndarray], middle: np.ndarray) -> None:
-        lines = [np.asarray(piece) for piece in pieces]
+    def lines(self, segments: list[np.ndarray], centre: np.ndarray) -> None:
+        lines = [np.asarray(segment) for segment in segments]
         self.polygons.append([piece[k : k + 2] for piece in lines for k in range(len(piece) - 1)])
 
-    def disc(self, middle: np.ndarray, radius: float) -> None:
+    def disc(self, centre: np.ndarray, radius: float) -> None:
         angle = 2 * np.pi * np.arange(_CIRCLE_CORNERS) / _CIRCLE_CORNERS
-        self.polygons.append([middle[:2] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
+        self.polygons.append([centre[:2] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
 
-    def rectangle(self, middle: np.ndarray, width: float, height: float) -> None:
-        self.polygons.append([middle[:2] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, height / 2]])
+    def rectangle(self, centre: np.ndarray, width: float, height: float) -> None:
+        self.polygons.append([centre[:2] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, height / 2]])
 
-    def dot(self, middle: np.ndarray) -> None:
-        self.polygons.append([np.asarray(middle[:2])[None]])
+    def dot(self, centre: np.ndarray) -> None:
+        self.polygons.append([np.asarray(centre[:2])[None]])

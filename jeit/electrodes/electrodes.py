@@ -39,16 +39,16 @@ class ElectrodePen(Protocol):
     """Interface to draw electrodes as seen from above, with one stroke per electrode; `middle` (d,) is the electrode's
     centre. All lengths are in metres."""
 
-    def lines(self, pieces: list[np.ndarray], middle: np.ndarray) -> None:
-        """Draw an electrode on the edge of a sheet, which covers the polylines `pieces`, each (k, 2)."""
+    def lines(self, segments: list[np.ndarray], centre: np.ndarray) -> None:
+        """Draw an electrode on the edge of a sheet, which covers the polylines `segments`, each (k, 2)."""
 
-    def disc(self, middle: np.ndarray, radius: float) -> None:
+    def disc(self, centre: np.ndarray, radius: float) -> None:
         """Draw a disc."""
 
-    def rectangle(self, middle: np.ndarray, width: float, height: float) -> None:
+    def rectangle(self, centre: np.ndarray, width: float, height: float) -> None:
         """Draw a rectangle with sides along x and y."""
 
-    def dot(self, middle: np.ndarray) -> None:
+    def dot(self, centre: np.ndarray) -> None:
         """Draw an electrode that has no size, or whose shape is not visible from above."""
 
 

@@ -43,7 +43,7 @@ class _Variable(NamedTuple):
     numbers_start: int  # where the numbers begin in the uncompressed element
     content: bytes  # the element as stored in the file, without its tag
     is_compressed: bool
-    order: str  # byte order: "<" or ">"
+    byte_order: str  # byte order: "<" or ">"
 
     @property
     def size(self) -> int:
@@ -195,7 +195,7 @@ def _numbers(data: bytes, offset: int, byte_order: str) -> tuple[np.ndarray, int
 
 def _values(variable: _Variable) -> np.ndarray:
     """The numbers of a variable of a .mat file as an array; a sparse matrix is converted to a dense array."""
-    data, offset, byte_order = _decompressed(variable), variable.numbers_start, variable.order
+    data, offset, byte_order = _decompressed(variable), variable.numbers_start, variable.byte_order
     rows = column_starts = None
     if variable.kind == _SPARSE_CLASS:
         rows, offset = _numbers(data, offset, byte_order)

@@ -356,12 +356,12 @@ class OneOf:
         return f" (did you mean {valid_word!r}, with {' and '.join(sizes)}?)"
 
 
-def validated(table: type[T], content: Any, origin: str) -> T:
-    """Validate the `content` of a file and return it as a `table`. Raises one `ValueError` of at most 400 characters,
-    which begins with `origin`, the file's name. It contains a sentence about each faulty key, or about as many keys as
-    fit."""
+def validated(table: type[T], table_values: Any, origin: str) -> T:
+    """Validate the `table_values` of a file and return them as a `table`. Raises one `ValueError` of at most 400
+    characters, which begins with `origin`, the file's name. It contains a sentence about each faulty key, or about as
+    many keys as fit."""
     try:
-        return table.model_validate(content)
+        return table.model_validate(table_values)
     except ValidationError as error:
         faults = error.errors(include_url=False, include_input=False)
     keys = [_full_key_name(_fault_path(details)) for details in faults]

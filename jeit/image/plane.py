@@ -80,8 +80,8 @@ def _cut_cells(cells, values, level: float, corners_by_number: dict[int, list[li
     piece_arrays = []
     for num_corners_above, corners in corners_by_number.items():
         cell = np.flatnonzero(num_nodes_above == num_corners_above)
-        order = np.argsort(-values[cells[cell]], axis=1, kind="stable")
-        end_nodes = np.take_along_axis(cells[cell], order, axis=1)[:, np.array(corners)]
+        sort_order = np.argsort(-values[cells[cell]], axis=1, kind="stable")
+        end_nodes = np.take_along_axis(cells[cell], sort_order, axis=1)[:, np.array(corners)]
         high, low = values[end_nodes[..., 0]], values[end_nodes[..., 1]]
         with np.errstate(invalid="ignore"):
             edge_fractions = np.where(high > low, (high - level) / np.where(high > low, high - low, 1), 0)

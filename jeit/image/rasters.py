@@ -124,9 +124,9 @@ def _cells_of_pixels(points, cells, x, y, height: float | None) -> Int[np.ndarra
     barycentric = [sum(inverse[cell, i, j] * offset[j] for j in range(len(offset))) for i in range(len(offset))]
     is_inside = np.minimum(np.minimum.reduce(barycentric), 1 - sum(barycentric)) > -1e-9
     distance = np.sum([(coordinate - centroid[cell, axis]) ** 2 for axis, coordinate in enumerate(position)], axis=0)
-    order = np.argsort(-distance[is_inside], kind="stable")  # the nearest cell of a pixel is assigned last
+    sort_order = np.argsort(-distance[is_inside], kind="stable")  # the nearest cell of a pixel is assigned last
     cell_of_pixel = np.full((len(y), len(x)), -1)
-    cell_of_pixel[row[is_inside][order], column[is_inside][order]] = cell[is_inside][order]
+    cell_of_pixel[row[is_inside][sort_order], column[is_inside][sort_order]] = cell[is_inside][sort_order]
     return cell_of_pixel
 
 

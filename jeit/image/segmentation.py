@@ -115,8 +115,8 @@ def shared_facets(mesh: Mesh) -> Int[np.ndarray, "m k"]:
     """Indices (m, k) of the k facets of each cell that are shared with another cell, -1 for facets on the boundary."""
     pairs, _ = interior_facets(mesh)
     cell, facet = pairs.T.ravel(), np.tile(np.arange(len(pairs)), 2)
-    order = np.argsort(cell, kind="stable")
-    cell, facet = cell[order], facet[order]
+    sort_order = np.argsort(cell, kind="stable")
+    cell, facet = cell[sort_order], facet[sort_order]
     shared = np.full((mesh.num_cells, mesh.dimension + 1), -1)
     shared[cell, np.arange(len(cell)) - np.searchsorted(cell, cell)] = facet
     return shared

@@ -51,7 +51,9 @@ def exchanges_message(frame: Measurement, reference: Measurement) -> str:
     if not pairs or remaining_norm > _MAX_TOTAL_RATIO * described_norm:
         return ""
     reference_norm = float(np.linalg.norm(reference_values))
-    pair_text = ", ".join(f"{first + 1} and {second + 1}" for first, second in pairs)
+    pair_text = ", ".join(
+        f"{first_electrode + 1} and {second_electrode + 1}" for first_electrode, second_electrode in pairs
+    )
     return (
         f"{exchanged_kind} {pair_text} look exchanged in it, and not in its reference: so taken it differs from that "
         f"by {percent(remaining_norm / reference_norm)}, as it is by {percent(described_norm / reference_norm)}. Mend "
@@ -259,26 +261,26 @@ def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
     first order has an empty name and is that of the protocol."""
     drive, measurement = np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)
     channels = np.arange(len(drive))
-    first = np.asarray(protocol.measurement).argmax(axis=1)[measurement]
+    positive_electrodes = np.asarray(protocol.measurement).argmax(axis=1)[measurement]
     source, sink = (choose(np.asarray(protocol.drive), axis=1)[drive] for choose in (np.argmax, np.argmin))
     sort_keys = {
-        'from electrode 1 on in every drive (order = "fixed")': (first, drive),
+        'from electrode 1 on in every drive (order = "fixed")': (positive_electrodes, drive),
         'from the driven electrodes on in every drive (order = "rotating")': (
-            (first - source) % protocol.num_electrodes,
+            (positive_electrodes - source) % protocol.num_electrodes,
             drive,
         ),
         "from the second driven electrode on in every drive (rotating)": (
-            (first - sink) % protocol.num_electrodes,
+            (positive_electrodes - sink) % protocol.num_electrodes,
             drive,
         ),
-        "measurement by measurement, not drive by drive": (drive, first),
+        "measurement by measurement, not drive by drive": (drive, positive_electrodes),
     }
     orders = {"": channels}
     for name, keys in sort_keys.items():
-        order = np.empty_like(channels)
-        order[np.lexsort(keys)] = channels
-        if not any(np.array_equal(order, found_order) for found_order in orders.values()):
-            orders[name] = order
+        channel_order = np.empty_like(channels)
+        channel_order[np.lexsort(keys)] = channels
+        if not any(np.array_equal(channel_order, found_order) for found_order in orders.values()):
+            orders[name] = channel_order
     return orders
 
 

@@ -106,7 +106,7 @@ def read_dxf(path: Path, outline: Domain | None) -> Layout:
     labels = []
     for electrode, (centre, radius) in enumerate(zip(centres, radii, strict=True), start=1):
         is_inside = np.linalg.norm(centre - text_positions, axis=-1) <= radius
-        electrode_labels = [texts[index].text for index in np.flatnonzero(is_inside)]
+        electrode_labels = [texts[text_index].text for text_index in np.flatnonzero(is_inside)]
         if len(electrode_labels) > 1:
             raise ValueError(f"electrode {electrode} has several labels: {names_text(map(repr, electrode_labels))}.")
         labels += electrode_labels or [str(electrode)]

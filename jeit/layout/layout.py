@@ -21,7 +21,7 @@ def check_labels(labels: Sequence[str] | None, num_electrodes: int) -> tuple[str
     """Check the labels of `num_electrodes` electrodes and return them as a tuple; by default "1", "2", … Raises
     `ValueError` for a wrong number of labels, for invalid labels, and for labels that are repeated."""
     if labels is None:
-        return tuple(str(index + 1) for index in range(num_electrodes))
+        return tuple(str(electrode_index + 1) for electrode_index in range(num_electrodes))
     labels = list(labels)
     if len(labels) != num_electrodes:
         raise ValueError(f"labels: there are {len(labels)}; give one for each of the {num_electrodes} electrodes.")
@@ -111,7 +111,9 @@ class Layout(Module):
         self.labels = check_labels(labels, number)
         self.name = name
         if has_values(self.centres, self.diameters, outline):
-            electrode_texts = [f"electrode {index + 1} ('{label}')" for index, label in enumerate(self.labels)]
+            electrode_texts = [
+                f"electrode {electrode_index + 1} ('{label}')" for electrode_index, label in enumerate(self.labels)
+            ]
             check_discs_fit(np.asarray(self.centres), np.asarray(self.diameters), outline, electrode_texts)
 
     @property

@@ -150,13 +150,15 @@ def _path_loops(element: ElementTree.Element) -> list[np.ndarray]:
             continue
         if kind == "Z" or not numbers or len(numbers) % size or (kind != "M" and not loops):
             raise ValueError(f"d of {describe_element(element)} is not a path: {letter}{argument_text.strip()[:40]}.")
-        for index in range(0, len(numbers), size):
+        for number_index in range(0, len(numbers), size):
             origin = (
                 position if relative else np.array({"H": [0, position[1]], "V": [position[0], 0]}.get(kind, [0, 0]))
             )
-            step = {"H": [numbers[index], 0], "V": [0, numbers[index]]}.get(kind, numbers[index : index + 2])
+            step = {"H": [numbers[number_index], 0], "V": [0, numbers[number_index]]}.get(
+                kind, numbers[number_index : number_index + 2]
+            )
             start, position = position, origin + np.array(step)
-            if kind == "M" and index == 0:
+            if kind == "M" and number_index == 0:
                 loops.append(([position], False))
             else:  # a line after Z without M starts a new loop where the closed loop began
                 if loops[-1][1]:

@@ -220,11 +220,11 @@ def _move_nodes_onto(split_mesh: _SplitMesh, level) -> tuple[_SplitMesh, Float[n
     edges = edges[np.prod(np.sign(levels)[edges], axis=1) < 0]
     crossing_points = _find_zeros_on_edges(points[edges], levels[edges[:, 0]], level)
     distance = np.linalg.norm(points[edges] - crossing_points[:, None], axis=2) / _edge_lengths(points[edges])[:, None]
-    end_nodes, order = edges.ravel(), np.argsort(-distance.ravel())  # a node's nearest crossing is assigned last
+    end_nodes, sort_order = edges.ravel(), np.argsort(-distance.ravel())  # a node's nearest crossing is assigned last
     nearest_distance, target = np.full(len(points), np.inf), points.copy()
-    nearest_distance[end_nodes[order]], target[end_nodes[order]] = (
-        distance.ravel()[order],
-        np.repeat(crossing_points, 2, axis=0)[order],
+    nearest_distance[end_nodes[sort_order]], target[end_nodes[sort_order]] = (
+        distance.ravel()[sort_order],
+        np.repeat(crossing_points, 2, axis=0)[sort_order],
     )
     is_moved = (nearest_distance < _MAX_MOVE) & ~_mark_nodes(split_mesh.facets, len(points))
     volumes_before = _volumes(points, cells)

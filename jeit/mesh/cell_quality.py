@@ -120,13 +120,13 @@ def merge_points(points: np.ndarray, cells: np.ndarray, tolerance: float) -> tup
     _, label = connected_components(graph, directed=False)
     _, first_points, group_index = np.unique(label, return_index=True, return_inverse=True)
     # Number the groups in the order of their first points.
-    order = np.argsort(first_points)
-    new_index = np.empty(len(order), int)
-    new_index[order] = np.arange(len(order))
+    sort_order = np.argsort(first_points)
+    new_index = np.empty(len(sort_order), int)
+    new_index[sort_order] = np.arange(len(sort_order))
     renumbered = new_index[group_index][cells]
     sorted_cells = np.sort(renumbered, axis=1)
     is_valid = (sorted_cells[:, 1:] != sorted_cells[:, :-1]).all(axis=1)
-    return points[first_points[order]], renumbered[is_valid]
+    return points[first_points[sort_order]], renumbered[is_valid]
 
 
 # Layout of a triangle in a binary .stl file: a normal, three corners, and two bytes of attributes.

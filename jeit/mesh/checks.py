@@ -72,13 +72,13 @@ def check_cells(cells: ArrayLike, num_points: int, dimension: int) -> np.ndarray
             f"cells: cell {repeated_cells[0]} uses a node twice: {array[repeated_cells[0]].tolist()}. Remove such "
             "cells."
         )
-    order = np.lexsort(sorted_cells.T[::-1])
-    duplicates = np.flatnonzero((sorted_cells[order][1:] == sorted_cells[order][:-1]).all(axis=1))
+    sort_order = np.lexsort(sorted_cells.T[::-1])
+    duplicates = np.flatnonzero((sorted_cells[sort_order][1:] == sorted_cells[sort_order][:-1]).all(axis=1))
     if duplicates.size:
-        pair = np.sort(order[duplicates[0] : duplicates[0] + 2]).tolist()
+        pair = np.sort(sort_order[duplicates[0] : duplicates[0] + 2]).tolist()
         raise ValueError(
             f"cells: {duplicates.size} cell(s) are duplicated, first cells {pair[0]} and {pair[1]} with nodes "
-            f"{sorted_cells[order[duplicates[0]]].tolist()}. Keep one of each."
+            f"{sorted_cells[sort_order[duplicates[0]]].tolist()}. Keep one of each."
         )
     unused_nodes = np.setdiff1d(np.arange(num_points), array)
     if unused_nodes.size:
@@ -176,16 +176,16 @@ def locate_tags(tags: Mapping[str, ArrayLike], facets: np.ndarray) -> dict[str, 
 def _match_facets(name: str, nodes: np.ndarray, facets: np.ndarray) -> np.ndarray:
     num_nodes = int(max(facets.max(), nodes.max())) + 1
     keys = topology.facet_keys(facets, num_nodes)
-    order = np.argsort(keys)
+    sort_order = np.argsort(keys)
     tag_keys = topology.facet_keys(nodes, num_nodes)
-    facet_positions = np.minimum(np.searchsorted(keys[order], tag_keys), len(keys) - 1)
-    missing_facets = np.flatnonzero((keys[order][facet_positions] != tag_keys) | (nodes.min(axis=1) < 0))
+    facet_positions = np.minimum(np.searchsorted(keys[sort_order], tag_keys), len(keys) - 1)
+    missing_facets = np.flatnonzero((keys[sort_order][facet_positions] != tag_keys) | (nodes.min(axis=1) < 0))
     if missing_facets.size:
         raise ValueError(
             f"tags: {name!r} names the facet with nodes {nodes[missing_facets[0]].tolist()}, which is not on the "
             "boundary of the mesh. Tags group boundary facets only."
         )
-    return order[facet_positions]
+    return sort_order[facet_positions]
 
 
 MAX_PLAUSIBLE_SIZE = 10.0

@@ -126,8 +126,8 @@ class Mesh(Module):
             from jeit.mesh import _surface
 
             indices = _surface.orient_surface(indices, coordinates)
-        first, second, single_facets = topology.pair_facets(indices)
-        checks.check_connected(first // (dimension + 1), second // (dimension + 1), len(indices))
+        first_facets, second_facets, single_facets = topology.pair_facets(indices)
+        checks.check_connected(first_facets // (dimension + 1), second_facets // (dimension + 1), len(indices))
         facets = topology.cell_facets(indices)[single_facets]
         if dimension == 2:
             facets = topology.order_loops(facets, coordinates) if len(facets) else facets
@@ -317,8 +317,8 @@ def interior_facets(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     if not has_values(mesh.cells):
         raise ValueError("interior_facets needs a mesh with values; call it outside jit and vmap.")
     cells = np.asarray(mesh.cells)
-    first, second, _ = topology.pair_facets(cells)
-    return np.stack([first, second], axis=1) // cells.shape[1], topology.cell_facets(cells)[first]
+    first_facets, second_facets, _ = topology.pair_facets(cells)
+    return np.stack([first_facets, second_facets], axis=1) // cells.shape[1], topology.cell_facets(cells)[first_facets]
 
 
 def _length(vectors):

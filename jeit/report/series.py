@@ -89,11 +89,11 @@ def write_film(
     frame_rate = min(_DEFAULT_RATE if rate is None else rate * len(selected) / len(values), _MAX_RATE)
     writer = (PillowWriter if path.suffix.lower() == ".gif" else FFMpegWriter)(fps=max(frame_rate, 0.1))  # pyright: ignore
     with writer.saving(figure, str(path), 80):
-        for index, frame in enumerate(selected):
+        for frame_index, frame in enumerate(selected):
             picture.show(values[frame], frame_titles[frame])
             writer.grab_frame()
             if progress is not None:
-                progress(f"{index + 1} of {len(selected)}")
+                progress(f"{frame_index + 1} of {len(selected)}")
 
 
 SERIES_FILES = ("series.png", "series.npz", "regions.csv", "report.json")

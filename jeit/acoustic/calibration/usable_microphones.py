@@ -257,5 +257,5 @@ def _assign_folds(tap_positions: Float[np.ndarray, "T d"]) -> Int[np.ndarray, " 
     in a fixed random order."""
     resolution = 1e-4 * max(float(np.ptp(tap_positions, axis=0).max()), 1e-300)
     _, position_indices = np.unique(np.round(tap_positions / resolution), axis=0, return_inverse=True)
-    order = np.random.default_rng(0).permutation(position_indices.max() + 1)
-    return (order % _NUM_FOLDS)[position_indices.ravel()]
+    random_order = np.random.default_rng(0).permutation(position_indices.max() + 1)
+    return (random_order % _NUM_FOLDS)[position_indices.ravel()]

@@ -146,18 +146,20 @@ def plot_error_curve(
     check_name("statistic", statistic, _STATISTICS)
     error_rows = {name: _errors_in_millimetres(array, f"errors['{name}']", x.size) for name, array in errors.items()}
     bound_values = None if bound is None else _STATISTICS[statistic](_errors_in_millimetres(bound, "bound", x.size))
-    order = np.argsort(x)
+    sort_order = np.argsort(x)
     ax = axes_or_new(ax, (5.8, 4.2))
     ax.set_yscale("log")
     for (name, rows), colour, marker in zip(error_rows.items(), SERIES_COLOURS, SERIES_MARKERS, strict=False):
         line_style = {"color": colour, "marker": marker, "markersize": 5, "linewidth": 1.8, "zorder": 3}
-        ax.plot(x[order], _STATISTICS[statistic](rows)[order], label=name, **line_style)
+        ax.plot(x[sort_order], _STATISTICS[statistic](rows)[sort_order], label=name, **line_style)
         if rows.shape[1] > 1:
             low, high = np.nanquantile(rows, [0.25, 0.75], axis=1)
-            ax.fill_between(x[order], low[order], high[order], color=colour, alpha=0.18, linewidth=0, zorder=2)
+            ax.fill_between(
+                x[sort_order], low[sort_order], high[sort_order], color=colour, alpha=0.18, linewidth=0, zorder=2
+            )
     if bound_values is not None:
         style = {"color": DARK_GREY, "linewidth": 1.4, "linestyle": (0, (4, 3)), "zorder": 4}
-        ax.plot(x[order], bound_values[order], label="Cramér-Rao bound", **style)
+        ax.plot(x[sort_order], bound_values[sort_order], label="Cramér-Rao bound", **style)
     ax.set_xlabel(quantity, color=DARK_GREY)
     ax.set_ylabel({"rms": "RMS error (mm)"}.get(statistic, f"{statistic.capitalize()} error (mm)"), color=DARK_GREY)
     ax.set_title(title or "")

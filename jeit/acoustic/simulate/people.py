@@ -311,13 +311,15 @@ def simulate_sound_clips(
     """
     check_skin_and_key(skin, key)
     check_kind("people", people, (list, tuple), "a list of them, such as [SoundingPerson.draw(key)]")
-    for index, person in enumerate(people):
-        check_kind(f"people[{index}]", person, SoundingPerson, "a SoundingPerson, such as SoundingPerson.draw(key)")
+    for person_index, person in enumerate(people):
+        check_kind(
+            f"people[{person_index}]", person, SoundingPerson, "a SoundingPerson, such as SoundingPerson.draw(key)"
+        )
     if not people:
         raise ValueError("people: give one at least, such as [SoundingPerson.draw(key)].")
     check_kind("modalities", modalities, (list, tuple), "a list of names, such as ['pat', 'none']")
-    for index, modality in enumerate(modalities):
-        check_name(f"modalities[{index}]", modality, MODALITIES)
+    for person_index, modality in enumerate(modalities):
+        check_name(f"modalities[{person_index}]", modality, MODALITIES)
     if not (isinstance(each, int) and each >= 1):
         raise ValueError(f"each must be a number of clips, 1 or more; it is {describe(each)}.")
     check_positive("duration", duration)

@@ -67,8 +67,8 @@ def transfer(skin: SoundingSkin, frequencies: Float[Array, " F"], position: Floa
         return received_amplitude
     # Microphone i is connected to slot i mod 4 of multiplexer i div 4. The slot read 25 µs earlier may have no
     # microphone.
-    index = np.arange(skin.num_microphones)
-    previous_index = index - index % NUM_SLOTS + (index - 1) % NUM_SLOTS
+    microphone_index = np.arange(skin.num_microphones)
+    previous_index = microphone_index - microphone_index % NUM_SLOTS + (microphone_index - 1) % NUM_SLOTS
     has_previous = previous_index < skin.num_microphones
     crosstalk = jnp.where(has_previous[:, None], received_amplitude[np.where(has_previous, previous_index, 0)], 0)
     received_amplitude += skin.readout.coupling * crosstalk * jnp.exp(-2j * jnp.pi * frequencies * SLOT_TIME)

@@ -270,12 +270,12 @@ def _moving_source_samples(skin, key, positions, envelope, num_samples, block_le
     frequencies = bin_frequencies(skin, block_length, num_bins)
 
     def add_block(output, item):
-        index, position = item
-        block_sound = jax.lax.dynamic_slice(sound, (index * hop,), (2 * hop,)) * window
+        block_index, position = item
+        block_sound = jax.lax.dynamic_slice(sound, (block_index * hop,), (2 * hop,)) * window
         spectrum = jnp.fft.rfft(block_sound, block_length)[:num_bins] * transfer(skin, frequencies, position)
-        output_block = jax.lax.dynamic_slice(output, (0, index * hop), (output.shape[0], block_length))
+        output_block = jax.lax.dynamic_slice(output, (0, block_index * hop), (output.shape[0], block_length))
         return jax.lax.dynamic_update_slice(
-            output, output_block + jnp.fft.irfft(spectrum, block_length), (0, index * hop)
+            output, output_block + jnp.fft.irfft(spectrum, block_length), (0, block_index * hop)
         ), None
 
     output = jnp.zeros((skin.num_microphones, positions.shape[0] * hop + block_length))

@@ -182,8 +182,8 @@ def simulate_tickle(
     distance, angle = np.asarray(jax.random.uniform(position_key, (2, num_taps)))
     # The square root of a uniform number makes the positions uniform over the disc.
     offsets = (radius * np.sqrt(distance) * [np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)]).T
-    for index in range(1, num_taps):
-        offsets[index] = (offsets[index - 1] + offsets[index]) / 2
+    for tap_index in range(1, num_taps):
+        offsets[tap_index] = (offsets[tap_index - 1] + offsets[tap_index]) / 2
     half_size = np.array([skin.layer.width, skin.layer.height]) / 2
     tap_positions = np.clip(centre + offsets, -half_size, half_size)
     # The source moves to the position of a tap at the onset of that tap.

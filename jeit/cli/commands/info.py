@@ -30,28 +30,28 @@ def info(
     from jeit.report import report_measurement
 
     measurement = read_file("DATA", data, format, description, key=key)
-    content = report_measurement(measurement)
-    body, noise = content["body"], content["noise"]
-    names = f" ({', '.join(content['frame_names'])})" if content["frame_names"] else ""
-    rate = f", {content['frame_rate']:.4g} a second" if content["frame_rate"] else ""
+    report = report_measurement(measurement)
+    body, noise = report["body"], report["noise"]
+    names = f" ({', '.join(report['frame_names'])})" if report["frame_names"] else ""
+    rate = f", {report['frame_rate']:.4g} a second" if report["frame_rate"] else ""
     noise_text = noise and f"{format_with_unit(noise['standard_deviation'], 'V')}, from {noise['method']}"
     rows = [
-        ("frames", f"{content['frames']}{names}{rate}"),
-        ("protocol", content["protocol"]),
-        ("channels", f"{content['channels']}, of {counted(content['drives'], 'drive')}"),
-        ("masked", f"{content['masked']} of {content['voltages']} voltages"),
-        ("largest current", format_with_unit(content["largest_current"], "A")),
-        ("largest voltage", format_with_unit(content["largest_voltage"], "V")),
+        ("frames", f"{report['frames']}{names}{rate}"),
+        ("protocol", report["protocol"]),
+        ("channels", f"{report['channels']}, of {counted(report['drives'], 'drive')}"),
+        ("masked", f"{report['masked']} of {report['voltages']} voltages"),
+        ("largest current", format_with_unit(report["largest_current"], "A")),
+        ("largest voltage", format_with_unit(report["largest_voltage"], "V")),
         ("body", _body_text(body)),
-        ("electrodes", f"{content['electrodes']['number']}, {content['electrodes']['kind']}"),
-        ("reciprocity error", percent(content["reciprocity_error"])),
+        ("electrodes", f"{report['electrodes']['number']}, {report['electrodes']['kind']}"),
+        ("reciprocity error", percent(report["reciprocity_error"])),
         ("noise", noise_text or "not known"),
-        ("impossible signs", percent(content["impossible_signs"])),
+        ("impossible signs", percent(report["impossible_signs"])),
     ]
-    if (content["impossible_signs"] or 0) > MOST_IMPOSSIBLE_SIGNS:
+    if (report["impossible_signs"] or 0) > MOST_IMPOSSIBLE_SIGNS:
         rows.append(("doubt", "so many impossible signs are those of noise: frames with them are not imaged"))
-    rows.append(("wiring", content["wiring"] or "not known: the file does not say where electrodes are"))
-    rows += [("note", note) for note in content["notes"]]
+    rows.append(("wiring", report["wiring"] or "not known: the file does not say where electrodes are"))
+    rows += [("note", note) for note in report["notes"]]
     plain_console().print(name_value_table(measurement.name, rows))
 
 

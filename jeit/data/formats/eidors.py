@@ -144,11 +144,13 @@ def _stored_protocol(variables: dict, path: Path) -> Protocol:
             "description gives a [protocol]. Save stim (L, S), meas (M, L) and meas_stim (M) with the data, "
             "or write a description."
         )
-    stim, meas, index = (matlab.numbers(variables, key, path) for key in PATTERN)
-    index = index.ravel()
-    if np.any(index != np.round(index)):
+    stim, meas, stimulation_index = (matlab.numbers(variables, key, path) for key in PATTERN)
+    stimulation_index = stimulation_index.ravel()
+    if np.any(stimulation_index != np.round(stimulation_index)):
         raise ValueError(f"{path.name}: meas_stim must hold whole numbers, the drive of each measurement, from 1.")
     try:
-        return from_channels(stim.T, meas, index.astype(int) - 1, name=f"{path.stem}, {len(index)} channels")
+        return from_channels(
+            stim.T, meas, stimulation_index.astype(int) - 1, name=f"{path.stem}, {len(stimulation_index)} channels"
+        )
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from None

@@ -163,7 +163,7 @@ def report_improved_layout(result: ImprovedLayout) -> dict[str, Any]:
     """Result of the layout optimisation, scores of the given ("start") and the optimised layout ("optimised") on the
     finer mesh, and the options, as plain numbers and strings. Values that are not finite are None."""
     optimisation, skin, space = result.optimisation, result.skin, result.space
-    content = {
+    report = {
         "layout": result.start.name,
         "status": optimisation.status,
         "reason": optimisation.reason,
@@ -183,7 +183,7 @@ def report_improved_layout(result: ImprovedLayout) -> dict[str, Any]:
             "num_points": result.num_points,
         },
     }
-    return to_plain_values(content)
+    return to_plain_values(report)
 
 
 def _score_figures(scores: Scores) -> dict[str, Any]:

@@ -177,10 +177,10 @@ def _find_node_damage(node: Any, array_shape: ArrayShape) -> str | None:
 def _read_json_object(file: Path) -> dict[str, Any] | None:
     """Read the JSON object in a file; None without a JSON object. Raises `OSError` if the file cannot be read."""
     try:
-        content = json.loads(file.read_bytes())
+        json_value = json.loads(file.read_bytes())
     except (ValueError, RecursionError):
         return None
-    return content if isinstance(content, dict) else None
+    return json_value if isinstance(json_value, dict) else None
 
 
 def _as_list(values: Any) -> list[Any]:

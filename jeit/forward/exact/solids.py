@@ -149,7 +149,7 @@ class _Bessel:
     the growth I_n'/I_n and of the decay −K_n'/K_n."""
 
     def __init__(self, count: int, x: np.ndarray):
-        order = np.arange(count)[:, None]
+        bessel_orders = np.arange(count)[:, None]
         first_kind_ratios, second_kind_ratios = np.empty((count, len(x))), np.empty((count, len(x)))
         ratio = x / (2.0 * (count + 60))
         for n in range(count + 59, -1, -1):  # I_{n+1} / I_n
@@ -162,7 +162,7 @@ class _Bessel:
         zero = np.zeros((1, len(x)))
         self.log_i = np.log(ive(0, x)) + x + np.concatenate([zero, np.cumsum(np.log(first_kind_ratios[:-1]), axis=0)])
         self.log_k = np.log(kve(0, x)) - x + np.concatenate([zero, np.cumsum(np.log(second_kind_ratios[:-1]), axis=0)])
-        self.growth, self.decay = first_kind_ratios + order / x, second_kind_ratios - order / x
+        self.growth, self.decay = first_kind_ratios + bessel_orders / x, second_kind_ratios - bessel_orders / x
 
 
 @dataclass(frozen=True)

@@ -193,19 +193,22 @@ def _hexagonal_lattice(lower_corner, upper_corner, centre, spacing: float) -> np
     """Points (k, 2) of a hexagonal grid with a point at `centre` that covers the box from `lower_corner` to
     `upper_corner`."""
     steps = spacing * np.array([1, np.sqrt(0.75)])
-    (first, bottom), (last, top) = (
+    (first_column, bottom), (last_column, top) = (
         np.floor((lower_corner - centre) / steps) - 1,
         np.ceil((upper_corner - centre) / steps) + 1,
     )
-    row, column = np.meshgrid(np.arange(bottom, top + 1), np.arange(first, last + 1), indexing="ij")
+    row, column = np.meshgrid(np.arange(bottom, top + 1), np.arange(first_column, last_column + 1), indexing="ij")
     return centre + steps * np.stack([column + row % 2 / 2, row], axis=-1).reshape(-1, 2)
 
 
 def _cubic_lattice(lower_corner, upper_corner, centre, spacing: float) -> np.ndarray:
     """Points (k, 3) of a cubic grid with a point at `centre` that covers the box from `lower_corner` to
     `upper_corner`."""
-    first, last = np.floor((lower_corner - centre) / spacing) - 1, np.ceil((upper_corner - centre) / spacing) + 1
-    steps = [np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]
+    first_indices, last_indices = (
+        np.floor((lower_corner - centre) / spacing) - 1,
+        np.ceil((upper_corner - centre) / spacing) + 1,
+    )
+    steps = [np.arange(a, b + 1) for a, b in zip(first_indices, last_indices, strict=True)]
     return centre + spacing * np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
 
 

@@ -103,9 +103,15 @@ class FrameCheck:
         is_pair = usable[self.first] & usable[self.second]
         if np.count_nonzero(is_pair) < _MIN_PAIRS:
             return usable, None, ""
-        first, second = self.pair_weights * change[self.first], self.pair_weights * change[self.second] / self.ratio
+        first_changes, second_changes = (
+            self.pair_weights * change[self.first],
+            self.pair_weights * change[self.second] / self.ratio,
+        )
         # As in `jeit.data.quality.signal_evidence`: differences of reciprocal channels contain noise, sums also signal.
-        noise, power = np.where(is_pair, (first - second) ** 2, 0), np.sum((first + second)[is_pair] ** 2)
+        noise, power = (
+            np.where(is_pair, (first_changes - second_changes) ** 2, 0),
+            np.sum((first_changes + second_changes)[is_pair] ** 2),
+        )
         noise_power, num_pairs = noise.sum(), np.count_nonzero(is_pair)
         has_signal = (power - noise_power) * np.sqrt(num_pairs) > 2 * _MIN_EVIDENCE * noise_power
         level = 2 * np.sum((self.pair_weights * self.expected_voltages[self.first])[is_pair] ** 2)

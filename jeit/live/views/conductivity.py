@@ -143,22 +143,22 @@ class _CurveDrawing:
     def __init__(self):
         self.curves: list[np.ndarray] = []
 
-    def lines(self, pieces: list[np.ndarray], middle: np.ndarray) -> None:
+    def lines(self, segments: list[np.ndarray], centre: np.ndarray) -> None:
         self.curves.append(
-            np.concatenate([np.asarray(piece)[:, :2] for piece in pieces]) if pieces else middle[None, :2]
+            np.concatenate([np.asarray(segment)[:, :2] for segment in segments]) if segments else centre[None, :2]
         )
 
-    def disc(self, middle: np.ndarray, radius: float) -> None:
+    def disc(self, centre: np.ndarray, radius: float) -> None:
         angle = np.linspace(0, 2 * np.pi, _NUM_VERTICES + 1)
         circle = np.column_stack([np.cos(angle), np.sin(angle)])
-        self.curves.append(np.asarray(middle)[:2] + float(radius) * circle)
+        self.curves.append(np.asarray(centre)[:2] + float(radius) * circle)
 
-    def rectangle(self, middle: np.ndarray, width: float, height: float) -> None:
+    def rectangle(self, centre: np.ndarray, width: float, height: float) -> None:
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) / 2
-        self.curves.append(np.asarray(middle)[:2] + corners * [width, height])
+        self.curves.append(np.asarray(centre)[:2] + corners * [width, height])
 
-    def dot(self, middle: np.ndarray) -> None:
-        self.curves.append(np.asarray(middle)[None, :2])
+    def dot(self, centre: np.ndarray) -> None:
+        self.curves.append(np.asarray(centre)[None, :2])
 
 
 class ConductivityView(AbstractView):

@@ -31,7 +31,7 @@ class Front:
     """
 
     curves: list[Curve]
-    stops: list[np.ndarray]
+    node_arc_lengths: list[np.ndarray]
     guards: list[np.ndarray]
     fixed_nodes: np.ndarray
     free_nodes: np.ndarray
@@ -39,7 +39,7 @@ class Front:
     @property
     def num_outline(self) -> int:
         """Number of nodes on the outline."""
-        return sum(len(stops) for stops in self.stops)
+        return sum(len(arc_lengths) for arc_lengths in self.node_arc_lengths)
 
     @property
     def num_immovable_nodes(self) -> int:
@@ -49,16 +49,18 @@ class Front:
     def points(self) -> np.ndarray:
         """All nodes (n, 2): the nodes of the first curve, of the second curve and so on, then fixed nodes, then free
         nodes."""
-        on_curves = [curve.points_at(stops) for curve, stops in zip(self.curves, self.stops, strict=True)]
+        on_curves = [
+            curve.points_at(arc_lengths) for curve, arc_lengths in zip(self.curves, self.node_arc_lengths, strict=True)
+        ]
         return np.concatenate([*on_curves, self.fixed_nodes, self.free_nodes])
 
     def segments(self) -> np.ndarray:
         """Outline segments as pairs of nodes (s, 2), in the order of their first nodes."""
         segments, offset = [], 0
-        for stops in self.stops:
-            index = np.arange(offset, offset + len(stops))
-            segments.append(np.stack([index, np.roll(index, -1)], axis=1))
-            offset += len(stops)
+        for arc_lengths in self.node_arc_lengths:
+            node_indices = np.arange(offset, offset + len(arc_lengths))
+            segments.append(np.stack([node_indices, np.roll(node_indices, -1)], axis=1))
+            offset += len(arc_lengths)
         return np.concatenate(segments)
 
     def is_sharp_corner(self) -> np.ndarray:
@@ -66,19 +68,21 @@ class Front:
         return np.concatenate(
             [
                 np.isin(arc_lengths, guarded_lengths)
-                for arc_lengths, guarded_lengths in zip(self.stops, self.guards, strict=True)
+                for arc_lengths, guarded_lengths in zip(self.node_arc_lengths, self.guards, strict=True)
             ]
         )
 
     def divide(self, segments: np.ndarray) -> None:
         """Insert a node in the middle of each of the outline segments with the indices `segments`."""
         offset = 0
-        for k, stops in enumerate(self.stops):
-            own_segments = segments[(segments >= offset) & (segments < offset + len(stops))] - offset
+        for k, arc_lengths in enumerate(self.node_arc_lengths):
+            own_segments = segments[(segments >= offset) & (segments < offset + len(arc_lengths))] - offset
             length = self.curves[k].length
-            next_stops = np.append(stops[1:], stops[0] + length)
-            self.stops[k] = np.sort(np.concatenate([stops, (0.5 * (stops + next_stops))[own_segments] % length]))
-            offset += len(stops)
+            next_stops = np.append(arc_lengths[1:], arc_lengths[0] + length)
+            self.node_arc_lengths[k] = np.sort(
+                np.concatenate([arc_lengths, (0.5 * (arc_lengths + next_stops))[own_segments] % length])
+            )
+            offset += len(arc_lengths)
 
 
 def triangulate(front: Front, points: np.ndarray) -> np.ndarray:
@@ -136,15 +140,17 @@ def smallest_angles(corners: np.ndarray) -> np.ndarray:
 def select_spaced_points(points: np.ndarray, radius: np.ndarray, priority: np.ndarray) -> np.ndarray:
     """Select points greedily in order of decreasing `priority`, skipping points within `radius` of a selected point.
     Returns the indices of the selected points."""
-    order = np.argsort(-priority, kind="stable")
-    neighbours = KDTree(points[order]).query_ball_point(points[order], radius[order], return_sorted=False)
+    priority_order = np.argsort(-priority, kind="stable")
+    neighbours = KDTree(points[priority_order]).query_ball_point(
+        points[priority_order], radius[priority_order], return_sorted=False
+    )
     is_selected = np.zeros(len(points), bool)
     is_blocked = np.zeros(len(points), bool)
     for rank, neighbour_indices in enumerate(neighbours):
         if not is_blocked[rank]:
             is_selected[rank] = True
             is_blocked[neighbour_indices] = True
-    return order[is_selected]
+    return priority_order[is_selected]
 
 
 def is_clear_of_outline(front: Front, nodes: np.ndarray, points: np.ndarray, gap: np.ndarray) -> np.ndarray:
@@ -209,11 +215,11 @@ def improve_worst_cells(front: Front, passes: int = 4) -> None:
         movable = movable[movable >= num_immovable_nodes]
         if not movable.size:
             return
-        order = np.argsort(cells.ravel(), kind="stable")
-        bounds = np.searchsorted(cells.ravel()[order], np.arange(len(points) + 1))
+        sort_order = np.argsort(cells.ravel(), kind="stable")
+        bounds = np.searchsorted(cells.ravel()[sort_order], np.arange(len(points) + 1))
         has_moved = False
         for node in movable.tolist():
-            star_corners = order[bounds[node] : bounds[node + 1]]
+            star_corners = sort_order[bounds[node] : bounds[node + 1]]
             corner = star_corners % 3
             star_cells = cells[star_corners // 3]
             second_corners = points[star_cells[np.arange(len(star_corners)), (corner + 1) % 3]]
@@ -298,8 +304,8 @@ def _insert_circumcentres(front: Front, points: np.ndarray, bad_cells: np.ndarra
     neighbours = KDTree(centre).query_ball_point(centres, radii * (1 - 1e-9))
     is_encroached = np.array([len(indices) > 0 for indices in neighbours])
     is_affected = np.zeros(len(centre), bool)
-    for index in np.flatnonzero(is_encroached):
-        is_affected[neighbours[index]] = True
+    for cell_index in np.flatnonzero(is_encroached):
+        is_affected[neighbours[cell_index]] = True
     is_outside = ~is_inside_curves(front.curves, centre)
     lost_centres = np.flatnonzero(is_outside & ~is_affected)
     if lost_centres.size:
@@ -431,9 +437,9 @@ def order_nodes(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.n
     points, cells = points[used_nodes], new_index[cells]
     edges = np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]])
     graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(points),) * 2)
-    order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
-    order = np.concatenate([[0], order[order != 0]])
+    node_order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
+    node_order = np.concatenate([[0], node_order[node_order != 0]])
     rank = np.empty(len(points), dtype=np.int64)
-    rank[order] = np.arange(len(points))
+    rank[node_order] = np.arange(len(points))
     cells = rank[cells]
-    return points[order], cells[np.argsort(cells.min(axis=1), kind="stable")]
+    return points[node_order], cells[np.argsort(cells.min(axis=1), kind="stable")]

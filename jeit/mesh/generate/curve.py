@@ -34,7 +34,7 @@ class Curve:
 def circle(radius: float, centre: np.ndarray) -> Curve:
     """A circle; arc length runs counter-clockwise from angle 0."""
 
-    def at(arc_length: np.ndarray) -> np.ndarray:
+    def points_at(arc_length: np.ndarray) -> np.ndarray:
         angle = np.asarray(arc_length) / radius
         return centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
@@ -43,7 +43,7 @@ def circle(radius: float, centre: np.ndarray) -> Curve:
 
     return Curve(
         length=2 * np.pi * radius,
-        points_at=at,
+        points_at=points_at,
         contains=lambda points: from_centre(points) < radius,
         distance=lambda points: np.abs(radius - from_centre(points)),
         corners=np.zeros(0),
@@ -51,14 +51,15 @@ def circle(radius: float, centre: np.ndarray) -> Curve:
     )
 
 
-def create_smooth_curve(length: float, at: Callable[[np.ndarray], np.ndarray], num_chords: int = 720) -> Curve:
-    """A closed curve without corners. `at` returns points (p, 2) at arc lengths (p,); the domain lies to the left.
+def create_smooth_curve(length: float, points_at: Callable[[np.ndarray], np.ndarray], num_chords: int = 720) -> Curve:
+    """A closed curve without corners. `points_at` returns points (p, 2) at arc lengths (p,); the domain lies to the
+    left.
 
     The functions `inside` and `distance` of the curve use a polygon of `num_chords` chords.
     """
-    chords = at(length * np.arange(num_chords) / num_chords)
+    chords = points_at(length * np.arange(num_chords) / num_chords)
     inscribed = closed_line(chords)
-    return Curve(length, at, inscribed.contains, inscribed.distance, np.zeros(0), np.zeros(0))
+    return Curve(length, points_at, inscribed.contains, inscribed.distance, np.zeros(0), np.zeros(0))
 
 
 def closed_line(vertices: np.ndarray) -> Curve:
@@ -66,7 +67,7 @@ def closed_line(vertices: np.ndarray) -> Curve:
     closed_vertices = np.concatenate([vertices, vertices[:1]])
     arc_lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed_vertices, axis=0), axis=1))])
 
-    def at(arc_length: np.ndarray) -> np.ndarray:
+    def points_at(arc_length: np.ndarray) -> np.ndarray:
         return np.stack([np.interp(arc_length, arc_lengths, closed_vertices[:, axis]) for axis in range(2)], axis=-1)
 
     def distance(points: np.ndarray) -> np.ndarray:
@@ -83,7 +84,7 @@ def closed_line(vertices: np.ndarray) -> Curve:
     )
     return Curve(
         length=float(arc_lengths[-1]),
-        points_at=at,
+        points_at=points_at,
         contains=lambda points: topology.is_inside_loops(points, [vertices]),
         distance=distance,
         corners=arc_lengths[:-1],

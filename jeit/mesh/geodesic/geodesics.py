@@ -81,10 +81,10 @@ class Geodesics(Module):
         node, start, end = (np.roll(cells, -shift, axis=1).ravel() for shift in range(3))
         corner_coordinates = _triangle_coordinates(points[start], points[end], points[node])
         end_nodes = np.concatenate([start, end])
-        order = np.argsort(end_nodes, kind="stable")
-        first = np.concatenate([[0], np.cumsum(np.bincount(end_nodes, minlength=len(points)))])
+        sort_order = np.argsort(end_nodes, kind="stable")
+        first_indices = np.concatenate([[0], np.cumsum(np.bincount(end_nodes, minlength=len(points)))])
         corners = _Corners(node, start, end, *corner_coordinates)
-        return cls(triangles, corners, _gaussian_curvature(triangles, corners), first, order % len(node))
+        return cls(triangles, corners, _gaussian_curvature(triangles, corners), first_indices, sort_order % len(node))
 
     def distances(
         self,
@@ -150,20 +150,27 @@ class Geodesics(Module):
         source_places = sources if isinstance(sources, SurfacePlaces) else self.surface.nearest(sources)
         nodes = self.surface.cells[source_places.triangle]
         length = np.linalg.norm(self.surface.points[nodes] - source_places.points[:, None], axis=-1)
-        lengths, owner = np.full(len(self.surface.points), np.inf), np.full(len(self.surface.points), -1)
+        lengths, nearest_sources = np.full(len(self.surface.points), np.inf), np.full(len(self.surface.points), -1)
         source_index = np.repeat(np.arange(len(nodes)), 3)
-        changed_nodes = _lower_distances(lengths, owner, nodes.ravel(), length.ravel(), source_index)
+        changed_nodes = _lower_distances(lengths, nearest_sources, nodes.ravel(), length.ravel(), source_index)
         while changed_nodes.size:
             _, corner = self._opposite_corners(changed_nodes, np.zeros_like(changed_nodes))
             start, end, node = self.corners.start[corner], self.corners.end[corner], self.corners.node[corner]
             local_coordinates = (coordinates[corner] for coordinates in self.corners[3:])
             new_lengths, is_by_start = _distances_across(
-                lengths[start], lengths[end], *local_coordinates, same_source=owner[start] == owner[end]
+                lengths[start],
+                lengths[end],
+                *local_coordinates,
+                same_source=nearest_sources[start] == nearest_sources[end],
             )
             changed_nodes = _lower_distances(
-                lengths, owner, node, new_lengths, np.where(is_by_start, owner[start], owner[end])
+                lengths,
+                nearest_sources,
+                node,
+                new_lengths,
+                np.where(is_by_start, nearest_sources[start], nearest_sources[end]),
             )
-        return owner, lengths
+        return nearest_sources, lengths
 
     def _distances_to_nodes(self, sources: SurfacePlaces, max_distance: float):
         """Distances (s, n) from the sources to all nodes, and mean curvatures (s, n) along the paths."""
@@ -356,12 +363,15 @@ def _gaussian_curvature(surface: Triangles, corners: _Corners) -> Float[np.ndarr
     return np.where(areas > 0, angle_defect / np.where(areas > 0, areas, 1.0), 0.0)
 
 
-def _lower_distances(lengths, owner, nodes, new_lengths, owner_index) -> np.ndarray:
+def _lower_distances(lengths, nearest_sources, nodes, new_lengths, owner_index) -> np.ndarray:
     """Lower the distances of `nodes` to the minimum of the new distances `new_lengths`, and store the corresponding
     entry of `owner_index` as their owner. Returns the nodes whose distance has decreased."""
     is_lower = new_lengths < (1 - _MIN_DECREASE) * lengths[nodes]
     nodes, new_lengths, owner_index = nodes[is_lower], new_lengths[is_lower], owner_index[is_lower]
-    order = np.lexsort((new_lengths, nodes))
-    changed_nodes, first_entries = np.unique(nodes[order], return_index=True)
-    lengths[changed_nodes], owner[changed_nodes] = new_lengths[order][first_entries], owner_index[order][first_entries]
+    sort_order = np.lexsort((new_lengths, nodes))
+    changed_nodes, first_entries = np.unique(nodes[sort_order], return_index=True)
+    lengths[changed_nodes], nearest_sources[changed_nodes] = (
+        new_lengths[sort_order][first_entries],
+        owner_index[sort_order][first_entries],
+    )
     return changed_nodes

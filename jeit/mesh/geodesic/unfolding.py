@@ -136,14 +136,14 @@ def _opposite_sides(cells) -> Int[Array, " h"]:
     xp = namespace(cells)
     start, end = cells.reshape(-1), xp.roll(cells, -1, axis=1).reshape(-1)
     lower_nodes, upper_nodes = xp.minimum(start, end), xp.maximum(start, end)
-    order = xp.lexsort((upper_nodes, lower_nodes))
-    is_same_as_next = (xp.diff(lower_nodes[order]) == 0) & (xp.diff(upper_nodes[order]) == 0)
+    sort_order = xp.lexsort((upper_nodes, lower_nodes))
+    is_same_as_next = (xp.diff(lower_nodes[sort_order]) == 0) & (xp.diff(upper_nodes[sort_order]) == 0)
     false_entry = xp.zeros(1, bool)
     step = xp.where(xp.concatenate([is_same_as_next, false_entry]), 1, 0) - xp.where(
         xp.concatenate([false_entry, is_same_as_next]), 1, 0
     )
-    opposite = order[xp.arange(len(order)) + step]
-    return opposite[xp.argsort(order)]
+    opposite = sort_order[xp.arange(len(sort_order)) + step]
+    return opposite[xp.argsort(sort_order)]
 
 
 def _find_connected_triangles(neighbour, is_near: Bool[Array, "L m"], root_triangles):

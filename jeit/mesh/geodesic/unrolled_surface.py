@@ -251,11 +251,11 @@ def _cut_to_disk(surface: Triangles, is_cut_edge) -> tuple[np.ndarray, np.ndarra
         )
     points = surface.points
     if num_loops == 2:
-        ends = np.unique(border[label == 0]), np.unique(border[label == 1])
+        end_nodes = np.unique(border[label == 0]), np.unique(border[label == 1])
     else:
         axis = int(np.argmax(np.ptp(points, axis=0)))
-        ends = np.array([points[:, axis].argmin()]), np.array([points[:, axis].argmax()])
-    path = _path_along_edges(points, edges, ends, is_cut_edge, border)
+        end_nodes = np.array([points[:, axis].argmin()]), np.array([points[:, axis].argmax()])
+    path = _path_along_edges(points, edges, end_nodes, is_cut_edge, border)
     return _split_along_path(cells, path, num_nodes, is_closed=num_loops == 0)
 
 
@@ -269,8 +269,8 @@ def _border_loops(border, num_nodes: int):
     return len(distinct_labels), label
 
 
-def _path_along_edges(points, edges, ends, cut, border) -> list[int]:
-    """Nodes of a path along edges from the first of the two `ends` to the second, near the point `cut` and off the
+def _path_along_edges(points, edges, end_nodes, cut, border) -> list[int]:
+    """Nodes of a path along edges from the first of the two `end_nodes` to the second, near the point `cut` and off the
     border."""
     centre = points.mean(axis=0)
     cut_position = np.asarray(cut, float) if cut is not None else None
@@ -282,7 +282,7 @@ def _path_along_edges(points, edges, ends, cut, border) -> list[int]:
         y_offsets = np.abs(midpoints[:, 1] - centre[1]) / largest_side
         cost = 1 + 20 * (x_offsets + y_offsets)
     else:
-        axis = points[ends[1]].mean(axis=0) - points[ends[0]].mean(axis=0)
+        axis = points[end_nodes[1]].mean(axis=0) - points[end_nodes[0]].mean(axis=0)
         axis = axis / np.linalg.norm(axis)
         offsets = midpoints - cut_position
         cost = 1 + 20 * np.linalg.norm(offsets - (offsets @ axis)[:, None] * axis, axis=1) / largest_side
@@ -290,8 +290,10 @@ def _path_along_edges(points, edges, ends, cut, border) -> list[int]:
     if len(border):
         length = np.where(_is_among(edges, np.sort(border, axis=1)), 1e3 * length, length)
     graph = scipy.sparse.csr_array((length, edges.T), shape=(len(points), len(points)))
-    lengths, predecessors, _ = dijkstra(graph, directed=False, indices=ends[0], return_predecessors=True, min_only=True)
-    path = [int(ends[1][np.argmin(lengths[ends[1]])])]
+    lengths, predecessors, _ = dijkstra(
+        graph, directed=False, indices=end_nodes[0], return_predecessors=True, min_only=True
+    )
+    path = [int(end_nodes[1][np.argmin(lengths[end_nodes[1]])])]
     while predecessors[path[-1]] >= 0:
         path.append(int(predecessors[path[-1]]))
     return path

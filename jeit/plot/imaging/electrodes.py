@@ -171,21 +171,21 @@ class _MatplotlibPen:
         self.number_positions.append(middle[:2])
         self.is_beside.append(is_beside)
 
-    def lines(self, pieces: list[np.ndarray], middle: np.ndarray) -> None:
-        self.boundary_segments += pieces
-        self._add_number(middle, is_beside=True)
+    def lines(self, segments: list[np.ndarray], centre: np.ndarray) -> None:
+        self.boundary_segments += segments
+        self._add_number(centre, is_beside=True)
 
-    def disc(self, middle: np.ndarray, radius: float) -> None:
-        self.shapes.append(Circle((middle[0], middle[1]), radius))
-        self._add_number(middle, is_beside=False)
+    def disc(self, centre: np.ndarray, radius: float) -> None:
+        self.shapes.append(Circle((centre[0], centre[1]), radius))
+        self._add_number(centre, is_beside=False)
 
-    def rectangle(self, middle: np.ndarray, width: float, height: float) -> None:
-        self.shapes.append(Rectangle((middle[0] - width / 2, middle[1] - height / 2), width, height))
-        self._add_number(middle, is_beside=True)
+    def rectangle(self, centre: np.ndarray, width: float, height: float) -> None:
+        self.shapes.append(Rectangle((centre[0] - width / 2, centre[1] - height / 2), width, height))
+        self._add_number(centre, is_beside=True)
 
-    def dot(self, middle: np.ndarray) -> None:
-        self.dots.append(middle[:2])
-        self._add_number(middle, is_beside=True)
+    def dot(self, centre: np.ndarray) -> None:
+        self.dots.append(centre[:2])
+        self._add_number(centre, is_beside=True)
 
 
 # Distance of a number from its electrode, and maximum distance from the edge of an electrode that counts as lying on

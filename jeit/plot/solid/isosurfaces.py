@@ -186,11 +186,11 @@ def level_surfaces(
 def check_levels(levels: Sequence[float]) -> list[float]:
     """Check the levels of isosurfaces, and return them as a list. Raises `ValueError` for a level that is not between 0
     and 1."""
-    shares: Float[np.ndarray, " k"] | Sequence = np.atleast_1d(np.asarray(levels, dtype=object))
-    if len(shares) == 0 or not all(is_number(level) and 0 < level < 1 for level in shares):
-        level_texts = ", ".join(describe(level) for level in shares[:4]) or "none"
+    fractions: Float[np.ndarray, " k"] | Sequence = np.atleast_1d(np.asarray(levels, dtype=object))
+    if len(fractions) == 0 or not all(is_number(level) and 0 < level < 1 for level in fractions):
+        level_texts = ", ".join(describe(level) for level in fractions[:4]) or "none"
         raise ValueError(f"levels must be shares of the strongest change, from 0 to 1; given were {level_texts}.")
-    return [float(level) for level in shares]
+    return [float(level) for level in fractions]
 
 
 def check_drawn(mesh: Mesh, electrodes, scale: ColourScale) -> None:

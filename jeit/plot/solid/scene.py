@@ -173,11 +173,15 @@ class Scene:
         edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)[rim]
         self.add_lines(edges, DARK_GREY, 0.5, depth_offset=depth_offset + abs(depth_offset) * 0.05)
 
-    def add_lines(self, ends: Float[np.ndarray, "s 2 3"], colour, width: float, *, depth_offset: float = 0.0) -> None:
-        """Add lines between pairs of `ends`, `width` in points; `depth_offset` as in `add_triangles`."""
-        edge = np.broadcast_to(to_rgba(colour), (len(ends), 4))
-        nearness = self.camera.nearness(ends.mean(axis=1)) + depth_offset
-        self._add(ends[:, [0, 1, 1, 0]], nearness, np.zeros((len(ends), 4)), edge, np.full(len(ends), width))
+    def add_lines(
+        self, end_points: Float[np.ndarray, "s 2 3"], colour, width: float, *, depth_offset: float = 0.0
+    ) -> None:
+        """Add lines between pairs of `end_points`, `width` in points; `depth_offset` as in `add_triangles`."""
+        edge = np.broadcast_to(to_rgba(colour), (len(end_points), 4))
+        nearness = self.camera.nearness(end_points.mean(axis=1)) + depth_offset
+        self._add(
+            end_points[:, [0, 1, 1, 0]], nearness, np.zeros((len(end_points), 4)), edge, np.full(len(end_points), width)
+        )
 
     def _add(self, corners, nearness, face, edge, width) -> None:
         self._corners.append(self.camera.on_page(corners))
@@ -190,9 +194,9 @@ class Scene:
         """Draw all pieces of the scene, from the farthest to the nearest."""
         if not self._corners:
             return
-        order = np.argsort(np.concatenate(self._nearness), kind="stable")
+        drawing_order = np.argsort(np.concatenate(self._nearness), kind="stable")
         corners, face, edge, width = (
-            np.concatenate(arrays)[order] for arrays in (self._corners, self._face, self._edge, self._width)
+            np.concatenate(arrays)[drawing_order] for arrays in (self._corners, self._face, self._edge, self._width)
         )
         ax.add_collection(
             PolyCollection(

@@ -88,8 +88,8 @@ class LoadCalibration(Module):
                 f"contacts and loads: give {_MIN_NUM_CONTACTS} or more, one load for each; there are {len(contacts)} "
                 f"contacts, and loads of shape {loads.shape}."
             )
-        for index, contact in enumerate(contacts):
-            check_kind(f"contacts[{index}]", contact, Contact, "a Contact, as of find_contacts")
+        for contact_index, contact in enumerate(contacts):
+            check_kind(f"contacts[{contact_index}]", contact, Contact, "a Contact, as of find_contacts")
         if not (np.isfinite(loads).all() and (loads > 0).all() and np.ptp(loads) > 0):
             raise ValueError("loads must be positive, in newtons, and not all the same.")
         peaks = np.array([contact.peak for contact in contacts])

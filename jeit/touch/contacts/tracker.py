@@ -177,8 +177,8 @@ class ContactTracker(Module):
         ]
         new_contacts = [contacts[column] for column in range(len(contacts)) if column not in assigned_contacts.values()]
         new_touches = [
-            _TrackedTouch(self.number + index, time, contact.centroid, np.zeros(2), ((time, contact),))
-            for index, contact in enumerate(new_contacts)
+            _TrackedTouch(self.number + contact_index, time, contact.centroid, np.zeros(2), ((time, contact),))
+            for contact_index, contact in enumerate(new_contacts)
         ]
         closed = self.closed + self._finished_paths(ended_touches)
         values = (time, (*updated_touches, *new_touches), closed, self.number + len(new_contacts))

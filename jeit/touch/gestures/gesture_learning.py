@@ -129,9 +129,9 @@ def _times_and_changes(
     images: TouchImages, recordings: GestureSet, indices: Sequence[int]
 ) -> Iterator[tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T m"]]]:
     """Yield the times (T,) and images of change (T, m) of each recording in `indices`, imaged as one stream."""
-    frames = (frame for index in indices for frame in recordings.recording(index)[1])
+    frames = (frame for recording_index in indices for frame in recordings.recording(recording_index)[1])
     stream = images.stream(frames)
-    for index in indices:
-        seconds, _ = recordings.recording(index)
+    for recording_index in indices:
+        seconds, _ = recordings.recording(recording_index)
         changes = [change for _, change in islice(stream, len(seconds))]
         yield seconds, np.array(changes).reshape(len(seconds), images.mesh.num_cells)

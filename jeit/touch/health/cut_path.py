@@ -282,9 +282,9 @@ class LossFit:
         steps = np.full(len(unknowns) - 1, _DERIVATIVE_STEP)
         steps[: 2 if len(unknowns) == 5 else -1] *= self.skin_size
         change_derivatives = []
-        for index, step in enumerate(steps):
+        for unknown_index, step in enumerate(steps):
             moved_unknowns = unknowns.copy()
-            moved_unknowns[index] += step
+            moved_unknowns[unknown_index] += step
             change_derivatives.append((self._conductivity_change(moved_unknowns) - change) / step)
         impedance, impedance_derivatives = self.region.derivatives(change, change_derivatives)
         columns = np.column_stack(

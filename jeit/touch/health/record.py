@@ -67,8 +67,8 @@ class HealthRecord:
     def add_events(self, change: LastingChange, findings: list[Finding], status: EventStatus) -> HealthRecord:
         """Add an event for each finding, and their change to the reference voltages."""
         events = [
-            self.create_event(change, finding, status, len(self.events) + index)
-            for index, finding in enumerate(findings)
+            self.create_event(change, finding, status, len(self.events) + finding_index)
+            for finding_index, finding in enumerate(findings)
         ]
         # If electrodes fail, the reference changes only in their channels, since the skin may be touched meanwhile.
         is_affected = np.logical_or.reduce(

@@ -117,9 +117,9 @@ class SelfOrganisingMap:
         squared_distances = self._squared_distances(frames)
         candidates = np.argpartition(squared_distances, count - 1, axis=1)[:, :count]
         candidate_distances = np.take_along_axis(squared_distances, candidates, axis=1)
-        order = np.argsort(candidate_distances, axis=1)
-        return np.take_along_axis(candidates, order, axis=1), np.sqrt(
-            np.take_along_axis(candidate_distances, order, axis=1)
+        sort_order = np.argsort(candidate_distances, axis=1)
+        return np.take_along_axis(candidates, sort_order, axis=1), np.sqrt(
+            np.take_along_axis(candidate_distances, sort_order, axis=1)
         )
 
     def checked(self, frames: ArrayLike) -> Float[np.ndarray, "n M"]:

@@ -45,9 +45,9 @@ def neuron_shares(placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> 
     channels that is not that of the map, and NaN.
     """
     touch_sum = _TouchSuperposition.from_frame(placed, frame, reference)
-    shares = np.zeros(placed.learnt.shape)
-    shares[placed.placed] = touch_sum.fit_shares(np.ones(len(touch_sum.places), bool))[0]
-    return shares
+    neuron_weights = np.zeros(placed.learnt.shape)
+    neuron_weights[placed.placed] = touch_sum.fit_weights(np.ones(len(touch_sum.places), bool))[0]
+    return neuron_weights
 
 
 def touches_reported(
@@ -90,17 +90,19 @@ def touches_reported(
     touch_sum = _TouchSuperposition.from_frame(placed, frame, reference)
     if apart is None:
         apart = _RELATIVE_SEPARATION * float(np.ptp(touch_sum.places, axis=0).max())
-    shares, residual = touch_sum.fit_shares(np.ones(len(touch_sum.places), bool))
-    num_neurons = np.count_nonzero(shares)
+    neuron_weights, residual = touch_sum.fit_weights(np.ones(len(touch_sum.places), bool))
+    num_neurons = np.count_nonzero(neuron_weights)
     if not num_neurons:
         return []
     variance = max(residual / max(len(touch_sum.change) - num_neurons, 1), touch_sum.variance)
-    selected_groups = _select_groups(touch_sum, touch_sum.group_neurons(shares, apart), variance)
+    selected_groups = _select_groups(touch_sum, touch_sum.group_neurons(neuron_weights, apart), variance)
     if not selected_groups:
         return []
-    shares, _ = touch_sum.fit_shares(np.any(selected_groups, axis=0))
+    neuron_weights, _ = touch_sum.fit_weights(np.any(selected_groups, axis=0))
     touches = [
-        _create_touch(touch_sum.places[group], shares[group]) for group in selected_groups if shares[group].any()
+        _create_touch(touch_sum.places[group], neuron_weights[group])
+        for group in selected_groups
+        if neuron_weights[group].any()
     ]
     touches.sort(key=lambda touch: -touch.strength)
     return [touch for touch in touches if touch.strength >= least * max(1.0, touches[0].strength)]
@@ -132,15 +134,17 @@ class _TouchSuperposition:
             (frame_values - reference_values) / size, changes / size, placed_positions, (placed_map.missed / size) ** 2
         )
 
-    def fit_shares(self, neurons: Bool[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " k"], float]:
+    def fit_weights(self, neurons: Bool[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " k"], float]:
         """Fit the shares of the selected `neurons` in the frame; also returns the residual sum of squares."""
         from scipy.optimize import nnls
 
-        shares = np.zeros(len(neurons))
-        shares[neurons], residual_norm = nnls(self.changes[neurons].T, self.change)
-        return shares, float(residual_norm) ** 2
+        neuron_weights = np.zeros(len(neurons))
+        neuron_weights[neurons], residual_norm = nnls(self.changes[neurons].T, self.change)
+        return neuron_weights, float(residual_norm) ** 2
 
-    def group_neurons(self, shares: Float[np.ndarray, " k"], min_distance: float) -> list[Bool[np.ndarray, " k"]]:
+    def group_neurons(
+        self, neuron_weights: Float[np.ndarray, " k"], min_distance: float
+    ) -> list[Bool[np.ndarray, " k"]]:
         """Group the neurons that have a share in the frame into clusters of nearby places.
 
         Returns a mask of neurons for each cluster that explains much of the frame's change, with the neurons whose
@@ -148,12 +152,12 @@ class _TouchSuperposition:
         """
         from scipy.cluster.hierarchy import fcluster, linkage
 
-        neurons_with_share = np.flatnonzero(shares)
+        neurons_with_share = np.flatnonzero(neuron_weights)
         cluster_numbers = np.ones(1, int)
         if len(neurons_with_share) > 1:
             cluster_numbers = fcluster(linkage(self.places[neurons_with_share], "single"), min_distance, "distance")
         clusters = [neurons_with_share[cluster_numbers == number] for number in np.unique(cluster_numbers)]
-        clusters.sort(key=lambda cluster: -np.linalg.norm(shares[cluster] @ self.changes[cluster]))
+        clusters.sort(key=lambda cluster: -np.linalg.norm(neuron_weights[cluster] @ self.changes[cluster]))
         return [
             np.linalg.norm(self.places[:, None] - self.places[cluster], axis=-1).min(axis=1) < min_distance / 2
             for cluster in clusters[:_MAX_TOUCHES]
@@ -168,7 +172,7 @@ def _select_groups(
     residual = float(model.change @ model.change)
     remaining_groups = list(groups)
     while remaining_groups:
-        new_residuals = [model.fit_shares(np.any([*selected_groups, group], axis=0))[1] for group in remaining_groups]
+        new_residuals = [model.fit_weights(np.any([*selected_groups, group], axis=0))[1] for group in remaining_groups]
         best_index = int(np.argmin(new_residuals))
         if residual - new_residuals[best_index] < _MIN_RESIDUAL_DECREASE * variance:
             break
@@ -177,11 +181,11 @@ def _select_groups(
     return selected_groups
 
 
-def _create_touch(places: Float[np.ndarray, "k d"], shares: Float[np.ndarray, " k"]) -> MapTouch:
+def _create_touch(places: Float[np.ndarray, "k d"], neuron_weights: Float[np.ndarray, " k"]) -> MapTouch:
     """Create a touch from the places and shares of a group of neurons."""
-    centroid = shares @ places / shares.sum()
-    standard_distance = np.sqrt(shares @ np.sum((places - centroid) ** 2, axis=1) / shares.sum())
-    return MapTouch(centroid, float(standard_distance), float(shares.sum()))
+    centroid = neuron_weights @ places / neuron_weights.sum()
+    standard_distance = np.sqrt(neuron_weights @ np.sum((places - centroid) ** 2, axis=1) / neuron_weights.sum())
+    return MapTouch(centroid, float(standard_distance), float(neuron_weights.sum()))
 
 
 def _check_frame(placed_map: PlacedMap, name: str, value) -> Float[np.ndarray, " M"]:

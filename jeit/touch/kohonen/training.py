@@ -88,23 +88,23 @@ class MapSchedule(Module):
 def train(
     weights: Float[Array, "R C M"],
     frames: Float[Array, "N M"],
-    order: Int[Array, " T"],
+    frame_order: Int[Array, " T"],
     rates: Float[Array, " T"],
     radii: Float[Array, " O"],
 ) -> tuple[Float[Array, "R C M"], Float[Array, " T"]]:
     """Train a map; returns its weights (rows, columns, channels), and the mean of all weights after each frame shown.
 
-    `weights`: initial weights; `order`: indices of the `frames` (frames, channels) in the order in which they are
+    `weights`: initial weights; `frame_order`: indices of the `frames` (frames, channels) in the order in which they are
     shown; `rates`: learning rate for each frame shown; `radii`: neighbourhood radius for each frame of the ordering
     phase, in grid steps. The frames after these are shown in the tuning phase. The function may be mapped by `jax.vmap`
     over weights, orders, rates and radii.
     """
     shape, mean_frame, num_ordering = weights.shape[:2], frames.mean(axis=0), len(radii)
 
-    def train_phase(phase, weight_rows, block_size, order, rates, *radii):
-        num_padding = -len(order) % block_size
+    def train_phase(phase, weight_rows, block_size, frame_order, rates, *radii):
+        num_padding = -len(frame_order) % block_size
         # Frames are appended to fill the last block; their learning rate is 0, so they change no weights.
-        order_rates = [jnp.pad(values, (0, num_padding)) for values in (order, rates)]
+        order_rates = [jnp.pad(values, (0, num_padding)) for values in (frame_order, rates)]
         blocks = *order_rates, *(jnp.pad(values, (0, num_padding), "edge") for values in radii)
 
         def train_block(weight_rows, block):
@@ -114,17 +114,17 @@ def train(
         weight_rows, curve = jax.lax.scan(
             train_block, weight_rows, tuple(values.reshape(-1, block_size) for values in blocks)
         )
-        return weight_rows, curve.reshape(-1)[: len(order)]
+        return weight_rows, curve.reshape(-1)[: len(frame_order)]
 
     weight_rows, curves = (weights - mean_frame).reshape(-1, weights.shape[2]), []
     if num_ordering:
         weight_rows, curve = train_phase(
-            _ordering_phase, weight_rows, _ORDERING_FRAMES, order[:num_ordering], rates[:num_ordering], radii
+            _ordering_phase, weight_rows, _ORDERING_FRAMES, frame_order[:num_ordering], rates[:num_ordering], radii
         )
         curves.append(curve)
-    if len(order) > num_ordering:
+    if len(frame_order) > num_ordering:
         weight_rows, curve = train_phase(
-            _tuning_phase, weight_rows, _TUNING_FRAMES, order[num_ordering:], rates[num_ordering:]
+            _tuning_phase, weight_rows, _TUNING_FRAMES, frame_order[num_ordering:], rates[num_ordering:]
         )
         curves.append(curve)
     return weight_rows.reshape(weights.shape) + mean_frame, jnp.concatenate(curves) + mean_frame.mean()

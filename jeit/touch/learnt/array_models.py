@@ -241,8 +241,8 @@ class NearestNeighbours:
             shifted_squares += self._squared_norms  # omits the frame's squared norm, which is the same for all presses
             indices = np.argpartition(shifted_squares, self.count - 1, axis=1)[:, : self.count]
             distances = np.linalg.norm(self.features[indices] - rows[:, None], axis=2)
-            order = np.argsort(distances, axis=1, kind="stable")
-            return np.stack([np.take_along_axis(array, order, axis=1) for array in (distances, indices)], axis=-1)
+            sort_order = np.argsort(distances, axis=1, kind="stable")
+            return np.stack([np.take_along_axis(array, sort_order, axis=1) for array in (distances, indices)], axis=-1)
 
         neighbours = apply_in_parts(find_nearest, features, _NEIGHBOUR_CHUNK_SIZE)
         return neighbours[..., 0], neighbours[..., 1].astype(int)

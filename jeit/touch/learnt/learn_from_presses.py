@@ -45,9 +45,9 @@ def time_folds(
     held-out presses.
     """
     num_presses = len(frames)
-    order = np.arange(num_presses) if time is None else np.argsort(time, kind="stable")
+    time_order = np.arange(num_presses) if time is None else np.argsort(time, kind="stable")
     rank = np.empty(num_presses, int)
-    rank[order] = np.arange(num_presses)
+    rank[time_order] = np.arange(num_presses)
     notes = []
     unit = np.arange(num_presses)
     groups = unit if group is None else np.unique(group, return_inverse=True)[1]

@@ -48,10 +48,10 @@ class GaussianProcess:
     @classmethod
     def fit(cls, features, targets) -> "GaussianProcess":
         """Fit a Gaussian process to features (presses, features) and standardised targets (presses, targets)."""
-        order = np.random.default_rng(0).permutation(len(features))
-        tuning_presses = order[:_NUM_TUNING_PRESSES]
+        random_order = np.random.default_rng(0).permutation(len(features))
+        tuning_presses = random_order[:_NUM_TUNING_PRESSES]
         length, noise = _estimate_length_and_noise(features[tuning_presses], targets[tuning_presses])
-        centre_indices = np.sort(order[:_MAX_CENTRES])
+        centre_indices = np.sort(random_order[:_MAX_CENTRES])
         centres = features[centre_indices]
         centre_kernel = _matern_kernel(cdist(centres, centres) / length)
         if len(centres) == len(features):

@@ -271,8 +271,8 @@ def _draw_batches(num_rows: int, num_epochs: int) -> Int[np.ndarray, "T b"]:
     """Return the rows of each batch (steps, rows in a batch), in a random order in each of `num_epochs` epochs."""
     num_steps = num_epochs * max(1, -(-num_rows // _BATCH_SIZE))
     rng = np.random.default_rng(0)
-    order = np.concatenate([rng.permutation(num_rows) for _ in range(num_epochs)])
-    return np.resize(order, (num_steps, _BATCH_SIZE))
+    row_order = np.concatenate([rng.permutation(num_rows) for _ in range(num_epochs)])
+    return np.resize(row_order, (num_steps, _BATCH_SIZE))
 
 
 def _pad_rows(values: np.ndarray) -> np.ndarray:

@@ -96,10 +96,10 @@ class LabelledClips:
                 "give clips of two classes or more."
             )
         channels, rates = [], []
-        for index in range(len(recordings)):
-            recording = recordings[index]
+        for clip_index in range(len(recordings)):
+            recording = recordings[clip_index]
             check_kind(
-                f"recordings[{index}]", recording, Recording, "a Recording of samples, as of read_recording(path)"
+                f"recordings[{clip_index}]", recording, Recording, "a Recording of samples, as of read_recording(path)"
             )
             channels.append(len(recording.samples))
             rates.append(recording.rate)
@@ -204,9 +204,9 @@ def _describe_unread(failures: list[tuple[str, str]]) -> str:
     """Describe how many files could not be read, and for which reasons. One file of each format is described first."""
     num_previous: dict[str, int] = {}
     sort_keys = []
-    for index, (suffix, reason) in enumerate(failures):
+    for failure_index, (suffix, reason) in enumerate(failures):
         num_previous[suffix] = num_previous.get(suffix, -1) + 1
-        sort_keys.append((num_previous[suffix], index, reason))
+        sort_keys.append((num_previous[suffix], failure_index, reason))
     reasons = [reason for *_, reason in sorted(sort_keys)]
     omitted = f"; and {len(reasons) - _MAX_DESCRIBED} more" if len(reasons) > _MAX_DESCRIBED else ""
     return f"{counted(len(reasons), 'file')} not read: {'; '.join(reasons[:_MAX_DESCRIBED])}{omitted}"

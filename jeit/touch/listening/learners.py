@@ -303,8 +303,8 @@ def select_early_stopping_windows(window_classes: Int[np.ndarray, " W"], groups:
         )
         already_held_out = held_out_groups & set(class_groups.tolist())
         candidates = [group for group in class_groups.tolist() if group not in held_out_groups]
-        order = np.random.default_rng(int(class_index)).permutation(len(candidates))
-        held_out_groups |= {candidates[index] for index in order[: max(0, num_wanted - len(already_held_out))]}
+        random_order = np.random.default_rng(int(class_index)).permutation(len(candidates))
+        held_out_groups |= {candidates[index] for index in random_order[: max(0, num_wanted - len(already_held_out))]}
     is_held_out = np.isin(groups, sorted(held_out_groups))
     # If a class would not remain in the training set, nothing is held out.
     return (

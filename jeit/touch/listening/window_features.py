@@ -54,11 +54,12 @@ class Levels:
         Microphones are sorted by their loudness in the window, the loudest first, so that a touch gives the same image
         at any place. Park et al. do not state the order of microphones. Levels are in single precision.
         """
-        order = np.argsort(-images.intensity.sum(axis=2), axis=1, kind="stable")
-        intensity = np.take_along_axis(images.intensity, order[..., None], axis=1)
+        loudness_order = np.argsort(-images.intensity.sum(axis=2), axis=1, kind="stable")
+        intensity = np.take_along_axis(images.intensity, loudness_order[..., None], axis=1)
         level_images = [
-            (_to_decibels(power, self.loudest[index] - _LEVEL_RANGE) - self.mean[index]) / self.deviation[index]
-            for index, power in enumerate((intensity, images.spectrum))
+            (_to_decibels(power, self.loudest[image_index] - _LEVEL_RANGE) - self.mean[image_index])
+            / self.deviation[image_index]
+            for image_index, power in enumerate((intensity, images.spectrum))
         ]
         return np.concatenate(level_images, axis=1).astype(np.float32)
 

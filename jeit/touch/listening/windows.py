@@ -106,12 +106,12 @@ class Windows:
                 raise ValueError(f"recordings[{clip_index}], {clips.recordings[clip_index].name}: it holds no numbers.")
             has_single_group = clip_labels[clip_index] in single_group_labels
             is_long = images.times[-1] - images.times[0] > _MAX_CLIP_DURATION
-            pieces = (
+            clip_pieces = (
                 _split_pieces(images.times[loud_windows])
                 if is_long or has_single_group
                 else [np.arange(len(loud_windows))]
             )
-            for piece_index, piece in enumerate(pieces):
+            for piece_index, piece in enumerate(clip_pieces):
                 selection = piece[
                     np.linspace(0, len(piece) - 1, min(len(piece), _MAX_PIECE_WINDOWS)).round().astype(int)
                 ]
@@ -120,12 +120,12 @@ class Windows:
                 group_of_piece.append(
                     (
                         clip_groups[clip_index],
-                        piece_index * _MAX_PIECE_GROUPS // max(len(pieces), _MAX_PIECE_GROUPS)
+                        piece_index * _MAX_PIECE_GROUPS // max(len(clip_pieces), _MAX_PIECE_GROUPS)
                         if has_single_group
                         else 0,
                     )
                 )
-            if has_single_group and len(pieces) > 1:
+            if has_single_group and len(clip_pieces) > 1:
                 cut_classes.add(str(names[clip_labels[clip_index]]))
             report(f"{counted(clip_index + 1, 'clip')} of {len(clips)}")
         clip = np.repeat(np.arange(len(image_blocks)), [len(block) for block in image_blocks])
@@ -202,5 +202,8 @@ def _split_pieces(times: Float[np.ndarray, " n"]) -> list[np.ndarray]:
         kept_windows = sound[time_in_piece <= _PIECE_DURATION]
         intervals += np.split(kept_windows, np.flatnonzero(np.diff(piece_number[time_in_piece <= _PIECE_DURATION])) + 1)
     if len(intervals) > _MAX_PIECES:
-        intervals = [intervals[index] for index in np.linspace(0, len(intervals) - 1, _MAX_PIECES).round().astype(int)]
+        intervals = [
+            intervals[interval_index]
+            for interval_index in np.linspace(0, len(intervals) - 1, _MAX_PIECES).round().astype(int)
+        ]
     return intervals

@@ -193,8 +193,8 @@ def train_unrolled(
 
 def shuffle_pairs(examples: TouchExamples, seed: int = 0) -> TouchExamples:
     """Pair voltage changes and depth maps at random: only the distribution of maps can be learnt from such pairs."""
-    order = np.random.default_rng(seed).permutation(len(examples.change))
-    return examples._replace(depth=examples.depth[order])
+    random_order = np.random.default_rng(seed).permutation(len(examples.change))
+    return examples._replace(depth=examples.depth[random_order])
 
 
 def _map_errors(network, batch):

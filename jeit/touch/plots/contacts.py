@@ -86,8 +86,8 @@ def draw_contacts(contacts: Sequence[Contact], *, ax: Axes | None = None) -> Axe
 def check_contacts(contacts) -> None:
     """Check that `contacts` is a list of contacts. Raises `ValueError` otherwise."""
     check_kind("contacts", contacts, (list, tuple), "a list of contacts, as of find_contacts(finder, image)")
-    for index, contact in enumerate(contacts):
-        check_kind(f"contacts[{index}]", contact, Contact, "a Contact")
+    for contact_index, contact in enumerate(contacts):
+        check_kind(f"contacts[{contact_index}]", contact, Contact, "a Contact")
 
 
 def largest_magnitude(values: np.ndarray) -> float:

@@ -188,9 +188,15 @@ def plot_place_errors(place: Standing, *, title: str | None = None, ax: Axes | N
     extent = extent_of(place.right)
     hide_axes(ax, extent, numbered=False)
     colour_limit = float(np.quantile(errors_mm, 0.98)) or 1.0
-    order = np.argsort(errors_mm)
+    sort_order = np.argsort(errors_mm)
     points = ax.scatter(
-        *place.right[order, :2].T, c=errors_mm[order], s=22, cmap=SEQUENTIAL, vmin=0, vmax=colour_limit, linewidths=0
+        *place.right[sort_order, :2].T,
+        c=errors_mm[sort_order],
+        s=22,
+        cmap=SEQUENTIAL,
+        vmin=0,
+        vmax=colour_limit,
+        linewidths=0,
     )
     draw_scale_bar(ax, extent)
     draw_colour_bar(ax, points, "Error of presses held out (mm)")
@@ -251,17 +257,17 @@ def plot_confusion(label: Standing, *, title: str | None = None, ax: Axes | None
             for true_label in labels
         ]
     )
-    shares = 100 * counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
-    matrix_image = ax.imshow(shares, cmap="Blues", vmin=0, vmax=100)
+    percentages = 100 * counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+    matrix_image = ax.imshow(percentages, cmap="Blues", vmin=0, vmax=100)
     draw_colour_bar(ax, matrix_image, "Share of the kind (%)")
     if len(labels) <= _MAX_TICK_LABELS:
         rotation = 90 if max(len(text) for text in labels) > 3 else 0
         ax.set_xticks(range(len(labels)), labels, rotation=rotation)
         ax.set_yticks(range(len(labels)), labels)
     if len(labels) <= 10:
-        for row, column in np.argwhere(shares >= 0.5):
-            colour = "white" if shares[row, column] > 50 else DARK_GREY
-            ax.text(column, row, f"{shares[row, column]:.0f}", ha="center", va="center", color=colour, fontsize=8)
+        for row, column in np.argwhere(percentages >= 0.5):
+            colour = "white" if percentages[row, column] > 50 else DARK_GREY
+            ax.text(column, row, f"{percentages[row, column]:.0f}", ha="center", va="center", color=colour, fontsize=8)
     ax.set_xlabel("Predicted label", color=DARK_GREY)
     ax.set_ylabel("True label", color=DARK_GREY)
     percentage = 100 * np.mean(label.right == label.held_out)

@@ -209,8 +209,8 @@ def gesture_colour(touch: NamedTouch, names: Sequence[str]) -> str:
 def check_named_touches(touches) -> None:
     """Raise `ValueError` unless `touches` is a list of `NamedTouch`, touches with a predicted gesture."""
     check_kind("touches", touches, (list, tuple), "a list of named touches, as TouchWatch.follow gives them")
-    for index, touch in enumerate(touches):
-        check_kind(f"touches[{index}]", touch, NamedTouch, "a NamedTouch")
+    for touch_index, touch in enumerate(touches):
+        check_kind(f"touches[{touch_index}]", touch, NamedTouch, "a NamedTouch")
 
 
 def _opacity(touch: NamedTouch) -> float:

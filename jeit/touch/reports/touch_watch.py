@@ -279,30 +279,30 @@ _CONTACT_COLUMNS = ("frame", "time_s", "touch", "x_m", "y_m", "deviation_m", "ar
 _MAX_NUMBERED = 20
 
 
-def write_contacts(found: RecordedContacts, images: TouchImages, folder: str | Path, *, name: str) -> None:
+def write_contacts(recorded_contacts: RecordedContacts, images: TouchImages, folder: str | Path, *, name: str) -> None:
     """Write the contacts of a recording into `folder`, which is created if needed: a table, a report and a picture.
 
     The files are `contacts.csv`, `report.json` and `contacts.png`. `name`: name of the recording. Raises `ValueError`
     if `folder` cannot be a folder.
     """
     rows = (
-        [frame, f"{found.seconds[frame]:.6g}", found.number_of(frame, contact)]
+        [frame, f"{recorded_contacts.seconds[frame]:.6g}", recorded_contacts.number_of(frame, contact)]
         + [f"{metres:.6f}" for metres in (*contact.centroid, contact.deviation)]
         + [f"{contact.area:.4g}", f"{contact.peak:.4g}"]
-        for frame, contacts in enumerate(found.contacts)
+        for frame, contacts in enumerate(recorded_contacts.contacts)
         for contact in contacts
     )
     with results(folder, CONTACT_FILES) as temporary_folder:
         write_rows(temporary_folder / "contacts.csv", _CONTACT_COLUMNS, rows)
-        write_json(_report_contacts(found, images, name), temporary_folder / "report.json")
-        _draw_contacts(found, images).savefig(temporary_folder / "contacts.png", dpi=130)
+        write_json(_report_contacts(recorded_contacts, images, name), temporary_folder / "report.json")
+        _draw_contacts(recorded_contacts, images).savefig(temporary_folder / "contacts.png", dpi=130)
 
 
-def _report_contacts(found: RecordedContacts, images: TouchImages, name: str) -> dict[str, Any]:
+def _report_contacts(recorded_contacts: RecordedContacts, images: TouchImages, name: str) -> dict[str, Any]:
     return to_plain_values(
         {
             "recording": name,
-            "frames": len(found.seconds),
+            "frames": len(recorded_contacts.seconds),
             "background": images.background,
             "touches": [
                 {
@@ -316,16 +316,16 @@ def _report_contacts(found: RecordedContacts, images: TouchImages, name: str) ->
                     "path_length": path.length,
                     "peak": path.peak[np.abs(path.peak).argmax()],
                 }
-                for path in found.touches
+                for path in recorded_contacts.touches
             ],
-            "notes": list(found.notes),
+            "notes": list(recorded_contacts.notes),
             "units": {"onset": "s", "position": "m", "path_length": "m", "peak": "S", "background": "S"},
             "versions": {package: package_version(package) for package in _WATCH_PACKAGES[:3]},
         }
     )
 
 
-def _draw_contacts(found: RecordedContacts, images: TouchImages):
+def _draw_contacts(recorded_contacts: RecordedContacts, images: TouchImages):
     """Draw the image of the frame with the strongest contacts, and the paths of all touches, as a `Figure`."""
     from matplotlib.figure import Figure
 
@@ -337,20 +337,25 @@ def _draw_contacts(found: RecordedContacts, images: TouchImages):
     electrodes, extent = images.calibration.model.electrodes, extent_of(np.asarray(images.mesh.points))
     figure = Figure(figsize=(12.0, 5.4), layout="constrained")
     left, right = figure.subplots(1, 2)
-    strengths = [sum(abs(contact.integral) for contact in contacts) for contacts in found.contacts]
+    strengths = [sum(abs(contact.integral) for contact in contacts) for contacts in recorded_contacts.contacts]
     frame = int(np.argmax(strengths))
-    title = f"Frame {frame}, {found.seconds[frame]:.2f} s"
+    title = f"Frame {frame}, {recorded_contacts.seconds[frame]:.2f} s"
     plot_contacts(
-        images.mesh, np.nan_to_num(found.changes[frame]), found.contacts[frame], electrodes, title=title, ax=left
+        images.mesh,
+        np.nan_to_num(recorded_contacts.changes[frame]),
+        recorded_contacts.contacts[frame],
+        electrodes,
+        title=title,
+        ax=left,
     )
     draw_outline(images.mesh, right)
     draw_electrodes(images.mesh, electrodes, numbers=False, ax=right)
-    for path in found.touches:
+    for path in recorded_contacts.touches:
         (line,) = right.plot(*path.position.T, linewidth=1.6)
         right.plot(*path.position[0], marker="o", markersize=5, color=line.get_color())
-        if len(found.touches) <= _MAX_NUMBERED:
+        if len(recorded_contacts.touches) <= _MAX_NUMBERED:
             right.annotate(str(path.number), path.position[0], (5, 3), textcoords="offset points", fontsize=9)
     hide_axes(right, extent)
     draw_scale_bar(right, extent)
-    right.set_title(f"Paths of {counted(len(found.touches), 'touch')}, from their dots")
+    right.set_title(f"Paths of {counted(len(recorded_contacts.touches), 'touch')}, from their dots")
     return figure

@@ -153,8 +153,10 @@ def fit_network(
     validation_rows = ArrayRows(validation, "validation")
     held_out_arrays = jax.tree.map(jnp.asarray, validation_rows.arrays)
     seed = [int(integer) for integer in np.asarray(jax.random.key_data(key) if _is_typed_key(key) else key).ravel()]
-    order = BatchOrder(rows.sizes, plan.batch, seed)
-    run = _CompiledTraining(network, objective, plan, order, jax.random.wrap_key_data(jnp.asarray(seed, jnp.uint32)))
+    batch_order = BatchOrder(rows.sizes, plan.batch, seed)
+    run = _CompiledTraining(
+        network, objective, plan, batch_order, jax.random.wrap_key_data(jnp.asarray(seed, jnp.uint32))
+    )
     fingerprint = {
         "plan": {**dataclasses.asdict(plan), "seconds": 0},
         "key": seed,
@@ -166,11 +168,11 @@ def fit_network(
     }
     checkpoint_file = None if checkpoint is None else Checkpoint(checkpoint, fingerprint)
     state = run.initial_state() if checkpoint_file is None else checkpoint_file.read(run.initial_state())
-    evaluation_interval = plan.look_every or order.batches_per_epoch
-    last_batch, last_saved, loaded_chunk = plan.epochs * order.batches_per_epoch, time.monotonic(), (-1, None)
+    evaluation_interval = plan.look_every or batch_order.batches_per_epoch
+    last_batch, last_saved, loaded_chunk = plan.epochs * batch_order.batches_per_epoch, time.monotonic(), (-1, None)
     while (reason := _end_reason(state, plan, last_batch)) is None:
         next_evaluation = min(last_batch, (state.step // evaluation_interval + 1) * evaluation_interval)
-        for batches in order.chunk_batches(state.step, next_evaluation, _CHECKPOINT_BATCHES):
+        for batches in batch_order.chunk_batches(state.step, next_evaluation, _CHECKPOINT_BATCHES):
             if loaded_chunk[0] != batches.chunk:
                 loaded_chunk = -1, None  # drops the chunk, so that two chunks are never in memory
                 loaded_chunk = batches.chunk, jax.tree.map(jnp.asarray, rows.chunk(batches.chunk))
@@ -186,7 +188,7 @@ def fit_network(
             state, held_out_arrays, next_evaluation - (next_evaluation - 1) // evaluation_interval * evaluation_interval
         )
         if progress is not None:
-            progress(_describe_progress(state, plan, order.batches_per_epoch))
+            progress(_describe_progress(state, plan, batch_order.batches_per_epoch))
         if checkpoint_file is not None and (
             time.monotonic() - last_saved >= plan.seconds or _end_reason(state, plan, last_batch)
         ):
@@ -199,10 +201,10 @@ class _CompiledTraining:
     """Compiled functions of a network's training, and methods that apply these functions to the state of the
     training."""
 
-    def __init__(self, network, objective: TrainingObjective, plan: TrainingPlan, order: BatchOrder, key: Array):
+    def __init__(self, network, objective: TrainingObjective, plan: TrainingPlan, batch_order: BatchOrder, key: Array):
         import optax
 
-        steps = plan.decay_epochs * order.batches_per_epoch
+        steps = plan.decay_epochs * batch_order.batches_per_epoch
         rate = plan.rate if plan.decay == 1 else optax.exponential_decay(plan.rate, steps, plan.decay, staircase=True)
         adam = optax.adam(rate)
         self.arrays, self.fixed = eqx.partition(network, eqx.is_array)

@@ -247,11 +247,13 @@ class _EliminationTree:
                 children[parent].append(child)
         starts, counts = self.border_first.tolist(), self.border.tolist()
         fronts = []
-        for number, (pivots, first) in enumerate(zip(self.pivots.tolist(), self.first_pivots.tolist(), strict=True)):
+        for number, (pivots, first_pivot) in enumerate(
+            zip(self.pivots.tolist(), self.first_pivots.tolist(), strict=True)
+        ):
             rows = slice(starts[number], starts[number] + counts[number])
             entries = slice(entry_offsets[number], entry_offsets[number + 1])
             front = Front(
-                pivots, counts[number], first, self.border_row[rows], entries, panel_indices[entries],
+                pivots, counts[number], first_pivot, self.border_row[rows], entries, panel_indices[entries],
                 tuple(children[number]), self.rows_in_parent[rows], num_parent_pivots[number], num_subtree_rows[number]
             )  # fmt: skip
             fronts.append(front)

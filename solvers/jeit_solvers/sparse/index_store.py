@@ -114,15 +114,15 @@ class PaddedSum(NamedTuple):
         place. The sums are processed in chunks, so that temporary arrays stay in the cache."""
         chunk_size = max(1, _NUMPY_CHUNK // math.prod(contributions.shape[1:]))
         gathered: Any = self.gather.read(indices)
-        for first in range(start, stop, chunk_size) if len(gathered) else ():
-            chunk = slice(first, min(first + chunk_size, stop))
+        for first_sum in range(start, stop, chunk_size) if len(gathered) else ():
+            chunk = slice(first_sum, min(first_sum + chunk_size, stop))
             for layer in gathered:
                 total[chunk] += gather_or_zero(contributions, layer[chunk])
         overflow_sums: Any = self.overflow_sum.read(indices)
         sources: Any = self.overflow_source.read(indices)
         for round_start, round_end in zip((0, *self.rounds), self.rounds, strict=False):
-            first, last = round_start + np.searchsorted(overflow_sums[round_start:round_end], (start, stop))
-            for chunk_start in range(first, last, chunk_size):
+            first_sum, last = round_start + np.searchsorted(overflow_sums[round_start:round_end], (start, stop))
+            for chunk_start in range(first_sum, last, chunk_size):
                 chunk = slice(chunk_start, min(chunk_start + chunk_size, last))
                 total[overflow_sums[chunk]] += gather(contributions, sources[chunk])
 

@@ -61,10 +61,10 @@ class Strips(Module):
         longest_axis, *other_axes = coordinates.T[np.argsort(-np.ptp(coordinates, axis=0))]
         strip = _breadth_first_levels(pattern, longest_axis)
         # Sort the unknowns of a strip by their other coordinates, so that neighbours in space are neighbours in memory.
-        order = np.lexsort((*other_axes[::-1], ~selected, strip))
+        sort_order = np.lexsort((*other_axes[::-1], ~selected, strip))
         counts = np.bincount(strip)
         index_in_strip = np.empty(len(strip), int)
-        index_in_strip[order] = np.arange(len(strip)) - np.repeat(np.cumsum(counts) - counts, counts)
+        index_in_strip[sort_order] = np.arange(len(strip)) - np.repeat(np.cumsum(counts) - counts, counts)
         strip_size = int(counts.max())
         num_selected = int(np.bincount(strip[selected], minlength=1).max())
         num_selected = min(
@@ -120,8 +120,8 @@ class NearInverse(Module):
             places = places.astype(jnp.int64)
         row, column = places[:, :, None], places[:, None]
         row, column = jnp.minimum(row, column), jnp.maximum(row, column)
-        index = row * width + column - row // selected * selected
-        return self.band.reshape(-1).at[index].get(mode="promise_in_bounds") + added
+        entry_index = row * width + column - row // selected * selected
+        return self.band.reshape(-1).at[entry_index].get(mode="promise_in_bounds") + added
 
     def add(self, left: Inexact[Array, "p r"], right: Inexact[Array, "p r"]) -> "NearInverse":
         """Return the sum G + left rightᵀ, which must be symmetric. The rows of `left` and `right` are in the order of

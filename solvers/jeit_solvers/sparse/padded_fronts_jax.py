@@ -169,8 +169,8 @@ def _eliminate_fronts(
     inverse[front_slice] = inverse_cholesky(panel[front_slice, : stage.pivots])
     np.matmul(panel[front_slice, stage.pivots :], _transposed(inverse[front_slice]), out=lower_blocks[front_slice])
     num_fronts_at_once = max(1, _UPDATED_ENTRIES // max(stage.border**2, 1))
-    for first in range(front_slice.start, front_slice.stop, num_fronts_at_once):
-        update_slice = slice(first, min(first + num_fronts_at_once, front_slice.stop))
+    for first_front in range(front_slice.start, front_slice.stop, num_fronts_at_once):
+        update_slice = slice(first_front, min(first_front + num_fronts_at_once, front_slice.stop))
         corner[update_slice] -= lower_blocks[update_slice] @ _transposed(lower_blocks[update_slice])
 
 
@@ -401,7 +401,7 @@ def _forward_stages(
     stages, _ = layout.content
     count = vectors.shape[1]
     reduced_vectors, updates = [], []
-    for stage, inverse, lower in zip(stages, factor.inverses, factor.lowers, strict=True):
+    for stage, inverse, lower_block in zip(stages, factor.inverses, factor.lowers, strict=True):
         rows = gather_or_zero(vectors, stage.right_hand_side.read(indices))
         child_updates = [link.rows.apply(indices, updates[link.source].reshape(-1, count)) for link in stage.links]
         child_updates = [update.reshape(stage.batch, -1, count) for update in child_updates]
@@ -411,7 +411,7 @@ def _forward_stages(
             operator.add, [update[:, stage.pivots :] for update in child_updates] or [zero]
         )
         reduced_vectors.append(inverse @ rows)
-        updates.append(border_update - lower @ reduced_vectors[-1])
+        updates.append(border_update - lower_block @ reduced_vectors[-1])
     return reduced_vectors
 
 

@@ -136,9 +136,9 @@ def solve_contact_displacement(
     The level is 0 if every gap is infinite. If the m lowest points are below the level, δ = (volume + Σ area · gap) / Σ
     area over these points. The result is exact for the smallest m for which the next point is above the level.
     """
-    order = np.argsort(gap, axis=-1)
-    heights = np.take_along_axis(gap, order, axis=-1)
-    areas = np.where(np.isfinite(heights), np.take_along_axis(area, order, axis=-1), 0.0)
+    sort_order = np.argsort(gap, axis=-1)
+    heights = np.take_along_axis(gap, sort_order, axis=-1)
+    areas = np.where(np.isfinite(heights), np.take_along_axis(area, sort_order, axis=-1), 0.0)
     weighted_heights = areas * np.where(areas > 0, heights, 0.0)
     cumulative_heights, cumulative_areas = np.cumsum(weighted_heights, axis=-1), np.cumsum(areas, axis=-1)
     levels = (np.asarray(volume)[..., None] + cumulative_heights) / np.where(
@@ -342,7 +342,7 @@ def advance_state(
     """Advance a material's `state` by a time step of `seconds`, at the end of which the material bears `pressure` (m,);
     return the new state and the effective pressure (m,), pascals."""
     output = np.maximum(pressure, np.minimum(state.hysteresis_output, pressure / (1 - material.hysteresis)))
-    shares, times = _creep_branches(material)
+    creep_fractions, times = _creep_branches(material)
     branch_states = state.branch_states
     if seconds > 0:
         relative_times = seconds / times
@@ -350,14 +350,16 @@ def advance_state(
         ramp_weights = 1 + np.expm1(-relative_times) / relative_times
         branch_states = decay_factors * branch_states + (1 - decay_factors) * state.hysteresis_output
         branch_states += ramp_weights * (output - state.hysteresis_output)
-    return MaterialState(output, branch_states), (1 - shares.sum()) * output + np.sum(shares * branch_states, axis=0)
+    return MaterialState(output, branch_states), (1 - creep_fractions.sum()) * output + np.sum(
+        creep_fractions * branch_states, axis=0
+    )
 
 
 def creep_pressure(material: Material, pressure: Float[np.ndarray, "..."], seconds: float) -> Float[np.ndarray, "..."]:
     """Compute the effective pressure (…), pascals, under the first `pressure` on a material, applied suddenly and
     constant for `seconds`."""
-    shares, times = _creep_branches(material)
-    return np.asarray(pressure) * (1 - np.sum(shares * np.exp(-seconds / times)))
+    creep_fractions, times = _creep_branches(material)
+    return np.asarray(pressure) * (1 - np.sum(creep_fractions * np.exp(-seconds / times)))
 
 
 def _creep_branches(material: Material) -> tuple[np.ndarray, np.ndarray]:

@@ -225,12 +225,12 @@ def record_damage(
                 f"events[{event_index}] has a skin of {event.skin.gain.size} channels, not of {skin.gain.size}."
             )
     seconds = np.asarray(seconds, float)
-    ends = [*(event.time for event in events), np.inf]
-    if list(ends) != sorted(ends):
+    end_times = [*(event.time for event in events), np.inf]
+    if list(end_times) != sorted(end_times):
         raise ValueError("events must be in order of their times.")
     stages = [DamageEvent(0.0, skin), *events]
     voltages, current_skin = np.zeros((len(seconds), skin.gain.size)), skin
-    for event_index, (stage, end) in enumerate(zip(stages, ends, strict=True)):
+    for event_index, (stage, end) in enumerate(zip(stages, end_times, strict=True)):
         current_skin = current_skin if stage.skin is None else stage.skin
         is_stage_frame = (seconds >= stage.time if event_index else seconds >= 0) & (seconds < end)
         if not is_stage_frame.any():

@@ -66,13 +66,13 @@ def simulate_gestures(
     check_key(key)
     check_kind("skin", skin, PressedSkin, "a PressedSkin")
     check_kind("people", people, (list, tuple), "a list of them, such as [Person.draw(key)]")
-    for index, person in enumerate(people):
-        check_kind(f"people[{index}]", person, Person, "a Person, such as of Person.draw(key)")
+    for person_index, person in enumerate(people):
+        check_kind(f"people[{person_index}]", person, Person, "a Person, such as of Person.draw(key)")
     if not people:
         raise ValueError("people: give one at least, such as [Person.draw(key)].")
     check_kind("gestures", gestures, (list, tuple), "a list of names, such as ['tap', 'slap']")
-    for index, gesture in enumerate(gestures):
-        check_name(f"gestures[{index}]", gesture, GESTURES)
+    for person_index, gesture in enumerate(gestures):
+        check_name(f"gestures[{person_index}]", gesture, GESTURES)
     if not (isinstance(each, int) and each >= 1):
         raise ValueError(f"each must be a number of touches, 1 or more; it is {describe(each)}.")
     reference_key, untouched_key, touch_key, time_key = jax.random.split(key, 4)
