@@ -131,6 +131,8 @@ class MovedElectrodes(OtherChanges):
         return cls(jacobian, bodies_problem, _ELECTRODE_LEVELS, changes)
 
     def voltages(self, level: float, fit: Fit, protocol: Protocol) -> Float[np.ndarray, " M"]:
+        """Posterior mean of the changes of the voltages (M,) of a `protocol`, volts, given the voltages that the bodies
+        of a `fit` do not explain."""
         return _channels_of(protocol, self.impedance_changes) @ self._mean_coefficients(level, fit)
 
 

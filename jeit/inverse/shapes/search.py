@@ -133,21 +133,22 @@ def reconstruct_shapes(
     else:
         other_changes = SmoothField.create(smooth, problem)
     setting = _FitSetting(problem, other_changes)
-    level, report = 0.0, progress or (lambda stage: None)
+    finer_model, report = None, progress or (lambda stage: None)
     report("bodies")
+    states = []
+    if smooth is None:
+        states.append(_fit_bodies(setting, 0.0, bodies, coefficients, least_rise))
     if other_changes is not None:
         level, ball_fit, _ = _add_bodies(setting, *bodies.with_modes(1, coefficients))
-        bodies, coefficients = ball_fit.bodies.with_modes(prior.modes, ball_fit.coefficients)
-        problem = setting.problem(level)
-    fitted = problem.fit(*grow_bodies(problem, bodies, coefficients, _FIRST_STEPS), STEPS)
-    result = remove_unsupported(problem, fitted, (), least_rise)
-    state, finer_model = _SearchState(setting, level, result), None
+        grown = ball_fit.bodies.with_modes(prior.modes, ball_fit.coefficients)
+        states.append(_fit_bodies(setting, level, *grown, least_rise))
+    state = min(states, key=lambda state: state.surprise)
     if is_solid:
         state, finer_model = _refine_meshes(state, least_rise, report)
         report("bodies, of which kind")
     else:
         report("bodies, how many")
-        state = state._replace(found=improve_fit(problem, result, least_rise))
+        state = state._replace(found=improve_fit(setting.problem(state.level), state.found, least_rise))
     (setting, level, (free_fit, rises, doubtful)), other_changes = state, state.setting.other_changes
     problem = setting.problem(level)
     fitted = _with_common_contrast(problem, free_fit)
@@ -277,6 +278,19 @@ class _SearchState(NamedTuple):
     setting: _FitSetting
     level: float
     found: SearchResult
+
+    @property
+    def surprise(self) -> float:
+        """Negative log evidence of the bodies and of the level, up to a constant."""
+        problem = self.setting.problem(self.level)
+        return problem.surprise(self.found.fit) + problem.half_log_determinant
+
+
+def _fit_bodies(setting: _FitSetting, level: float, bodies: Bodies, coefficients, least_rise: float) -> _SearchState:
+    """Fit all bodies together, with other changes at their `level`, and remove those that are not supported."""
+    problem = setting.problem(level)
+    fitted = problem.fit(*grow_bodies(problem, bodies, coefficients, _FIRST_STEPS), STEPS)
+    return _SearchState(setting, level, remove_unsupported(problem, fitted, (), least_rise))
 
 
 def _refine_meshes(
