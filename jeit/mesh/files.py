@@ -129,7 +129,7 @@ def _check_counts(path: Path) -> None:
             )
 
 
-class _FirstElement(Exception):
+class _ElementReachedError(Exception):
     """Raised at the first XML element, to stop parsing there."""
 
 
@@ -141,13 +141,13 @@ def _check_prologue(path: Path) -> None:
         raise ValueError(f"path: {path.name[:80]} has a document type (<!DOCTYPE), which mesh files have no use for.")
 
     def stop_parsing(*_: Any) -> None:
-        raise _FirstElement
+        raise _ElementReachedError
 
     parser.StartDoctypeDeclHandler, parser.StartElementHandler = reject_doctype, stop_parsing
     try:
         with path.open("rb") as file:
             parser.ParseFile(file)
-    except _FirstElement:
+    except _ElementReachedError:
         return
     except expat.ExpatError:
         return  # meshio reports the error

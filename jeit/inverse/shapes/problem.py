@@ -137,7 +137,7 @@ class MovedElectrodes(OtherChanges):
 
 
 def _channels_of(protocol: Protocol, impedances: Float[np.ndarray, "n L L"]) -> Float[np.ndarray, "M n"]:
-    """Voltages (M, n) of the channels of a protocol for each of n transfer impedances."""
+    """Voltages (M, n) of the channels of a protocol for each of n matrices (L, L) of transfer impedances."""
     protocol = on_host(protocol)
     return np.stack([np.asarray(select_channels(protocol, impedance)) for impedance in impedances], axis=1)
 

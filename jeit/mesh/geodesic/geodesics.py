@@ -320,8 +320,9 @@ def _distances_across(start, end, side, x, y, *, same_source: Any = True, curvat
 
 
 def _virtual_source(start, end, side):
-    """Virtual source of a wave with known distances at the start and the end of a side: its coordinate along the side,
-    its distance behind the side, and the square of this distance, which is negative for incompatible distances."""
+    """Point source of a wave that has known distances from the start and the end of a side of a triangle: its
+    coordinate along the side, its distance from the line of the side, and the square of this distance, which is
+    negative if no point in the plane has both distances."""
     source_x = (start**2 - end**2 + side**2) / (2 * side)
     squared_depth = start**2 - source_x**2
     return source_x, np.sqrt(np.maximum(squared_depth, 0.0)), squared_depth
