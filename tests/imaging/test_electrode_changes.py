@@ -272,6 +272,19 @@ def test_a_strong_body_is_outlined_although_electrodes_have_moved():
     assert result.shapes is not None
 
 
+@pytest.mark.slow
+def test_one_body_is_preferred_to_several_that_explain_as_much():
+    """Without six of the electrodes, bodies that are all fitted at once explain the voltages of a narrow one, too."""
+    measured, reference = (
+        replace(one, mask=~np.any([PROTOCOL.channels_touching(electrode) for electrode in range(6)], axis=0)[None])
+        for one in (frame("narrow"), frame("none", 0.0, seed=2))
+    )
+    result = image_difference(measured, reference, ImagingSettings(num_points=600))
+    assert result.shapes is not None
+    (body,) = result.inclusions
+    assert np.linalg.norm(np.array(body.centroid) - NARROW[:2]) < NARROW[2]
+
+
 def test_an_implausible_displacement_of_one_electrode_is_not_taken_for_it():
     prepared = prepare_difference(frame("none", 1.0), frame("none", 0.0, seed=2), num_points=600, as_is=True)
     changes = prepared.electrode_changes
