@@ -28,13 +28,14 @@ class ShapeReconstruction(Module):
 
     **Fields**: `bodies`: `Star`s in a sheet, `Ellipsoid`s in a solid, in descending order of `rise`; `conductivity`
     (m,): S/m (2-D: S), in partly covered cells of a solid the geometric mean of body and bath; `voltages` (M,):
-    voltages predicted for the bodies; `misfit`: root mean square of predicted - measured voltages over the channels
-    used, in standard deviations; `drift`: relative difference of the bath's conductivity from `background`; `doubtful`:
-    bodies that were removed because their `rise` is too small; `contrast_deviations`: standard deviation of each body's
-    contrast in log σ, due to noise and to the mesh (the mesh contributes 0.03, in solids 0.1); `alternatives`: for each
-    body of a solid, the body of the other kind (ellipsoid or column) if the data do not determine the kind, else None;
-    `alternative_deviations`: standard deviations of the contrasts of the alternatives, or NaN; `finer`: for a solid
-    with bodies, the conductivity on the last refined mesh, for display.
+    voltages predicted for the bodies and for other changes besides them, such as moved electrodes; `misfit`: root mean
+    square of predicted - measured voltages over the channels used, in standard deviations; `drift`: relative difference
+    of the bath's conductivity from `background`; `doubtful`: bodies that were removed because their `rise` is too
+    small; `contrast_deviations`: standard deviation of each body's contrast in log σ, due to noise and to the mesh (the
+    mesh contributes 0.03, in solids 0.1); `alternatives`: for each body of a solid, the body of the other kind
+    (ellipsoid or column) if the data do not determine the kind, else None; `alternative_deviations`: standard
+    deviations of the contrasts of the alternatives, or NaN; `finer`: for a solid with bodies, the conductivity on the
+    last refined mesh, for display.
 
     **Example:**
 

@@ -198,11 +198,12 @@ class ConductivityView(AbstractView):
         check_kind("imager", imager, Imager, "an Imager, as of prepare_imager(reference)[0]")
         check_kind("calibration", calibration, Calibration, "a Calibration, as of prepare_imager(reference)[1]")
         model = calibration.model
-        self.imager, self.calibration, self.as_is = imager, calibration, as_is
+        self.imager, self.calibration = imager, calibration
         self.background = float(calibration.conductivity)
         self.grid = PixelGrid(model.mesh)
         self._strongest = StrongestRegion(model.mesh)
-        self._state, self._electrode_changes = StreamState(imager), ElectrodeChangeFilter(imager, calibration)
+        self._state = StreamState(imager)
+        self._electrode_changes = None if as_is else ElectrodeChangeFilter(imager, calibration)
         is_plane = model.mesh.dimension == 2
         self.scene = create_scene(
             model.mesh,
@@ -236,8 +237,10 @@ class ConductivityView(AbstractView):
     def picture(self, frame: LiveFrame) -> Picture:
         """Compute the image of a frame without the effect of moved electrodes; see `AbstractView.picture`. A search for
         moved electrodes takes up to a second."""
-        rest, change = (frame.values, None) if self.as_is else self._electrode_changes.rest(self._state, frame.values)
-        picture = self.image(replace(frame, values=rest))[1]
+        electrode_changes, values, change = self._electrode_changes, frame.values, None
+        if electrode_changes is not None:
+            values, change = electrode_changes.rest(self._state, values)
+        picture = self.image(replace(frame, values=values))[1]
         if change is None:
             return picture
         event = (
@@ -263,7 +266,8 @@ class ConductivityView(AbstractView):
         images."""
         self.imager = self.imager.with_reference(mean_frame(frames))
         self._state = StreamState(self.imager)
-        self._electrode_changes = ElectrodeChangeFilter(self.imager, self.calibration)
+        if self._electrode_changes is not None:
+            self._electrode_changes = ElectrodeChangeFilter(self.imager, self.calibration)
 
 
 def mean_frame(frames: Float[np.ndarray, "N M"]) -> Float[np.ndarray, " M"]:
