@@ -261,6 +261,8 @@ def test_a_live_picture_leaves_out_what_moved_electrodes_explain():
     np.testing.assert_array_equal(view.image(moved)[1].pixels, picture_as_is.pixels)
     view.set_reference(moved.values[None])
     assert view.picture(moved).status == "unchanged"
+    moved_back = view.picture(replace(moved, values=np.asarray(frame("none", 0.0, seed=2).voltages)[0]))
+    assert len(moved_back.events) == 1  # movement since the new reference is a new event
     assert view.picture(replace(moved, values="no numbers")).pixels is None
 
 
