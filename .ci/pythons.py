@@ -139,11 +139,15 @@ def fill(made: Row, wheel: Path, uv: Path, *, whole: bool, tested: bool) -> None
 
 
 def alone(extra: str, wheel: Path, uv: Path, python: str) -> list[tuple]:
-    """Return the commands that install one extra into its own environment and check that its packages are there."""
+    """Return the commands that leave one extra alone in an environment and check that its packages are there.
+
+    The environment is used again for the next extra, whose installation removes what it does not need: the modules of
+    JAX are compiled once.
+    """
     its_own = Path("alone") / "bin" / "python"
     return [
-        (uv, "venv", "--quiet", "--clear", "--python", python, "alone"),
-        (uv, "pip", "install", "--quiet", "--python", its_own, f"{wheel}[{extra}]"),
+        (uv, "venv", "--quiet", "--allow-existing", "--python", python, "alone"),
+        (uv, "pip", "install", "--quiet", "--exact", "--python", its_own, f"{wheel}[{extra}]"),
         (uv, "pip", "check", "--quiet", "--python", its_own),
         (its_own, "-c", IMPORT_EXTRA, extra),
     ]
