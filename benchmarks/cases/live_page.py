@@ -41,6 +41,7 @@ def run(options: Options) -> Result:
     if program is None:
         return Result([], notes=[f"A browser is needed: {', '.join(BROWSERS)}."])
     rows, asked = [], []
+    window, samples = (1.0, 1) if options.quick else (WINDOW, 6)
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=program, args=["--no-sandbox"])
         for name, solver in (("linear", "one-step"), ("Gauss-Newton", "gauss-newton")):
@@ -50,7 +51,7 @@ def run(options: Options) -> Result:
                 for width, height in SIZES[: 1 if options.quick else None]:
                     page = browser.new_page(viewport={"width": width, "height": height})
                     page.goto(address)
-                    found = np.array([_sample(page) for _ in range(1 if options.quick else 6)])
+                    found = np.array([_sample(page, window) for _ in range(samples)])
                     page.close()
                     median, high = np.median(found[:, 0]), np.max(found[:, 1])
                     drawn, state = np.mean(found[:, 2]), session.state()
@@ -66,9 +67,9 @@ def run(options: Options) -> Result:
     return Result([Table(header, rows, f"16 electrodes, 208 voltages, {RATE:g} frames/s")], asked)
 
 
-def _sample(page) -> list[float]:
-    """Median and 99th percentile of latency, and pictures drawn per second, of the next ten seconds."""
-    time.sleep(WINDOW + 1.0)
+def _sample(page, window: float) -> list[float]:
+    """Median and 99th percentile of latency, and pictures drawn per second, of the next `window` ≤ 10 seconds."""
+    time.sleep(window + 1.0)
     latency = page.locator("#latency")
     times = [float(latency.get_attribute(f"data-{name}")) for name in ("median", "worst")]
     return [*times, float(page.inner_text("#drawn").split()[0])]

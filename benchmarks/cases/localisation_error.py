@@ -34,15 +34,15 @@ CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 0.1
 METHODS = ("consistency", "likelihood")
 
 
-def calibrated(skin, given=None):
-    """The calibration of a skin from taps. `given`: stated positions (microphones, 2) in metres, by default the true
-    positions.
+def calibrated(skin, given=None, taps: int = 13):
+    """The calibration of a skin from a grid of `taps` × `taps` taps. `given`: stated positions (microphones, 2) in
+    metres, by default the true positions.
     """
 
-    sound = simulate_calibration_taps(skin, jax.random.key(1), grid(0.18, 0.18, 13, 13))
+    sound = simulate_calibration_taps(skin, jax.random.key(1), grid(0.18, 0.18, taps, taps))
     array = np.asarray(skin.microphones) if given is None else given
-    taps = Taps(array, CORNERS, sound.positions, samples=sound.samples, rate=sound.rate)
-    return calibrate_microphones(taps).calibration
+    tapped = Taps(array, CORNERS, sound.positions, samples=sound.samples, rate=sound.rate)
+    return calibrate_microphones(tapped).calibration
 
 
 def averaged_intensities(skin, places, bursts: int):
@@ -134,7 +134,7 @@ def microphone_table(sides, number: int) -> Table:
     return Table(["microphones", "paper's loss, mm", "likelihood, mm", "in the 95 % ellipse"], rows)
 
 
-def change_table(changes, number: int) -> Table:
+def change_table(changes, number: int, taps: int) -> Table:
     """A table of the errors with ten bursts at each position, located with the defaults, after changes of microphone
     positions and gains."""
     header = ["microphones off, mm", "gains changed, %", "median, mm", "greatest, mm", "in the 95 % ellipse"]
@@ -147,7 +147,7 @@ def change_table(changes, number: int) -> Table:
         recorded = Intensities(
             np.arange(len(places)), power * factor, floor=floor * factor, freedom=freedom, usable=usable
         )
-        found = locate(recorded, calibrated(skin, given))
+        found = locate(recorded, calibrated(skin, given, taps))
         off = found.position - places
         length = 1e3 * np.linalg.norm(off, axis=1)
         square = np.einsum("fi,fij,fj->f", off, np.linalg.inv(found.covariance), off)
@@ -174,10 +174,11 @@ def run(options: Options) -> Result:
     """Compute the tables and, if an output folder is given, draw the curve."""
     quick, skin = options.quick, SoundingSkin(jax.random.key(0))
     number, ratios, sides, bursts = (4, (20,), (0.15,), 1) if quick else (13, RATIOS, (0.15, 0.18), 10)
-    calibration = calibrated(skin)
+    taps = 7 if quick else 13
+    calibration = calibrated(skin, taps=taps)
     paper, off = paper_table(skin, calibration, number, sides, bursts)
     against, curve, bounds = ratio_table(skin, calibration, ratios, number)
-    tables = [paper, against, change_table(CHANGES[2:3] if quick else CHANGES, number)]
+    tables = [paper, against, change_table(CHANGES[2:3] if quick else CHANGES, number, taps)]
     if not quick:
         tables.insert(2, microphone_table((2, 3, 4, 5), number))
     if options.output is not None:

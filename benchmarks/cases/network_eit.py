@@ -36,7 +36,7 @@ SHAPE = (48, 48)
 # Factors by which the λ chosen by the noise figure is multiplied.
 WEIGHTS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 # Training of a smoke run, whose figures are not judged.
-_SMALL = NetworkPreset(64, 20, TrainingPlan(rate=2e-3, batch=32, epochs=2, patience=2, decay=0.8))
+_SMALL = NetworkPreset(64, 20, TrainingPlan(rate=2e-3, batch=32, epochs=1, patience=1, decay=0.8))
 ASKED_MEAN, ASKED_RATIO, ASKED_FRAME, ASKED_EACH = 4.2e-3, 0.8, 16.7e-3, 0.2e-3
 Maps = Callable[[np.ndarray], np.ndarray]
 
