@@ -9,7 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import scipy.io.wavfile
-from readers import BODY, READERS, Reader, struck
+from readers import BODY, READERS, Reader  # first: it adds folders of other tests to the path
+
+from made_clips import struck  # isort: skip
 
 from jeit.cli import main
 
