@@ -63,6 +63,8 @@ JOBS = {
         60.0,
     ),
 }
+# The jobs of a smoke run.
+QUICK_JOBS = ("one step, NOSER", "GREIT", "total variation, with error bars")
 _MEMORY = 2048.0
 
 
@@ -72,7 +74,7 @@ def run(options: Options) -> Result:
     """
     rows, checks, wrong = [], [], []
     for nodes in options.nodes or (800 if options.quick else 20_000,):
-        for name in JOBS if nodes <= LARGE else AT_LARGE:
+        for name in QUICK_JOBS if options.quick else JOBS if nodes <= LARGE else AT_LARGE:
             script, most = JOBS[name]
             text = _SETUP.replace("{nodes}", str(nodes)) + script + _DONE
             done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=LIMIT)
