@@ -39,7 +39,7 @@ def small_maps():
     """Maps with half the usual numbers of rows and columns, bodies of one kind, and one program for touches of all
     sizes, to limit compilation."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learn, "SHAPE", SHAPE)
+        patch.setattr(learn, "DEPTH_MAP_SHAPE", SHAPE)
         patch.setattr(learn, "_PLACES_PER_SIDE", 5)
         patch.setattr(linear_channels, "_PLACES_PER_SIDE", 5)
         patch.setattr(linear_channels, "_MAX_BODIES", 1)

@@ -182,10 +182,12 @@ def test_entries_reported_as_damaged_are_discarded(tmp_path, monkeypatch):
     before = jax.config.jax_compilation_cache_dir
     try:
         jax.config.update("jax_compilation_cache_dir", str(tmp_path / "another"))
-        assert not jax_setup.discarded_damaged(warning)
+        assert not jax_setup.discard_damaged_cache_files(warning)
         jax.config.update("jax_compilation_cache_dir", str(folder))
-        assert not jax_setup.discarded_damaged("Error writing persistent compilation cache entry for 'jit_stage'")
-        assert jax_setup.discarded_damaged(warning)
+        assert not jax_setup.discard_damaged_cache_files(
+            "Error writing persistent compilation cache entry for 'jit_stage'"
+        )
+        assert jax_setup.discard_damaged_cache_files(warning)
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
     assert [path.name for path in folder.iterdir()] == ["jit_stages-1-cache"]

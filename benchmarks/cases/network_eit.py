@@ -26,7 +26,7 @@ from jeit.design import Skin
 from jeit.inverse import Gaussian, Laplace, one_step
 from jeit.inverse.streaming.imager import Imager
 from jeit.mesh import centroids
-from jeit.touch.networks import DESIGNS, PRESETS, ImageNetwork, NetworkPreset, learn_images, read_network
+from jeit.touch.networks import NETWORK_DESIGNS, PRESETS, ImageNetwork, NetworkPreset, learn_images, read_network
 from jeit.touch.networks.linear_channels import deepest_positions, depth_centroids, detection_noise, error_statistics
 from jeit.touch.simulate import depth_maps
 from jeit.touch.simulate.contact.indent_sets import image_places
@@ -129,7 +129,7 @@ _SPREADS = (
 def _networks(options: Options, nominal_skin: Skin, quick: bool) -> dict[str, ImageNetwork]:
     """One network of each design, read from a file if it exists, otherwise trained."""
     found = {}
-    for design in DESIGNS:
+    for design in NETWORK_DESIGNS:
         own = None if options.data is None else options.data / design
         if own is not None and own.is_dir() and not quick:
             found[design] = read_network(own, skin=nominal_skin)

@@ -123,7 +123,9 @@ def breakdown(imager) -> list[tuple[str, float, float]]:
     start, mesh = imager.start, model.mesh
     conductivity = inversion.conductivity(start)
     contact = model.electrodes.contact(mesh)
-    operator, load = model.system.grounded(mesh, cell_conductivity(mesh, conductivity), model.electrodes, contact)
+    operator, load = model.system.grounded_system(
+        mesh, cell_conductivity(mesh, conductivity), model.electrodes, contact
+    )
     plan = model.system.solver.plan
     factor = factorise(plan, operator.values)
     residual, jacobian = jax.jit(type(inversion).linearise)(inversion, start)

@@ -91,7 +91,7 @@ def _problem(body: str, count: int) -> dict[str, np.ndarray]:
     system = System.create(mesh, electrodes, "cg")
     rng, contact = np.random.default_rng(0), on_host(electrodes.contact(mesh))
     made = [
-        on_host(system.grounded(on_host(mesh), 10.0 ** rng.uniform(-1, 1, mesh.num_cells), electrodes, contact))
+        on_host(system.grounded_system(on_host(mesh), 10.0 ** rng.uniform(-1, 1, mesh.num_cells), electrodes, contact))
         for _ in range(2)
     ]
     return {

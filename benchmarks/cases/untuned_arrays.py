@@ -16,7 +16,7 @@ from benchmarks.harness.timing import say
 from benchmarks.problems.located_arrays import Located, located_by_each, plainly_located
 from benchmarks.problems.simulated_arrays import REPORTED, draw_array, steep_array
 from jeit.acoustic.calibration.calibrate import AUTO
-from jeit.acoustic.decay import DECAYS
+from jeit.acoustic.decay import DECAY_MODELS
 
 # Seed of the first array, and number of arrays.
 SEED, ARRAYS = 70_000, 200
@@ -25,7 +25,7 @@ SEED, ARRAYS = 70_000, 200
 WITHIN, WORSE = 0.01, 0.1
 LENGTHS = (0.035, 0.05, 0.065, 0.08)
 PLAIN = "plain fit"
-NAMES = (PLAIN, *DECAYS, AUTO)
+NAMES = (PLAIN, *DECAY_MODELS, AUTO)
 
 
 def locate_by_each(array) -> dict[str, Located]:
@@ -42,7 +42,7 @@ def arrays_table(found: list[dict[str, Located]]) -> Table:
     """A table with a row for each method: refused arrays, errors, and coverage of ellipses among located touches."""
     header = ["decay model", "refused", "of those the plain fit locates", "median, mm", "9 of 10 arrays, mm", "best"]
     header += ["in the 68 % ellipse", "in the 95 % ellipse", "silence taken for touch"]
-    least = np.min([medians(found, name) for name in DECAYS], axis=0)
+    least = np.min([medians(found, name) for name in DECAY_MODELS], axis=0)
     plain = medians(found, PLAIN) < WITHIN
     rows = []
     for name in NAMES:
@@ -90,7 +90,7 @@ def asked(found: list[dict[str, Located]]) -> list[Asked]:
     best fixed model."""
     lost = sum(bool(one[AUTO].message) and one[PLAIN].median < WITHIN for one in found)
     mine = np.median(medians(found, AUTO))
-    fixed = {name: float(np.median(medians(found, name))) for name in DECAYS}
+    fixed = {name: float(np.median(medians(found, name))) for name in DECAY_MODELS}
     best = min(fixed, key=lambda name: fixed[name])
     beside = f"{1e3 * mine:.2f} mm; {best} {1e3 * fixed[best]:.2f} mm"
     return [

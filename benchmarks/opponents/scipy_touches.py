@@ -22,7 +22,7 @@ class PlainTouches:
 
         mesh = model.mesh
         contact = model.electrodes.contact(mesh)
-        operator, load = model.system.grounded(mesh, conductivity, model.electrodes, contact)
+        operator, load = model.system.grounded_system(mesh, conductivity, model.electrodes, contact)
         self.load = np.asarray(load)
         self.cells = np.asarray(mesh.cells)
         packed = np.asarray(stiffness(mesh, conductivity))

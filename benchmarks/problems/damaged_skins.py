@@ -25,7 +25,7 @@ from jeit.touch import CellFinder, SkinHealth, find_contacts
 from jeit.touch.simulate import DiscIndenter, Press, PressDraws, PressedSkin, ball_indenter, material
 from jeit.touch.simulate.damage import Cut, ElectrodeFault, draw_cut, mend_cut
 
-RATE, PATIENCE = 5.0, 30.0
+RATE, DEFAULT_PATIENCE = 5.0, 30.0
 # Fractions of the load during onset and release of a touch; median in seconds of the duration of a touch, and standard
 # deviation of its logarithm; minimum and maximum pause between touches in seconds.
 RISE, LASTS, BETWEEN = (0.25, 0.6, 1.0), (1.5, 0.5), (1.0, 8.0)
@@ -105,7 +105,7 @@ class DamagedSkin:
         seconds = np.arange(0, 120, 1 / RATE)
         frames = self.read(self.skin, 2, seconds, self.touches)
         sign = -1 if self.name == "park" else 1
-        options = {"model": self.image_model, "conductivity": self.sheet, "sign": sign, "patience": PATIENCE}
+        options = {"model": self.image_model, "conductivity": self.sheet, "sign": sign, "patience": DEFAULT_PATIENCE}
         return SkinHealth.fit(frames, seconds, **options)
 
     def read(

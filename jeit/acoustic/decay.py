@@ -213,7 +213,7 @@ def _stack_logarithms(*parameters: Float[Array, " M"]) -> Float[Array, "K M"]:
     return xp.log(xp.stack(parameters))
 
 
-DECAYS: dict[str, type[AbstractDecay]] = {
+DECAY_MODELS: dict[str, type[AbstractDecay]] = {
     kind.name: kind for kind in (InverseSquare, Exponential, AttenuatedInverseSquare)
 }
 
@@ -223,5 +223,5 @@ def find_decay(name: str | type[AbstractDecay]) -> type[AbstractDecay]:
     given as `name` is returned unchanged. Raises `ValueError` for an unknown name."""
     if isinstance(name, type) and issubclass(name, AbstractDecay):
         return name
-    check_name("decay", name, DECAYS, ", a class like theirs, or 'auto'")
-    return DECAYS[str(name)]
+    check_name("decay", name, DECAY_MODELS, ", a class like theirs, or 'auto'")
+    return DECAY_MODELS[str(name)]

@@ -32,7 +32,7 @@ from jeit_solvers.module import Module
 MIN_RELATIVE_ERROR = 1e-3
 # Minimum noise floor in standard deviations of the noise, which keeps the argument of the logarithm positive if no
 # floor is known.
-_FLOOR_DEVIATIONS = 4.0
+_MIN_NOISE_FLOOR_DEVIATIONS = 4.0
 
 
 class IntensityNoise(Module):
@@ -66,7 +66,7 @@ class IntensityNoise(Module):
         if deviation is not None:
             deviations = np.maximum(deviations, np.broadcast_to(np.asarray(deviation, float), (num_microphones,)))
         floor, bounded_errors = (
-            np.maximum(floors, _FLOOR_DEVIATIONS * deviations),
+            np.maximum(floors, _MIN_NOISE_FLOOR_DEVIATIONS * deviations),
             np.maximum(errors, MIN_RELATIVE_ERROR),
         )
         return cls(*(as_array(values) for values in (floor, deviations, 4 * floors / degrees, bounded_errors)))

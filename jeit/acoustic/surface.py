@@ -23,7 +23,7 @@ from jeit_solvers.module import Module
 _MAX_KNOTS = 300
 # Distance in the best plane below which points are at one place, and difference of the heights of such points from
 # their mean above which the surface folds, relative to the extent of the points.
-_SAME_PLACE, _FOLD_HEIGHT = 1e-3, 0.01
+_MIN_KNOT_DISTANCE, _FOLD_HEIGHT_DIFFERENCE = 1e-3, 0.01
 
 
 class AbstractSurface(Module):
@@ -181,30 +181,32 @@ def _curved_surface(vertices: np.ndarray, points_on_surface: np.ndarray) -> Curv
     normal = directions[2] * (1.0 if directions[2][np.argmax(np.abs(directions[2]))] > 0 else -1.0)
     # The first axis of the chart is the projection of the coordinate axis that is most nearly parallel to the
     # best-fitting plane.
-    leading_axis = np.eye(3)[np.argmin(np.abs(normal) + np.array([0.0, 1e-3, 2e-3]))]
-    first_axis = leading_axis - normal * (normal @ leading_axis)
+    least_aligned_axis = np.eye(3)[np.argmin(np.abs(normal) + np.array([0.0, 1e-3, 2e-3]))]
+    first_axis = least_aligned_axis - normal * (normal @ least_aligned_axis)
     first_axis /= np.linalg.norm(first_axis)
     axes = np.stack([first_axis, np.cross(normal, first_axis)], axis=1)
     chart, height = (points_on_surface - origin) @ axes, (points_on_surface - origin) @ normal
     scale = np.ptp(chart, axis=0).max()
-    knots = chart[_farthest_points(chart, _MAX_KNOTS, _SAME_PLACE * scale)]
+    knots = chart[_farthest_points(chart, _MAX_KNOTS, _MIN_KNOT_DISTANCE * scale)]
     distance, knot_index = KDTree(knots).query(chart)
-    is_at_knot = distance <= _SAME_PLACE * scale
-    knot_index, height_at_knot = knot_index[is_at_knot], height[is_at_knot]
+    is_same_as_knot = distance <= _MIN_KNOT_DISTANCE * scale
+    knot_index, height_at_knot = knot_index[is_same_as_knot], height[is_same_as_knot]
     # A place that was touched several times has the mean height.
     knot_height = np.bincount(knot_index, height_at_knot) / np.bincount(knot_index)
-    if (np.abs(height_at_knot - knot_height[knot_index]) > _FOLD_HEIGHT * scale).any():
+    if (np.abs(height_at_knot - knot_height[knot_index]) > _FOLD_HEIGHT_DIFFERENCE * scale).any():
         raise ValueError(
             "positions: the surface folds over its best plane (two points lie above each other), which jeit cannot "
             "chart; calibrate its parts one by one."
         )
     chart, height = knots, knot_height
     squared = np.sum((chart[:, None] - chart) ** 2, axis=-1)
-    kernel = _thin_plate(squared)
+    spline_kernel = _thin_plate(squared)
     polynomial = np.column_stack([np.ones(len(chart)), chart])
     # The spline is slightly smoothed, so that small errors of the points, a fraction of a per cent, do not make the
     # surface wavy.
-    system = np.block([[kernel + 1e-9 * scale**2 * np.eye(len(chart)), polynomial], [polynomial.T, np.zeros((3, 3))]])
+    system = np.block(
+        [[spline_kernel + 1e-9 * scale**2 * np.eye(len(chart)), polynomial], [polynomial.T, np.zeros((3, 3))]]
+    )
     solution = np.linalg.lstsq(system, np.concatenate([height, np.zeros(3)]), rcond=None)[0]
     arrays = (origin, axes, normal, chart, solution[:-3], solution[-3:])
     return CurvedSurface(Polygon((vertices - origin) @ axes), *(as_array(array) for array in arrays))

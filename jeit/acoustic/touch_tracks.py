@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from scipy.special import chdtri
 
 from jeit.acoustic.calibration.calibration import Calibration, calibrated_intensities
-from jeit.acoustic.localisation.locate import GAIN_DRIFT, locate
+from jeit.acoustic.localisation.locate import GAIN_DRIFT_DEVIATION, locate
 from jeit.acoustic.localisation.locations import MAX_NUMPY_FRAMES, Locations
 from jeit.acoustic.signal.intensity import IntensitySettings
 from jeit.acoustic.signal.recording import Intensities, Recording
@@ -27,11 +27,11 @@ from jeit_solvers.engines import evaluate_in_numpy, namespace, scan
 from jeit_solvers.module import Module
 
 # Candidate spectral densities of acceleration in m²/s³, from a finger at rest to a finger that moves violently.
-_DENSITIES = np.geomspace(1e-5, 10.0, 13)
+_ACCELERATION_SPECTRAL_DENSITIES = np.geomspace(1e-5, 10.0, 13)
 # Probability that a correct position is rejected as too far from the filter's prediction.
-_FALSE_REJECTION = 1e-4
+_FALSE_REJECTION_PROBABILITY = 1e-4
 # Standard deviation of each component of the initial velocity of a touch, in m/s.
-_INITIAL_SPEED = 0.5
+_INITIAL_SPEED_DEVIATION = 0.5
 # Rows and columns of the map on which the consistency loss is minimised, as in Park 2022.
 _MAP_SHAPE = (200, 200)
 
@@ -98,7 +98,7 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
     position, velocity = np.full((num_frames, dimension), np.nan), np.full((num_frames, dimension), np.nan)
     covariance, is_rejected = np.full((num_frames, dimension, dimension), np.nan), np.zeros(num_frames, bool)
     intervals = _touch_intervals(times, has_position, gap)
-    densities = _DENSITIES if acceleration is None else np.array([acceleration])
+    spectral_densities = _ACCELERATION_SPECTRAL_DENSITIES if acceleration is None else np.array([acceleration])
     touches = []
     for first_frame, last_frame in intervals:
         touch_frames = slice(first_frame, last_frame + 1)
@@ -112,7 +112,7 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
         measured_covariance = measured_covariance + 1e-14 * np.eye(dimension)
         time_steps = np.diff(times[touch_frames], prepend=times[first_frame])
         states, errors, is_accepted = _smooth_touch(
-            time_steps, measured, measured_covariance, has_position[touch_frames], densities
+            time_steps, measured, measured_covariance, has_position[touch_frames], spectral_densities
         )
         position[touch_frames], velocity[touch_frames] = states[:, :dimension], states[:, dimension:]
         covariance[touch_frames] = errors[:, :dimension, :dimension]
@@ -141,12 +141,12 @@ def _touch_intervals(times, has_position, gap: float) -> list[tuple[int, int]]:
     ]
 
 
-def _smooth_touch(time_steps, measured, covariances, has_position, densities) -> tuple[np.ndarray, ...]:
+def _smooth_touch(time_steps, measured, covariances, has_position, spectral_densities) -> tuple[np.ndarray, ...]:
     """Call `_smooth_positions` with NumPy for a touch with few frames. Otherwise compile the function, with the number
     of frames padded to a power of two."""
     num_frames, dimension = measured.shape
     if num_frames <= MAX_NUMPY_FRAMES:
-        return evaluate_in_numpy(_smooth_positions, time_steps, measured, covariances, has_position, densities)
+        return evaluate_in_numpy(_smooth_positions, time_steps, measured, covariances, has_position, spectral_densities)
     padding = (1 << (num_frames - 1).bit_length()) - num_frames
     arrays = (
         np.pad(time_steps, (0, padding)),
@@ -154,17 +154,19 @@ def _smooth_touch(time_steps, measured, covariances, has_position, densities) ->
         np.concatenate([covariances, np.broadcast_to(np.eye(dimension), (padding, dimension, dimension))]),
         np.pad(has_position, (0, padding)),
     )
-    return tuple(np.asarray(array)[:num_frames] for array in jax.jit(_smooth_positions)(*arrays, densities))
+    return tuple(np.asarray(array)[:num_frames] for array in jax.jit(_smooth_positions)(*arrays, spectral_densities))
 
 
-def _smooth_positions(time_steps, measured, measured_covariance, has_position, densities):
-    """Smooth the positions of one touch with n frames, for the most likely of the spectral `densities` of acceleration.
+def _smooth_positions(time_steps, measured, measured_covariance, has_position, spectral_densities):
+    """Smooth the positions of one touch with n frames, for the most likely of the `spectral_densities` of acceleration.
 
     Returns the states (n, 2 d), position and velocity; the covariances of the states (n, 2 d, 2 d); and the mask (n,)
     of accepted positions.
     """
     xp, dimension = namespace(measured), measured.shape[1]
-    log_likelihoods, filtered = _kalman_filter(time_steps, measured, measured_covariance, has_position, densities)
+    log_likelihoods, filtered = _kalman_filter(
+        time_steps, measured, measured_covariance, has_position, spectral_densities
+    )
     best_index = xp.argmax(log_likelihoods)
     mean, covariance, predicted_mean, predicted_covariance, is_accepted = (array[:, best_index] for array in filtered)
 
@@ -187,22 +189,23 @@ def _smooth_positions(time_steps, measured, measured_covariance, has_position, d
     return means, covariances, is_accepted
 
 
-def _kalman_filter(step, measured, measured_covariance, has_position, densities):
+def _kalman_filter(time_step, measured, measured_covariance, has_position, spectral_densities):
     """Run the Kalman filter over the positions of one touch for Q spectral densities of acceleration at once.
 
     Returns the log-likelihood (Q,) of each density; and for every frame and density the filtered mean and covariance of
     the state (position and velocity), the predicted mean and covariance, and whether the position was accepted.
     """
     xp, dimension = namespace(measured), measured.shape[1]
-    max_distance = float(chdtri(dimension, _FALSE_REJECTION))
+    max_distance = float(chdtri(dimension, _FALSE_REJECTION_PROBABILITY))
 
     def filter_step(state, frame_data):
         mean, covariance = state
-        step, position, measured_covariance, is_measured = frame_data
-        transition = _transition_matrix(step, dimension)
+        time_step, position, measured_covariance, is_measured = frame_data
+        transition = _transition_matrix(time_step, dimension)
         mean, covariance = (
             mean @ transition.T,
-            transition @ covariance @ transition.T + densities[:, None, None] * _process_noise(step, dimension),
+            transition @ covariance @ transition.T
+            + spectral_densities[:, None, None] * _process_noise(time_step, dimension),
         )
         innovation, innovation_covariance = (
             position - mean[:, :dimension],
@@ -232,23 +235,23 @@ def _kalman_filter(step, measured, measured_covariance, has_position, densities)
 
     initial_mean = xp.concatenate([measured[0], xp.zeros(dimension)])
     initial_variances = xp.concatenate(
-        [1e4 * xp.trace(measured_covariance[0]) * xp.ones(dimension), xp.full(dimension, _INITIAL_SPEED**2)]
+        [1e4 * xp.trace(measured_covariance[0]) * xp.ones(dimension), xp.full(dimension, _INITIAL_SPEED_DEVIATION**2)]
     )
-    num_densities = len(densities)
+    num_densities = len(spectral_densities)
     initial_state = (
         xp.tile(initial_mean, (num_densities, 1)),
         xp.tile(xp.diag(initial_variances), (num_densities, 1, 1)),
     )
     _, (log_likelihoods, *filtered) = scan(
-        filter_step, initial_state, (step, measured, measured_covariance, has_position)
+        filter_step, initial_state, (time_step, measured, measured_covariance, has_position)
     )
     return xp.sum(log_likelihoods, axis=0), filtered
 
 
-def _transition_matrix(step, dimension: int) -> Float[Array, "s s"]:
-    """Transition matrix (2 d, 2 d) of position and velocity for a time step of `step` seconds."""
-    xp = namespace(step)
-    return xp.kron(xp.eye(2) + step * xp.eye(2, k=1), xp.eye(dimension))
+def _transition_matrix(time_step, dimension: int) -> Float[Array, "s s"]:
+    """Transition matrix (2 d, 2 d) of position and velocity for a time step of `time_step` seconds."""
+    xp = namespace(time_step)
+    return xp.kron(xp.eye(2) + time_step * xp.eye(2, k=1), xp.eye(dimension))
 
 
 def _process_noise(step, dimension: int) -> Float[Array, "s s"]:
@@ -287,7 +290,7 @@ def locate_touches(
     gap: float = 0.15,
     intensity: IntensitySettings | None = None,
     silence: Recording | None = None,
-    gain_drift: float = GAIN_DRIFT,
+    gain_drift: float = GAIN_DRIFT_DEVIATION,
     progress: Callable[[str], None] | None = None,
 ) -> LocatedTouches:
     """Locate every touch in a recording of microphones, as the command `jeit locate` does.

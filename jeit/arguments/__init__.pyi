@@ -1,5 +1,5 @@
 from .checks import (
-    IN_MILLIMETRES,
+    MILLIMETRE_HINT,
     check_has_values,
     check_key,
     check_kind,
@@ -21,7 +21,7 @@ from .checks import (
 )
 
 __all__ = [
-    "IN_MILLIMETRES",
+    "MILLIMETRE_HINT",
     "check_has_values",
     "check_key",
     "check_kind",

@@ -17,7 +17,7 @@ from jeit_solvers.engines import has_values
 
 # Types whose values are shown in error messages (of other values, only the type is shown), and maximum number of
 # characters of a value.
-_SHOWN_TYPES, _MAX_TEXT = (str, bytes, int, float, complex, type(None)), 60
+_SHOWN_TYPES, _MAX_SHOWN_TEXT_LENGTH = (str, bytes, int, float, complex, type(None)), 60
 
 
 def check_kind(name: str, value: Any, kind: type | tuple[type, ...], expected: str) -> None:
@@ -45,7 +45,7 @@ def describe(value: Any) -> str:
         except ValueError:
             # An integer with more digits than Python converts to text.
             return "a number without end"
-        return text if len(text) <= _MAX_TEXT else f"{text[: _MAX_TEXT - 1]}…"
+        return text if len(text) <= _MAX_SHOWN_TEXT_LENGTH else f"{text[: _MAX_SHOWN_TEXT_LENGTH - 1]}…"
     if isinstance(item, type):
         return f"the class {item.__name__} itself"
     name = type(item).__name__
@@ -119,13 +119,13 @@ def interval_text(interval: Interval, format_end: Callable[[float], str]) -> str
 
 
 # Maximum reading of any instrument, in volts or fractions of volts; squares of such numbers do not overflow.
-_MAX_READING = 1e12
+_MAX_PLAUSIBLE_READING = 1e12
 
 
 def measurable_values(values: np.ndarray) -> np.ndarray:
     """Replace values that no instrument can measure by NaN: infinite values, and absolute values above 1e12."""
     with np.errstate(invalid="ignore", over="ignore"):
-        return np.where(np.abs(values) <= _MAX_READING, values, np.nan)
+        return np.where(np.abs(values) <= _MAX_PLAUSIBLE_READING, values, np.nan)
 
 
 def check_key(key: Any, name: str = "key") -> None:
@@ -139,7 +139,7 @@ def check_key(key: Any, name: str = "key") -> None:
     raise ValueError(f"{name} must be one random key, such as jax.random.key({seed}); it is {describe(key)}.")
 
 
-IN_MILLIMETRES = "were millimetres given for metres?"
+MILLIMETRE_HINT = "were millimetres given for metres?"
 """Question to append to a message about a length that is larger than possible."""
 
 
@@ -150,7 +150,7 @@ def check_metres(name: str, value: Any, maximum: float = np.inf, limit: str = ""
         raise ValueError(f"{name} must be a positive length in metres; it is {describe(value)}.")
     if value > maximum:
         raise ValueError(
-            f"{name} is {1e3 * float(value):g} mm, more than {limit}, {1e3 * maximum:g} mm; {IN_MILLIMETRES}"
+            f"{name} is {1e3 * float(value):g} mm, more than {limit}, {1e3 * maximum:g} mm; {MILLIMETRE_HINT}"
         )
 
 
@@ -179,8 +179,8 @@ def did_you_mean(value: Any, names: Iterable[str]) -> str:
     """Question, in brackets, that proposes the name most similar to `value`, or a name that begins with `value`; empty
     if no name is similar."""
     known_names, lowercase_value = list(names), value.lower() if isinstance(value, str) else ""
-    completions = [name for name in known_names if lowercase_value and name.startswith(lowercase_value)]
-    matches = difflib.get_close_matches(lowercase_value, known_names, n=1) or completions
+    names_with_prefix = [name for name in known_names if lowercase_value and name.startswith(lowercase_value)]
+    matches = difflib.get_close_matches(lowercase_value, known_names, n=1) or names_with_prefix
     return f" (did you mean {matches[0]!r}?)" if matches else ""
 
 
@@ -193,13 +193,13 @@ def names_text(names: Iterable[Any], max_names: int = 8) -> str:
     return (", ".join(shown_texts) or "nothing") + remainder_text
 
 
-def check_has_values(name: str, tree: Any, purpose: str, instead: str) -> None:
+def check_has_values(name: str, pytree: Any, argument_use: str, instead: str) -> None:
     """Raise `ValueError` with the argument's `name` for a pytree that contains values traced by `jax.jit`, `jax.vmap`
-    or a derivative; `purpose` describes what the values are needed for, and `instead` what the user should pass or
+    or a derivative; `argument_use` describes what the values are needed for, and `instead` what the user should pass or
     do."""
-    if not has_values(tree):
+    if not has_values(pytree):
         raise ValueError(
-            f"{name} is traced, inside jax.jit, jax.vmap or a derivative, and {purpose} its values: {instead}."
+            f"{name} is traced, inside jax.jit, jax.vmap or a derivative, and {argument_use} its values: {instead}."
         )
 
 

@@ -22,23 +22,23 @@ EXTRAS = {
 
 # Maximum number of characters of the reason why a package cannot be imported. The reason precedes the advice on what to
 # install.
-_MAX_REASON = 120
+_MAX_REASON_LENGTH = 120
 
 
-def need_extra(extra: str, task: str) -> None:
+def require_extra(extra: str, task: str) -> None:
     """Raise `ImportError`, with the command to install it, if a package of `extra` is missing; `task` names the task
     for which the package is needed."""
     missing_packages = [package for module, package in EXTRAS[extra].items() if _is_missing(module)]
     if missing_packages:
         names = " and ".join(", ".join(missing_packages).rsplit(", ", 1))
-        raise ImportError(f"{task} needs {names}: {how_to_install(extra)}.")
+        raise ImportError(f"{task} needs {names}: {installation_command(extra)}.")
 
 
-def optional(module: str, task: str, otherwise: str = "") -> ModuleType:
+def import_optional(module: str, task: str, alternative: str = "") -> ModuleType:
     """Import a module of an optional package; `task` names the task for which the module is needed.
 
     Raises `ImportError` if the import fails. The message states the reason, what to install, and the alternative
-    `otherwise`.
+    `alternative`.
     """
     try:
         return importlib.import_module(module)
@@ -46,14 +46,16 @@ def optional(module: str, task: str, otherwise: str = "") -> ModuleType:
         extra = next(extra for extra, modules in EXTRAS.items() if module.partition(".")[0] in modules)
         package = EXTRAS[extra][module.partition(".")[0]]
         reason = (
-            "" if _is_missing(module.partition(".")[0]) else f", which cannot be imported ({str(error)[:_MAX_REASON]})"
+            ""
+            if _is_missing(module.partition(".")[0])
+            else f", which cannot be imported ({str(error)[:_MAX_REASON_LENGTH]})"
         )
         raise ImportError(
-            f"{task} needs {package}{reason}: {how_to_install(extra)}.{otherwise and f' {otherwise}'}"
+            f"{task} needs {package}{reason}: {installation_command(extra)}.{alternative and f' {alternative}'}"
         ) from error
 
 
-def how_to_install(extra: str) -> str:
+def installation_command(extra: str) -> str:
     """The command that installs jeit with an extra (a group of optional packages)."""
     return f"pip install 'jeit[{extra}]', or in a clone '.[{extra}]'"
 

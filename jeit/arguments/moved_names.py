@@ -11,7 +11,7 @@ from types import ModuleType
 from typing import Any
 
 # For each package that exported names in version 0.2: the new modules of names that have moved but were not changed.
-_MOVED = {
+_MOVED_NAMES = {
     "jeit.imaging": {
         "jeit.touch": "LearntGestures NamedTouch TouchImages TouchWatch WatchedFrame doubts_of learn_gestures "
         "learn_health untouched_frames",
@@ -46,44 +46,46 @@ _MOVED = {
         "jeit.touch.simulate": "GestureStream IndentSet indented_cells",
     },
 }
-_INDENTERS = {
+_RENAMED_INDENTERS = {
     **{old: f"{old}Indenter" for old in ("Bar", "DepthMap", "Disc", "Prism", "Revolved", "Ring")},
     "Joined": "JoinedIndenters",
     "Placed": "PlacedIndenter",
     "ball": "ball_indenter",
 }
-_SOUNDS = {
+_RENAMED_SOUNDS = {
     **{old: f"simulate_{old}" for old in ("calibration_taps", "pat", "room_sound", "sound_clips", "stroke", "tap")},
     "quiet": "simulate_silence",
     "tickle": "simulate_tickle",
     "wind": "simulate_wind",
 }
-_MARKS = {"Marks": "MapMarks", "plot_pairs": "plot_position_errors"}
-_DAMAGE = {"mended": "mend_cut", "Mishap": "DamageEvent", "record_mishaps": "record_damage"}
-_TRAINING = {"Objective": "TrainingObjective", "Plan": "TrainingPlan", "fit": "fit_network"}
+_RENAMED_MARKS = {"Marks": "MapMarks", "plot_pairs": "plot_position_errors"}
+_RENAMED_DAMAGE = {"mended": "mend_cut", "Mishap": "DamageEvent", "record_mishaps": "record_damage"}
+_RENAMED_TRAINING = {"Objective": "TrainingObjective", "Plan": "TrainingPlan", "fit": "fit_network"}
 # For each package of version 0.2, the package that now contains its renamed names, and the new name for each old name.
-_RENAMED = (
-    ("jeit.acoustic.plots", "jeit.acoustic", _MARKS),
-    ("jeit.acoustic.simulate", "jeit.acoustic", _SOUNDS),
-    ("jeit.plot", "jeit.acoustic", _MARKS),
+_RENAMED_NAMES_BY_MODULE = (
+    ("jeit.acoustic.plots", "jeit.acoustic", _RENAMED_MARKS),
+    ("jeit.acoustic.simulate", "jeit.acoustic", _RENAMED_SOUNDS),
+    ("jeit.plot", "jeit.acoustic", _RENAMED_MARKS),
     ("jeit.plot", "jeit.touch", {"plot_heard": "plot_sound_labels"}),
     ("jeit.report", "jeit.touch.reports", {f"{verb}_heard": f"{verb}_sound_labels" for verb in ("draw", "report")}),
     ("jeit.report", "jeit.touch", {"write_heard": "write_sound_labels"}),
-    ("jeit.simulate", "jeit.acoustic", _SOUNDS),
-    ("jeit.simulate", "jeit.touch", _INDENTERS),
+    ("jeit.simulate", "jeit.acoustic", _RENAMED_SOUNDS),
+    ("jeit.simulate", "jeit.touch", _RENAMED_INDENTERS),
     ("jeit.touch.attributes", "jeit.touch.attributes", {"least_told": "detection_threshold"}),
     ("jeit.touch.kohonen", "jeit.touch", {"Schedule": "MapSchedule", "touches_told": "touches_reported"}),
     ("jeit.touch.listening", "jeit.touch", {"Heard": "SoundLabels"}),
     ("jeit.touch.networks", "jeit.touch", {"Preset": "NetworkPreset"}),
-    ("jeit.touch.simulate", "jeit.touch", _INDENTERS),
-    ("jeit.touch.simulate.contact", "jeit.touch", _INDENTERS),
-    ("jeit.touch.simulate.damage", "jeit.touch", _DAMAGE),
-    ("jeit.touch.training", "jeit.touch", _TRAINING),
+    ("jeit.touch.simulate", "jeit.touch", _RENAMED_INDENTERS),
+    ("jeit.touch.simulate.contact", "jeit.touch", _RENAMED_INDENTERS),
+    ("jeit.touch.simulate.damage", "jeit.touch", _RENAMED_DAMAGE),
+    ("jeit.touch.training", "jeit.touch", _RENAMED_TRAINING),
     ("jeit.touch.training", "jeit.touch.training", {"Trained": "TrainingResult"}),
 )
-MOVED = {f"{page}.{old}": f"{home}.{new}" for page, home, names in _RENAMED for old, new in names.items()} | {
+MOVED = {
+    f"{page}.{old}": f"{home}.{new}" for page, home, names in _RENAMED_NAMES_BY_MODULE for old, new in names.items()
+} | {
     f"{page}.{name}": f"{home}.{name}"
-    for page, homes in _MOVED.items()
+    for page, homes in _MOVED_NAMES.items()
     for home, names in homes.items()
     for name in names.split()
 }
@@ -101,9 +103,9 @@ _MOVED_PAGES = {
 }
 
 
-def with_moved_names(page: str, find: Callable[[str], Any] | None = None) -> Callable[[str], Any]:
-    """Create the `__getattr__` of a package from which names have moved; `find` is the `__getattr__` for the names that
-    the package still contains.
+def with_moved_names(page: str, find_current_name: Callable[[str], Any] | None = None) -> Callable[[str], Any]:
+    """Create the `__getattr__` of a package from which names have moved; `find_current_name` is the `__getattr__` for
+    the names that the package still contains.
 
     Modules of the package that have moved can still be imported under their old names.
     """
@@ -118,9 +120,9 @@ def with_moved_names(page: str, find: Callable[[str], Any] | None = None) -> Cal
             return _forward(old, MOVED[old])
         if page in _MOVED_PAGES and not name.startswith("__"):
             return _forward(old, f"{_MOVED_PAGES[page]}.{name}")
-        if find is None:
+        if find_current_name is None:
             raise AttributeError(f"module '{page}' has no attribute '{name}'", name=name, obj=sys.modules[page])
-        return find(name)
+        return find_current_name(name)
 
     return find_or_forward
 

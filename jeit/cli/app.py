@@ -17,16 +17,16 @@ import typer
 from jeit.cli.applications import COMMANDS
 from jeit.cli.options import (
     StoppedError,
-    naming_options,
-    remembering_files,
+    naming_options_in_errors,
+    recording_input_files,
     remove_empty_folders,
     reporting_when_stopped,
 )
-from jeit.start import discarded_damaged, quick_compilation
+from jeit.start import discard_damaged_cache_files, quick_compilation
 
 # Commands that run the same compiled program many times. Full optimisation by the compiler makes the computation of a
 # frame three times as fast.
-_FULLY_OPTIMISED = (
+_FULLY_OPTIMISED_COMMANDS = (
     "study",
     "live",
     "stream",
@@ -42,7 +42,7 @@ _FULLY_OPTIMISED = (
 _DEVELOPER_WARNINGS = (DeprecationWarning, PendingDeprecationWarning, FutureWarning)
 
 # Maximum number of characters of an error message.
-_MAX_MESSAGE = 390
+_MAX_MESSAGE_LENGTH = 390
 
 
 def application(commands: Iterable[str] = COMMANDS) -> typer.Typer:
@@ -92,7 +92,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with warnings.catch_warnings():
             warnings.showwarning = _create_warning_printer()
             if arguments is None:
-                _set_up_process(compile_quickly=not " ".join(command_arguments[:2]).startswith(_FULLY_OPTIMISED))
+                _set_up_process(
+                    compile_quickly=not " ".join(command_arguments[:2]).startswith(_FULLY_OPTIMISED_COMMANDS)
+                )
             status = command.main(args=command_arguments, prog_name="jeit", standalone_mode=False)
     except (KeyboardInterrupt, StoppedError) as stop:
         remove_empty_folders()
@@ -126,7 +128,7 @@ def _name_options(command) -> None:
         if parameter.param_type_name == "option"
     }
     if command.callback is not None and options:
-        command.callback = remembering_files(naming_options(options)(command.callback))
+        command.callback = recording_input_files(naming_options_in_errors(options)(command.callback))
     if command.callback is not None:
         command.callback = reporting_when_stopped(command.callback)
 
@@ -164,8 +166,8 @@ def _print_error(message: str, status: int) -> int:
 def _join_lines(message: str) -> str:
     """Convert an error message to one line of printable characters, shortened in the middle if it is too long."""
     line = "".join(letter if letter.isprintable() else "�" for letter in " ".join(message.split()))
-    half_length = (_MAX_MESSAGE - 3) // 2
-    return line if len(line) <= _MAX_MESSAGE else f"{line[:half_length]} … {line[-half_length:]}"
+    half_length = (_MAX_MESSAGE_LENGTH - 3) // 2
+    return line if len(line) <= _MAX_MESSAGE_LENGTH else f"{line[:half_length]} … {line[-half_length:]}"
 
 
 def _create_warning_printer() -> Callable[..., None]:
@@ -176,7 +178,7 @@ def _create_warning_printer() -> Callable[..., None]:
         text = str(message)
         if issubclass(category, _DEVELOPER_WARNINGS) and not os.environ.get("JEIT_DEBUG"):
             return
-        if text not in printed_texts and not discarded_damaged(text):
+        if text not in printed_texts and not discard_damaged_cache_files(text):
             printed_texts.add(text)
             print(f"jeit: warning: {_join_lines(text)}", file=sys.stderr)
 

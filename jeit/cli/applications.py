@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Iterable
 from typing import Any
 
-from jeit.cli.options import NETWORK
+from jeit.cli.options import NETWORK_METHOD
 
 # Module of each command, by name of the command.
 COMMANDS = {
@@ -29,12 +29,12 @@ COMMANDS = {
 }
 
 
-def check_method(method: str | None, others: Iterable[str]) -> None:
-    """Check the option `--method`. Raises `ValueError` unless the method is "network" or among `others`."""
+def check_method(method: str | None, other_methods: Iterable[str]) -> None:
+    """Check the option `--method`. Raises `ValueError` unless the method is "network" or among `other_methods`."""
     from jeit.arguments import check_name
 
     if method is not None:
-        check_name("--method", method, (*others, NETWORK))
+        check_name("--method", method, (*other_methods, NETWORK_METHOD))
 
 
 def image_by_network(*arguments: Any, **options: Any) -> None:

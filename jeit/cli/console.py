@@ -26,8 +26,8 @@ _MAX_TABLE_WIDTH = 80
 _MIN_SHOWN_SECONDS = 2.0
 # Pattern of a progress text such as "12 of 60" (completed parts of a step), and minimum completed fraction at which the
 # remaining time is estimated. Texts such as "12 of at most 60" do not match.
-_PROGRESS, _MIN_SHARE = re.compile(r"(\d[\d,]*) of (\d[\d,]*)"), 0.05
-_PREFIXES = ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n"))
+_PROGRESS_PATTERN, _MIN_SHARE_FOR_ESTIMATE = re.compile(r"(\d[\d,]*) of (\d[\d,]*)"), 0.05
+_SI_PREFIXES = ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n"))
 
 
 def plain_console() -> Console:
@@ -58,7 +58,7 @@ class Steps:
             self._status.start()
 
     @property
-    def under_way(self) -> str:
+    def current_step_name(self) -> str:
         """Name of the current step; empty before the first step."""
         return self._step
 
@@ -66,10 +66,14 @@ class Steps:
         """Show the progress within the current step beside its spinner; for a `detail` such as "frame 12 of 100", also
         the remaining time."""
         if self._status is not None:
-            match = _PROGRESS.search(detail)
-            num_finished, num_parts = (int(digits.replace(",", "")) for digits in match.groups()) if match else (0, 0)
-            now = time.perf_counter()
-            self._status.update(_StepLine(f"{self._step} … {detail}", self._start, num_finished, num_parts, now))
+            progress_match = _PROGRESS_PATTERN.search(detail)
+            num_finished, num_parts = (
+                (int(digits.replace(",", "")) for digits in progress_match.groups()) if progress_match else (0, 0)
+            )
+            current_time = time.perf_counter()
+            self._status.update(
+                _StepLine(f"{self._step} … {detail}", self._start, num_finished, num_parts, current_time)
+            )
 
     def __enter__(self) -> "Steps":
         return self
@@ -97,13 +101,13 @@ class _StepLine:
     start_time: float
     num_done: int = 0
     num_parts: int = 0
-    reported: float = 0.0
+    latest_progress: float = 0.0
 
     def __rich__(self) -> Text:
         seconds = time.perf_counter() - self.start_time
         text = f"{self.step}  {seconds:.0f} s" if seconds >= _MIN_SHOWN_SECONDS else self.step
-        if seconds >= _MIN_SHOWN_SECONDS and _MIN_SHARE * self.num_parts <= self.num_done < self.num_parts:
-            elapsed = self.reported - self.start_time
+        if seconds >= _MIN_SHOWN_SECONDS and _MIN_SHARE_FOR_ESTIMATE * self.num_parts <= self.num_done < self.num_parts:
+            elapsed = self.latest_progress - self.start_time
             seconds_left = max(elapsed * self.num_parts / self.num_done - seconds, 0)
             text += f", about {_rounded_duration(seconds_left)} left"
         return Text(text)
@@ -126,7 +130,7 @@ def name_value_table(title: str, rows: list[tuple[str, str]]) -> Table:
     return table
 
 
-def say_written(console: Console, first_path: Path, *other_names: str) -> None:
+def print_written_files(console: Console, first_path: Path, *other_names: str) -> None:
     """Print the names of the written files: the `first_path` with its folder, the `other_names` without the folder."""
     console.print(Text("Written:", "dim"), ", ".join([str(first_path), *other_names]), soft_wrap=True)
 
@@ -136,7 +140,7 @@ def format_with_unit(value: float | None, unit: str) -> str:
     if value is None:
         return "not known"
     value = float(f"{value:.3g}")  # 999.6 µS is 1 mS
-    for exponent, si_prefix in _PREFIXES:
+    for exponent, si_prefix in _SI_PREFIXES:
         if abs(value) >= 10.0**exponent:
             return f"{value / 10.0**exponent:.3g} {si_prefix}{unit}"
     return f"{value:.3g} {unit}"
@@ -146,7 +150,7 @@ def format_in_one_unit(values: list[float], unit: str) -> tuple[str, list[str]]:
     """Format the values of a table column in one unit, with the SI prefix that suits the largest value; return the unit
     and the formatted values."""
     max_value = float(f"{max((abs(value) for value in values), default=0.0):.3g}")
-    exponent, si_prefix = next((pair for pair in _PREFIXES if max_value >= 10.0 ** pair[0]), _PREFIXES[0])
+    exponent, si_prefix = next((pair for pair in _SI_PREFIXES if max_value >= 10.0 ** pair[0]), _SI_PREFIXES[0])
     return f"{si_prefix}{unit}", [f"{value / 10.0**exponent:.3g}" for value in values]
 
 
@@ -157,13 +161,13 @@ def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str, *, background:
     """
     unit, peaks = format_in_one_unit([inclusion.peak for inclusion in inclusions], unit)
     noun, size_unit, digits = _size_format(inclusions)
-    share_columns = ["of back-\nground"] if background else []
+    columns_of_shares = ["of back-\nground"] if background else []
     rows = []
     for inclusion, peak in zip(inclusions, peaks, strict=True):
-        share_cells = [percent(inclusion.peak / background)] if background else []
-        rows.append([f"{1e6 * inclusion.area:.{digits}f}", peak, *share_cells])
+        cells_of_shares = [percent(inclusion.peak / background)] if background else []
+        rows.append([f"{1e6 * inclusion.area:.{digits}f}", peak, *cells_of_shares])
     return _create_inclusion_table(
-        inclusions, [f"{noun}\n/ {size_unit}", f"peak change\n/ {unit}", *share_columns], rows
+        inclusions, [f"{noun}\n/ {size_unit}", f"peak change\n/ {unit}", *columns_of_shares], rows
     )
 
 

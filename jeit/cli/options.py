@@ -14,54 +14,56 @@ import typer
 if TYPE_CHECKING:
     from jeit.data import Measurement
 
-Data = Annotated[Path, typer.Argument(help="Measured file to image.", show_default=False)]
-Reference = Annotated[
+DataArgument = Annotated[Path, typer.Argument(help="Measured file to image.", show_default=False)]
+ReferenceArgument = Annotated[
     Path | None,
     typer.Option(help="Measured file of the undisturbed body; may be left out if DATA has a frame 'reference'."),
 ]
-Format = Annotated[
+FormatOption = Annotated[
     str | None,
     typer.Option(
         help="kit4, ktc2023, eidors, sciospec, draeger, carefusion, swisstom, goettingen, cn0565, quadrupoles, "
         "openeit, table or tank6cm; found from the content unless given."
     ),
 ]
-Description = Annotated[
+DescriptionOption = Annotated[
     str | None,
     typer.Option(help="TOML file that says what the numbers mean; looked for beside the data unless given."),
 ]
-Key = Annotated[
+KeyOption = Annotated[
     str | None,
     typer.Option(help="Array of the frames in a .mat or .npz file; that which fits unless given.", metavar="NAME"),
 ]
-ReferenceKey = Annotated[
+ReferenceKeyOption = Annotated[
     str | None,
     typer.Option(help="Array of the reference, in REFERENCE, or in DATA where no REFERENCE is given.", metavar="NAME"),
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
-Contact = Annotated[
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+ContactOption = Annotated[
     str | None,
     typer.Option(help="Contact impedance in the calibration: each, common or fixed; found from the protocol."),
 ]
-Nodes = Annotated[int | None, typer.Option(help="Nodes of the mesh, about (default 2000; of a solid body 10000).")]
-AsIs = Annotated[
+NodesOption = Annotated[
+    int | None, typer.Option(help="Nodes of the mesh, about (default 2000; of a solid body 10000).")
+]
+AsIsOption = Annotated[
     bool,
     typer.Option(
         "--as-is",
         help="Go on though electrodes, channels or signs look wired otherwise than described; correct nothing.",
     ),
 ]
-Model = Annotated[
+ModelOption = Annotated[
     Path | None,
     typer.Option("--model", help="Folder of 'jeit learn image', or its network.jeit; for --method network."),
 ]
-Frame = Annotated[
+FrameOption = Annotated[
     str | None,
     typer.Option(
         help="Frame of DATA to image, by number from 0 (negative: from the end) or by name; the first unless given."
     ),
 ]
-ReferenceFrames = Annotated[
+ReferenceFramesOption = Annotated[
     str | None,
     typer.Option(
         help="Frames, from 0, whose mean is the undisturbed body, such as 0-17 or 5: of REFERENCE, or of DATA where no "
@@ -69,7 +71,7 @@ ReferenceFrames = Annotated[
         metavar="FIRST-LAST",
     ),
 ]
-NETWORK = "network"
+NETWORK_METHOD = "network"
 """Value of `--method` of `reconstruct` and `stream` for imaging by a network, besides the methods of `jeit.imaging`."""
 
 # Folders created by `make_folder`, inner folders first.
@@ -80,7 +82,7 @@ _INPUT_FILES: list[Path] = []
 _OUTPUT_OPTIONS = ("output", "page", "film")
 
 
-def remembering_files(command: Callable[..., Any]) -> Callable[..., Any]:
+def recording_input_files(command: Callable[..., Any]) -> Callable[..., Any]:
     """Wrap a command so that its input files are recorded; `make_folder` checks that no output overwrites them."""
 
     @wraps(command)
@@ -113,14 +115,14 @@ def reporting_when_stopped(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @contextmanager
-def naming_options(options: dict[str, str]) -> Iterator[None]:
+def naming_options_in_errors(options: dict[str, str]) -> Iterator[None]:
     """Context manager that replaces names of Python arguments by names of `options` in error messages; see
-    `in_options`."""
+    `with_option_names`."""
     try:
         yield
     except (ValueError, FileNotFoundError) as error:
         message = str(error)
-        if (renamed := in_options(message, options)) == message:
+        if (renamed := with_option_names(message, options)) == message:
             raise
         raise ValueError(renamed) from error
 
@@ -137,7 +139,7 @@ def read_file(
     or "--reference"."""
     from jeit.data import read
 
-    with naming_options({"path": option, "key": "--reference-key" if option == "--reference" else "--key"}):
+    with naming_options_in_errors({"path": option, "key": "--reference-key" if option == "--reference" else "--key"}):
         return read(path, format, description, like=like, key=key)
 
 
@@ -163,8 +165,8 @@ def read_pair(
 
 def reference_of_frames(measurement: "Measurement", frames: str) -> "Measurement":
     """Return the frames of a measurement that the option --reference-frames selects, such as "0-17" or "5"."""
-    match = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", frames.strip())
-    first_frame, last_frame = (int(match[1]), int(match[2] or match[1])) if match else (0, -1)
+    range_match = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", frames.strip())
+    first_frame, last_frame = (int(range_match[1]), int(range_match[2] or range_match[1])) if range_match else (0, -1)
     if not first_frame <= last_frame < measurement.num_frames:
         raise ValueError(
             f"--reference-frames: give FIRST-LAST, such as 0-17, or one number, of the frames 0 to "
@@ -173,16 +175,16 @@ def reference_of_frames(measurement: "Measurement", frames: str) -> "Measurement
     return measurement.frames(slice(first_frame, last_frame + 1))
 
 
-def in_options(message: str, options: dict[str, str]) -> str:
+def with_option_names(message: str, options: dict[str, str]) -> str:
     """Replace names of Python arguments in an error message by names of options. Names are replaced at the beginning of
     the message, and where they are written as `name=`.
 
     For options in millimetres, whose names end in "-mm", the question whether the user confused millimetres and metres
     is removed.
     """
-    from jeit.arguments import IN_MILLIMETRES
+    from jeit.arguments import MILLIMETRE_HINT
 
-    questions = IN_MILLIMETRES, "are both in metres?"
+    questions = MILLIMETRE_HINT, "are both in metres?"
 
     for argument, option in options.items():
         if message.startswith((f"{argument} ", f"{argument}:")):
@@ -226,7 +228,7 @@ def make_folder(output: Path, names: tuple[str, ...] = ("image.png", "image.npz"
     from jeit.report.folder import results_folder
 
     missing_folders = [folder for folder in (output, *output.parents) if not folder.exists()]
-    with naming_options({"folder": "--output"}):
+    with naming_options_in_errors({"folder": "--output"}):
         results_folder(output, names)
     _CREATED_FOLDERS.extend(missing_folders)
 
@@ -238,7 +240,7 @@ def remove_empty_folders() -> None:
             _CREATED_FOLDERS.pop(0).rmdir()
 
 
-def number_or_name(text: str, number_type: type = float):
+def convert_to_number_if_possible(text: str, number_type: type = float):
     """Convert text to a number; return the text itself if it is not a number."""
     try:
         return number_type(text)

@@ -21,15 +21,15 @@ from jeit.cli.console import Steps
 from jeit.cli.options import remove_empty_folders
 
 # Minimum waiting time after which a frame counts as live, as a fraction of the usual interval between frames.
-_MIN_WAIT_SHARE = 0.4
+_MIN_RELATIVE_WAITING_TIME = 0.4
 # Number of consecutive live frames after which no earlier frames are assumed to remain.
-_NUM_LIVE_FRAMES = 3
+_NUM_CONSECUTIVE_LIVE_FRAMES = 3
 # Maximum time in seconds for reading earlier frames.
-_MAX_CATCH_UP_SECONDS = 5.0
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_MAX_SKIPPING_DURATION = 5.0
+_STOPPING_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _END_OF_FRAMES = object()
 # Interval in seconds between reports of the number of frames received.
-_REPORT_INTERVAL = 0.25
+_FRAME_COUNT_INTERVAL = 0.25
 
 
 class LiveFrames:
@@ -58,7 +58,7 @@ class LiveFrames:
     def initial_frames(self, duration: float) -> Float[np.ndarray, "u M"]:
         """Read the frames (frames, channels) of the first `duration` seconds; iteration returns these frames again.
         Raises `ValueError` if there are none."""
-        self._catch_up()
+        self._skip_earlier_frames()
         while not self.read_frames or self.read_frames[-1][0] < duration:
             frame = self._next()
             if frame is None:
@@ -72,30 +72,32 @@ class LiveFrames:
         return np.array([row for row in rows if len(row) == usual_width])
 
     def __iter__(self) -> Iterator[tuple[float, object]]:
-        self._catch_up()
+        self._skip_earlier_frames()
         yield from self.read_frames
         while (frame := self._next()) is not None:
             yield self._current_time(), frame
 
-    def _catch_up(self) -> None:
+    def _skip_earlier_frames(self) -> None:
         """Skip frames that arrived before reading began. If the input ends among these frames, none is skipped, and
         their times are computed from the usual rate."""
         if not self.by_clock:
             return
         skipped_frames, num_consecutive, start = [], 0, time.monotonic()
-        while time.monotonic() - start < _MAX_CATCH_UP_SECONDS:
-            wait_start = time.monotonic()
+        while time.monotonic() - start < _MAX_SKIPPING_DURATION:
+            wait_start_time = time.monotonic()
             frame = self._next()
             if frame is None:
                 self.rate = self.measured_rate
                 self.num_returned = len(self.read_frames)
                 self.by_clock = False
-                self.read_frames += [(self._current_time(), skipped) for skipped in skipped_frames]
+                self.read_frames += [(self._current_time(), skipped_frame) for skipped_frame in skipped_frames]
                 return
             num_consecutive = (
-                num_consecutive + 1 if time.monotonic() - wait_start > _MIN_WAIT_SHARE / self.usual_rate else 0
+                num_consecutive + 1
+                if time.monotonic() - wait_start_time > _MIN_RELATIVE_WAITING_TIME / self.usual_rate
+                else 0
             )
-            if num_consecutive == _NUM_LIVE_FRAMES:
+            if num_consecutive == _NUM_CONSECUTIVE_LIVE_FRAMES:
                 self.left_out += len(skipped_frames)
                 self.read_frames.append((self._current_time(), frame))
                 return
@@ -118,17 +120,17 @@ class _StoppedError(Exception):
     """Error raised to skip the remaining work when a stream was stopped."""
 
 
-class Stopping:
-    """Context manager that stops a stream on Ctrl-C and SIGTERM: the iterator of `until` ends after the current frame,
-    or at once while waiting for the next frame. A second signal, or a signal before the first frame, stops the command
-    at once."""
+class StreamStopper:
+    """Context manager that stops a stream on Ctrl-C and SIGTERM: the iterator of `frames_until_signal` ends after the
+    current frame, or at once while waiting for the next frame. A second signal, or a signal before the first frame,
+    stops the command at once."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
         self._streaming, self._waiting = False, False
         self._earlier_handlers: dict[int, Any] = {}
 
-    def until(self, frames: Iterable) -> Iterator:
+    def frames_until_signal(self, frames: Iterable) -> Iterator:
         """Iterate over the frames until a signal arrives."""
         self._streaming = True
         source = iter(frames)
@@ -147,15 +149,15 @@ class Stopping:
         finally:
             self._waiting = False
 
-    def drawing_reporter(self, pictures: Sequence[str], step: Steps) -> Callable[[str], None]:
+    def drawing_reporter(self, picture_names: Sequence[str], step: Steps) -> Callable[[str], None]:
         """Create a function that reports writing and drawing as steps, and raises `_StoppedError` before drawing if a
         signal has arrived."""
 
         def report(task: str) -> None:
-            step_name = "draw" if task.partition(":")[0] in pictures else "write"
+            step_name = "draw" if task.partition(":")[0] in picture_names else "write"
             if step_name == "draw" and self.signal is not None:
                 raise _StoppedError
-            if step.under_way != step_name:
+            if step.current_step_name != step_name:
                 step(step_name)
             step.report(task)
 
@@ -184,10 +186,12 @@ class Stopping:
         print(f"jeit: stopped{detail}.", file=sys.stderr)
         raise typer.Exit(128 + (self.signal or 0))
 
-    def __enter__(self) -> "Stopping":
+    def __enter__(self) -> "StreamStopper":
         if threading.current_thread() is threading.main_thread():
             handled_signals = [
-                signal_number for signal_number in _SIGNALS if signal.getsignal(signal_number) is not signal.SIG_IGN
+                signal_number
+                for signal_number in _STOPPING_SIGNALS
+                if signal.getsignal(signal_number) is not signal.SIG_IGN
             ]
             self._earlier_handlers = {
                 signal_number: signal.signal(signal_number, self._stop) for signal_number in handled_signals
@@ -201,9 +205,9 @@ class Stopping:
             self._end("")
 
     def _stop(self, signal_number: int, _) -> None:
-        stops_at_once = self.signal is not None or self._waiting or not self._streaming
+        stops_immediately = self.signal is not None or self._waiting or not self._streaming
         self.signal = signal_number
-        if stops_at_once:
+        if stops_immediately:
             raise KeyboardInterrupt
 
 
@@ -218,7 +222,7 @@ class FrameCounter:
     def count_frame(self) -> None:
         """Count a frame."""
         self.number += 1
-        now = time.monotonic()
-        if now - self._last_report > _REPORT_INTERVAL:
-            self._last_report = now
+        current_time = time.monotonic()
+        if current_time - self._last_report > _FRAME_COUNT_INTERVAL:
+            self._last_report = current_time
             self._step.report(f"frame {self.number:,}{self._total_text}")

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
 # Size of the body divided by the length that a key of `[geometry]` specifies.
-_SIZE_FACTORS = {"radius": 2.0, "width": 1.0, "depth": 1.0, "height": 1.0, "thickness": 1.0}
+_BODY_SIZE_PER_KEY_VALUE = {"radius": 2.0, "width": 1.0, "depth": 1.0, "height": 1.0, "thickness": 1.0}
 
 
 def warn_large_body(table: GeometryTable, body: Body, origin: str) -> None:
@@ -34,8 +34,10 @@ def warn_large_body(table: GeometryTable, body: Body, origin: str) -> None:
     metres."""
     from jeit.data.description_tables import PolygonTable  # already imported when the table was read
 
-    lengths = {key: float(getattr(table, key, None) or 0) for key in _SIZE_FACTORS}
-    large_lengths = {key: length for key, length in lengths.items() if _SIZE_FACTORS[key] * length > MAX_PLAUSIBLE_SIZE}
+    lengths = {key: float(getattr(table, key, None) or 0) for key in _BODY_SIZE_PER_KEY_VALUE}
+    large_lengths = {
+        key: length for key, length in lengths.items() if _BODY_SIZE_PER_KEY_VALUE[key] * length > MAX_PLAUSIBLE_SIZE
+    }
     if isinstance(body, OwnMesh):
         key_names, size = "mesh", _largest_side(body.given.points)
         suggestions = {unit: f"scale = {factor * getattr(table, 'scale', 1.0):g}" for unit, factor in _UNITS.items()}
@@ -45,7 +47,7 @@ def warn_large_body(table: GeometryTable, body: Body, origin: str) -> None:
     else:
         key_names, size = (
             ", geometry.".join(large_lengths),
-            max((_SIZE_FACTORS[key] * large_lengths[key] for key in large_lengths), default=0.0),
+            max((_BODY_SIZE_PER_KEY_VALUE[key] * large_lengths[key] for key in large_lengths), default=0.0),
         )
         suggestions = {
             unit: " and ".join(f"{factor * length:g}" for length in large_lengths.values())
@@ -71,7 +73,7 @@ def _largest_side(points) -> float:
 # Maximum distance of an electrode from the surface as a fraction of the electrode's smaller dimension, and maximum
 # overhang beyond the wall as a fraction of the wall's height.
 _MAX_SURFACE_DISTANCE = 0.1
-_MAX_OVERHANG = 0.02
+_MAX_ELECTRODE_OVERHANG = 0.02
 
 
 def check_on_solid(electrodes: AbstractElectrodes, body: Solid) -> None:
@@ -99,7 +101,7 @@ def check_on_solid(electrodes: AbstractElectrodes, body: Solid) -> None:
         np.maximum(height / 2 - z, z + height / 2 - body_height),
         _surface_distance(body, positions)[1],
     )
-    for electrode_index in np.flatnonzero(is_on_wall & (overhangs > _MAX_OVERHANG * height))[:1]:
+    for electrode_index in np.flatnonzero(is_on_wall & (overhangs > _MAX_ELECTRODE_OVERHANG * height))[:1]:
         lower_end, upper_end = (
             z[electrode_index] - height[electrode_index] / 2,
             z[electrode_index] + height[electrode_index] / 2,

@@ -31,7 +31,7 @@ _NON_OPTION_KEYS = {"kind", "number", "name", "current", "current_from_name", "c
 _ELECTRODE_KEYS = ("common", "reference", "pairs", "drive_pairs", "measurement_pairs")
 # Estimated memory of a protocol: bytes for every channel in addition to its patterns, and number of copies of the
 # patterns.
-_BYTES_PER_CHANNEL, _NUM_COPIES = 64, 2
+_BYTES_PER_CHANNEL, _NUM_MEMORY_COPIES = 64, 2
 
 
 def described_protocol(table: ProtocolTable, num_electrodes: int | None, path: Path, origin: str) -> Protocol:
@@ -67,7 +67,7 @@ def protocol_table_variants(table: ProtocolTable) -> list[tuple[ProtocolTable, s
     fields = type(table).model_fields
     open_options = [name for name in _OPTION_VALUES if name in fields and name not in table.model_fields_set]
     open_options = [name for name in open_options if fields[name].default in _OPTION_VALUES[name]]
-    variants = []
+    table_variants = []
     for values in product(*(_OPTION_VALUES[name] for name in open_options)):
         changed_options = {
             name: value for name, value in zip(open_options, values, strict=True) if value != fields[name].default
@@ -75,8 +75,8 @@ def protocol_table_variants(table: ProtocolTable) -> list[tuple[ProtocolTable, s
         assignments = [
             f"{name} = " + ("true" if value is True else f'"{value}"') for name, value in changed_options.items()
         ]
-        variants.append((table.model_copy(update=changed_options), ", ".join(assignments)))
-    return variants
+        table_variants.append((table.model_copy(update=changed_options), ", ".join(assignments)))
+    return table_variants
 
 
 def _construct(table: ConstructedTable, num_electrodes: int | None, path: Path, origin: str) -> Protocol:
@@ -133,7 +133,7 @@ def _max_counts(kind: str, num_electrodes: int, options: dict[str, Any]) -> tupl
 
 def _check_size(num_drives: int, num_measurements: int, num_electrodes: int, num_channels: int, origin: str) -> None:
     num_entries = num_electrodes * (num_drives + num_measurements + num_channels)
-    check_memory(f"{origin}: protocol", 8 * _NUM_COPIES * num_entries + _BYTES_PER_CHANNEL * num_channels)
+    check_memory(f"{origin}: protocol", 8 * _NUM_MEMORY_COPIES * num_entries + _BYTES_PER_CHANNEL * num_channels)
 
 
 def _current_amplitude(table: DrivenTable, path: Path) -> float:

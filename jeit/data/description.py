@@ -60,7 +60,7 @@ if TYPE_CHECKING:
     from jeit.data.description_tables import DataTable, ProtocolTable, UncertaintyTable
     from jeit.protocol.all_at_once import Reading
 
-BUNDLED = ("tank6cm",)
+BUNDLED_DESCRIPTIONS = ("tank6cm",)
 _VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "µV": 1e-6}
 
 
@@ -195,14 +195,14 @@ def load_description(which: str | Path) -> Description:
     description = load_description("tank6cm")
     ```
     """
-    if str(which) in BUNDLED:
+    if str(which) in BUNDLED_DESCRIPTIONS:
         origin = f"{which}.toml"
         text = resources.files("jeit.data").joinpath(origin).read_text("utf-8")
         return parse_description(tomllib.loads(text), origin)
     path = Path(which)
     if not path.is_file():
         raise ValueError(
-            f"description {path}: there is no such file. Give a TOML file, or one of {', '.join(BUNDLED)}."
+            f"description {path}: there is no such file. Give a TOML file, or one of {', '.join(BUNDLED_DESCRIPTIONS)}."
         )
     return parse_description(read_toml(path), path.name, path.parent)
 

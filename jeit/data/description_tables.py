@@ -8,27 +8,27 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import FailFast, Field, model_validator
 
-from jeit.files import MOST_ELECTRODES
-from jeit.files.schema import Number, Numbers, OneOf, Table, Word, Words, fault
+from jeit.files import MAX_ELECTRODES
+from jeit.files.schema import Number, Numbers, Table, TableOfKind, Word, Words, fault
 from jeit.inverse import Uncertainty
 
 # Maximum numbers of vertices of a polygon and of its holes: each side is compared with every other side, and each hole
 # with every other hole.
 _MAX_VERTICES, _MAX_HOLES = 4096, 64
-_ELECTRODE_COUNT = Number(2, MOST_ELECTRODES, beyond="Channels grow with its square; in Python there is no such limit.")
-_ELECTRODE_INDEX = Number(0, MOST_ELECTRODES)
+_ELECTRODE_COUNT = Number(2, MAX_ELECTRODES, beyond="Channels grow with its square; in Python there is no such limit.")
+_ELECTRODE_INDEX = Number(0, MAX_ELECTRODES)
 
 Length = Annotated[float, Number(1e-9, 1e3, "m")]
-Sizes = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 1e-9, 1e3, "m", single=True)]
+Sizes = Annotated[np.ndarray, Numbers(((1, MAX_ELECTRODES),), 1e-9, 1e3, "m", single=True)]
 PlanePoint = Annotated[np.ndarray, Numbers(((2, 2),), -1e3, 1e3, "m")]
 PolygonVertices = Annotated[np.ndarray, Numbers(((3, _MAX_VERTICES), (2, 2)), -1e3, 1e3, "m")]
-Positions = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES), (2, 3)), -1e3, 1e3, "m")]
+Positions = Annotated[np.ndarray, Numbers(((1, MAX_ELECTRODES), (2, 3)), -1e3, 1e3, "m")]
 # A single number means one ring of electrodes; likewise, a single size applies to all electrodes.
-Levels = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 0, 1e3, "m", single=True)]
+Levels = Annotated[np.ndarray, Numbers(((1, MAX_ELECTRODES),), 0, 1e3, "m", single=True)]
 # For electrodes on the edge of a sheet the contact impedance is in ohm·m.
-Impedances = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 1e-15, 1e12, "ohm·m²", single=True)]
-Patterns = Annotated[np.ndarray, Numbers(((1, math.inf), (2, MOST_ELECTRODES)), -1e12, 1e12)]
-Pairs = Annotated[np.ndarray, Numbers(((1, math.inf), (2, 2)), 0, MOST_ELECTRODES, kind=int)]
+Impedances = Annotated[np.ndarray, Numbers(((1, MAX_ELECTRODES),), 1e-15, 1e12, "ohm·m²", single=True)]
+Patterns = Annotated[np.ndarray, Numbers(((1, math.inf), (2, MAX_ELECTRODES)), -1e12, 1e12)]
+Pairs = Annotated[np.ndarray, Numbers(((1, math.inf), (2, 2)), 0, MAX_ELECTRODES, kind=int)]
 Indices = Annotated[np.ndarray, Numbers(((1, math.inf),), 0, 2**31 - 1, kind=int)]
 Gains = Annotated[np.ndarray, Numbers(((1, math.inf),), 1e-6, 1e6)]
 Reading = Literal["adjacent", "mean", "mean-removed", "against"]
@@ -41,7 +41,7 @@ _UNKNOWN_IMPEDANCE = "; if it is not known, write {}, which the reference frame 
 class DiskTable(Table):
     """Section `[geometry]` of a disk or, with a thickness, of a cylinder."""
 
-    subject = "a disk"
+    name_in_messages = "a disk"
     shape: Literal["disk"]
     radius: Length
     centre: PlanePoint = np.zeros(2)
@@ -51,7 +51,7 @@ class DiskTable(Table):
 class RectangleTable(Table):
     """Section `[geometry]` of a rectangle or, with a thickness, of a box."""
 
-    subject = "a rectangle"
+    name_in_messages = "a rectangle"
     shape: Literal["rectangle"]
     width: Length
     height: Length
@@ -62,7 +62,7 @@ class RectangleTable(Table):
 class PolygonTable(Table):
     """Section `[geometry]` of a polygon or, with a thickness, of an upright prism over the polygon."""
 
-    subject = "a polygon"
+    name_in_messages = "a polygon"
     shape: Literal["polygon"]
     vertices: PolygonVertices
     holes: Annotated[list[PolygonVertices], FailFast()] = Field(default=[], max_length=_MAX_HOLES)
@@ -83,7 +83,7 @@ class PolygonTable(Table):
 class BoxTable(Table):
     """Section `[geometry]` of a box."""
 
-    subject = "a box"
+    name_in_messages = "a box"
     shape: Literal["box"]
     width: Length
     depth: Length
@@ -93,7 +93,7 @@ class BoxTable(Table):
 class CylinderTable(Table):
     """Section `[geometry]` of a cylinder."""
 
-    subject = "a cylinder"
+    name_in_messages = "a cylinder"
     shape: Literal["cylinder"]
     radius: Length
     height: Length
@@ -102,7 +102,7 @@ class CylinderTable(Table):
 class MeshTable(Table):
     """Section `[geometry]` of a mesh in a file beside the description. `scale`: length of the mesh's unit in metres."""
 
-    subject = "a mesh"
+    name_in_messages = "a mesh"
     mesh: Word
     scale: Annotated[float, Number(1e-9, 1e3, "m")] = 1.0
 
@@ -139,7 +139,7 @@ class PlacedTable(Table):
 class BoundaryTable(PlacedTable):
     """Section `[electrodes]` of electrodes that are arcs on the edge of a sheet. `contact_impedance` in ohm·m."""
 
-    subject = "electrodes of kind 'boundary'"
+    name_in_messages = "electrodes of kind 'boundary'"
     hints: ClassVar[dict[str, str]] = {"contact_impedance": _UNKNOWN_IMPEDANCE.format("0.01 (ohm·m)")}
     kind: Literal["boundary"] = "boundary"
     width: Sizes
@@ -149,7 +149,7 @@ class BoundaryTable(PlacedTable):
 class DiscTable(PlacedTable):
     """Section `[electrodes]` of electrodes that are discs."""
 
-    subject = "electrodes of kind 'disc'"
+    name_in_messages = "electrodes of kind 'disc'"
     hints: ClassVar[dict[str, str]] = {"contact_impedance": _UNKNOWN_IMPEDANCE.format("1e-3 (ohm·m²)")}
     kind: Literal["disc"]
     radius: Sizes
@@ -159,7 +159,7 @@ class DiscTable(PlacedTable):
 class PatchTable(PlacedTable):
     """Section `[electrodes]` of electrodes that are rectangles on a solid."""
 
-    subject = "electrodes of kind 'patch'"
+    name_in_messages = "electrodes of kind 'patch'"
     hints: ClassVar[dict[str, str]] = {"contact_impedance": _UNKNOWN_IMPEDANCE.format("1e-3 (ohm·m²)")}
     kind: Literal["patch"]
     width: Sizes
@@ -170,17 +170,17 @@ class PatchTable(PlacedTable):
 class PointTable(PlacedTable):
     """Section `[electrodes]` of electrodes that are points."""
 
-    subject = "electrodes of kind 'point'"
+    name_in_messages = "electrodes of kind 'point'"
     kind: Literal["point"]
 
 
 class FacetsTable(Table):
     """Section `[electrodes]` of electrodes that are named groups of boundary facets of a mesh."""
 
-    subject = "electrodes of kind 'facets'"
+    name_in_messages = "electrodes of kind 'facets'"
     hints: ClassVar[dict[str, str]] = {"contact_impedance": _UNKNOWN_IMPEDANCE.format("1e-3 (ohm·m²)")}
     kind: Literal["facets"]
-    tags: Annotated[list[Word], Field(min_length=1, max_length=MOST_ELECTRODES), FailFast()]
+    tags: Annotated[list[Word], Field(min_length=1, max_length=MAX_ELECTRODES), FailFast()]
     contact_impedance: Impedances
 
 
@@ -216,7 +216,7 @@ class DrivenTable(Table):
 class AdjacentTable(DrivenTable):
     """Section `[protocol]` with the arguments of `jeit.protocol.adjacent`."""
 
-    subject = "the protocol 'adjacent'"
+    name_in_messages = "the protocol 'adjacent'"
     kind: Literal["adjacent"]
     driven_electrodes: bool = False
     reciprocal: Literal["all", "half"] = "all"
@@ -226,7 +226,7 @@ class AdjacentTable(DrivenTable):
 class SkipTable(DrivenTable):
     """Section `[protocol]` with the arguments of `jeit.protocol.skip`."""
 
-    subject = "the protocol 'skip'"
+    name_in_messages = "the protocol 'skip'"
     kind: Literal["skip"]
     skipped: Annotated[int, _ELECTRODE_INDEX]
     measurement_skipped: Annotated[int, _ELECTRODE_INDEX] | None = None
@@ -238,7 +238,7 @@ class SkipTable(DrivenTable):
 class OppositeTable(DrivenTable):
     """Section `[protocol]` with the arguments of `jeit.protocol.opposite`."""
 
-    subject = "the protocol 'opposite'"
+    name_in_messages = "the protocol 'opposite'"
     kind: Literal["opposite"]
     drives: Literal["distinct", "all"] = "distinct"
     driven_electrodes: bool = False
@@ -248,7 +248,7 @@ class OppositeTable(DrivenTable):
 class AgainstOneTable(DrivenTable):
     """Section `[protocol]` with the arguments of `jeit.protocol.all_against_one`."""
 
-    subject = "the protocol 'all_against_one'"
+    name_in_messages = "the protocol 'all_against_one'"
     kind: Literal["all_against_one"]
     common: Annotated[int, _ELECTRODE_INDEX] = 0
     measurement: Literal["common", "adjacent"] = "common"
@@ -259,7 +259,7 @@ class AgainstOneTable(DrivenTable):
 class ReferenceTable(DrivenTable):
     """Section `[protocol]` with the arguments of `jeit.protocol.reference_electrode`. `number`: boundary electrodes."""
 
-    subject = "the protocol 'reference_electrode'"
+    name_in_messages = "the protocol 'reference_electrode'"
     kind: Literal["reference_electrode"]
     skipped: Annotated[int, _ELECTRODE_INDEX] = 0
     reference: Annotated[int, _ELECTRODE_INDEX] | None = None
@@ -270,7 +270,7 @@ class ReferenceTable(DrivenTable):
 class TwoTerminalTable(DrivenTable):
     """Section `[protocol]` with the arguments of `jeit.protocol.two_terminal`."""
 
-    subject = "the protocol 'two_terminal'"
+    name_in_messages = "the protocol 'two_terminal'"
     kind: Literal["two_terminal"]
     pairs: Pairs | None = None
 
@@ -285,7 +285,7 @@ class AllAtOnceTable(DrivenTable):
 class TrigonometricTable(AllAtOnceTable):
     """Section `[protocol]` with the arguments of `jeit.protocol.trigonometric`."""
 
-    subject = "the protocol 'trigonometric'"
+    name_in_messages = "the protocol 'trigonometric'"
     kind: Literal["trigonometric"]
     measurement: Reading = "adjacent"
 
@@ -293,7 +293,7 @@ class TrigonometricTable(AllAtOnceTable):
 class HaarTable(AllAtOnceTable):
     """Section `[protocol]` with the arguments of `jeit.protocol.haar`."""
 
-    subject = "the protocol 'haar'"
+    name_in_messages = "the protocol 'haar'"
     kind: Literal["haar"]
 
 
@@ -301,12 +301,12 @@ class OptimalTable(Table):
     """Section `[protocol]` with the arguments of `jeit.protocol.optimal`. `transfer`, `other`: transfer impedances in
     ohm; `drives`: number of drive patterns; `power` in watts."""
 
-    subject = "the protocol 'optimal'"
+    name_in_messages = "the protocol 'optimal'"
     kind: Literal["optimal"]
     name: Word | None = None
     transfer: Patterns
     other: Patterns | None = None
-    drives: Annotated[int, Number(1, MOST_ELECTRODES)] | None = None
+    drives: Annotated[int, Number(1, MAX_ELECTRODES)] | None = None
     power: Annotated[float, Number(1e-15, 1e3, "W")] | None = None
     measurement: Reading = "mean-removed"
     reference: Annotated[int, _ELECTRODE_INDEX] | None = None
@@ -324,7 +324,7 @@ class MeasuredTable(Table):
     """Section `[protocol]` for currents that are stored in the data file. `drive_key`, `measurement_key`: names of the
     matrices in the data file."""
 
-    subject = "a protocol of measured currents"
+    name_in_messages = "a protocol of measured currents"
     kind: Literal["measured"]
     name: Word | None = None
     drive_key: Word = "current_patterns"
@@ -338,7 +338,7 @@ class MeasuredTable(Table):
 class BipolarTable(DrivenTable):
     """Section `[protocol]` with the arguments of `jeit.protocol.bipolar`."""
 
-    subject = "the protocol 'bipolar'"
+    name_in_messages = "the protocol 'bipolar'"
     kind: Literal["bipolar"]
     drive_pairs: Pairs
     measurement_pairs: Pairs
@@ -350,7 +350,7 @@ class MatricesTable(Table):
     """Section `[protocol]` that combines every drive pattern, in amperes, with the measurement patterns selected by
     `select`."""
 
-    subject = "a protocol of matrices"
+    name_in_messages = "a protocol of matrices"
     kind: Literal["matrices"]
     name: Word = "matrices"
     drive: Patterns
@@ -362,7 +362,7 @@ class ChannelsTable(Table):
     """Section `[protocol]` that specifies for each channel the indices, counted from 0, of its drive pattern (in
     amperes) and of its measurement pattern."""
 
-    subject = "a protocol of channels"
+    name_in_messages = "a protocol of channels"
     kind: Literal["channels"]
     name: Word = "channels"
     drive: Patterns
@@ -374,7 +374,7 @@ class ChannelsTable(Table):
 class DataTable(Table):
     """Section `[data]`: arrangement of the numbers in the data file."""
 
-    subject = "[data]"
+    name_in_messages = "[data]"
     frames_in: Literal["rows", "columns"] | None = None
     delimiter: Annotated[str, Field(max_length=10)] | None = None
     skip_rows: Annotated[int, Number(0, 10**9)] | None = None
@@ -405,14 +405,14 @@ class DataTable(Table):
 class NotesTable(Table):
     """Section `[notes]`: sentences that are copied to the notes of the measurement."""
 
-    subject = "[notes]"
+    name_in_messages = "[notes]"
     text: Annotated[list[Annotated[str, Field(max_length=10_000)]], FailFast()] = Field(default=[])
 
 
 class UncertaintyTable(Table):
     """Section `[uncertainty]`: standard deviations of the described properties of the sensor."""
 
-    subject = "[uncertainty]"
+    name_in_messages = "[uncertainty]"
     position: Annotated[float, Number(0, 1e3, "m")] | None = None
     position_degrees: Annotated[float, Number(0, 90, "degrees")] | None = None
     contact_drift_percent: Annotated[float, Number(0, 1000, "%")] = 100 * Uncertainty().drift
@@ -434,18 +434,18 @@ ConstructedTable = (
 )  # fmt: skip
 ProtocolTable = ConstructedTable | OptimalTable | MatricesTable | ChannelsTable | MeasuredTable
 
-_SHAPE = OneOf(
+_SHAPE = TableOfKind(
     "shape", DiskTable, RectangleTable, PolygonTable, BoxTable, CylinderTable,
     alternative_key="mesh", alternative_table=MeshTable,
     synonyms={"circle": "disk", "tank": "cylinder", "tube": "cylinder", "cube": "box", "cuboid": "box",
               "square": "rectangle"},
 )  # fmt: skip
-_ELECTRODES = OneOf(
+_ELECTRODES = TableOfKind(
     "kind", BoundaryTable, DiscTable, PatchTable, PointTable, FacetsTable,
     synonyms={"strip": "patch", "plate": "patch", "bar": "patch", "rectangle": "patch", "square": "patch",
               "circle": "disc", "round": "disc", "arc": "boundary", "edge": "boundary", "mesh": "facets"},
 )  # fmt: skip
-_PROTOCOL = OneOf(
+_PROTOCOL = TableOfKind(
     "kind", AdjacentTable, SkipTable, OppositeTable, AgainstOneTable, ReferenceTable, TwoTerminalTable,
     TrigonometricTable, HaarTable, OptimalTable, BipolarTable, MatricesTable, ChannelsTable, MeasuredTable,
 )  # fmt: skip
@@ -454,7 +454,7 @@ _PROTOCOL = OneOf(
 class DescriptionTable(Table):
     """All sections of a description file."""
 
-    subject = "a description"
+    name_in_messages = "a description"
     title: Annotated[str, Field(max_length=1000)] = ""
     geometry: Annotated[GeometryTable, _SHAPE] | None = None
     electrodes: Annotated[ElectrodesTable, _ELECTRODES] | None = None

@@ -15,7 +15,7 @@ from jeit.data.described_body import ELECTRODES
 from jeit.data.described_protocol import PROTOCOL_ARRAYS
 from jeit.data.measurement import Measurement
 from jeit.electrodes import AbstractElectrodes, NodeElectrodes, electrodes_from_nodes
-from jeit.files import check_memory, read_as, whole_files
+from jeit.files import atomically_written_files, check_memory, read_as
 from jeit.forward import ForwardModel
 from jeit.mesh import Body, Mesh
 from jeit.mesh.outline import OUTLINES
@@ -68,7 +68,7 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
     if measurement.times is not None:
         arrays["times"] = np.asarray(measurement.times)
     description_path = data_path.with_suffix(".toml")
-    with whole_files(data_path.parent) as temporary_folder:
+    with atomically_written_files(data_path.parent) as temporary_folder:
         np.savez_compressed(
             temporary_folder / data_path.name,
             voltages=np.asarray(measurement.voltages),

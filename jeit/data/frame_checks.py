@@ -24,27 +24,27 @@ from jeit_solvers.engines import as_array
 
 # Maximum fraction of voltages with an impossible sign. A quarter means that half of the voltages are noise, because
 # noise has the wrong sign half of the time.
-MOST_IMPOSSIBLE_SIGNS = 0.25
+MAX_IMPOSSIBLE_SIGN_SHARE = 0.25
 # Fraction of voltages with an impossible sign above which the polarity is reversed: noise alone yields only one half.
-MOST_OPPOSITE_SIGNS = 0.75
+REVERSED_POLARITY_SIGN_SHARE = 0.75
 # Maximum reciprocity error of a frame. A reciprocity error r corresponds to a ratio of noise to signal of
 # r / sqrt(2 - r²), here one half.
-MOST_RECIPROCITY_ERROR = 0.63
+MAX_RECIPROCITY_ERROR = 0.63
 # Maximum of `FrameQuality.noise_share` that raises no doubt; it corresponds to that reciprocity error.
-MOST_NOISE = MOST_RECIPROCITY_ERROR / np.sqrt(2)
+MAX_NOISE_SHARE = MAX_RECIPROCITY_ERROR / np.sqrt(2)
 # Share of a common factor in the power of the difference above which it is drift of the bath or of a gain. In simulated
 # tanks it was 0.82 to 0.99 with 3 to 100 % drift, and at most 0.55 without drift, even if half of the tank resists.
-_MOST_COMMON = 0.7
+_MAX_COMMON_FACTOR_SHARE = 0.7
 # Maximum fraction of the noise that is left without the channels of an electrode that explains the noise.
-_MOST_LEFT = 0.5
+_MAX_REMAINING_NOISE_SHARE = 0.5
 # Minimum evidence that a difference contains more than noise, in standard deviations (`signal_evidence`). Bodies are
 # found reliably where noise exceeds the signal, because a body alters many channels in a pattern.
 MIN_SIGNAL_EVIDENCE = 3.0
 # Cosine of the angle between a frame and its reference below which the frame or the reference has the opposite
 # polarity.
-_MIN_COSINE = -0.5
+_OPPOSITE_POLARITY_COSINE = -0.5
 # Maximum fraction of the difference between frame and reference that is due to rounding of the voltages.
-_MAX_ROUNDING = 0.7
+_MAX_ROUNDING_SHARE = 0.7
 
 
 @dataclass(frozen=True)
@@ -98,9 +98,11 @@ class FrameQuality:
     @property
     def doubt(self) -> str:
         """A sentence about noise that exceeds half of the signal; otherwise empty."""
-        if self.noise_share is None or self.noise_share <= MOST_NOISE:
+        if self.noise_share is None or self.noise_share <= MAX_NOISE_SHARE:
             return ""
-        found = f"by {self.noise_source}, noise is {percent(self.noise_share)} of the difference from the reference"
+        noise_text = (
+            f"by {self.noise_source}, noise is {percent(self.noise_share)} of the difference from the reference"
+        )
         if self.common_factor:
             return (
                 f"all voltages have changed by {percent(self.common_factor)} alike, as when a bath's temperature or a "
@@ -109,12 +111,12 @@ class FrameQuality:
             )
         if self.noisy_electrode is not None:
             return (
-                f"{found}, most of it in the channels of electrode {self.noisy_electrode + 1}: check its contact and "
-                "cable, or leave the channels out (NaN in the file)."
+                f"{noise_text}, most of it in the channels of electrode {self.noisy_electrode + 1}: check its contact "
+                "and cable, or leave the channels out (NaN in the file)."
             )
         return (
-            f"{found} (apart from {self.noise_apart_from}): bodies may be missed, or shown where none are. Average "
-            "more frames, or use more current."
+            f"{noise_text} (apart from {self.noise_apart_from}): bodies may be missed, or shown where none are. "
+            "Average more frames, or use more current."
         )
 
     def of_rest(self, share: float) -> FrameQuality:
@@ -178,8 +180,8 @@ def check_same_setup(measurement: Measurement, reference: Measurement) -> None:
     if not common_channels.any():
         raise ValueError(f"'{measurement.name}' and the reference '{reference.name}' have no usable channel in common.")
     sizes = [
-        np.median(np.abs(np.asarray(compared.mean_frame().voltages)[0, common_channels]))
-        for compared in (measurement, reference)
+        np.median(np.abs(np.asarray(compared_measurement.mean_frame().voltages)[0, common_channels]))
+        for compared_measurement in (measurement, reference)
     ]
     ratio = sizes[0] / sizes[1] if sizes[1] > 0 else np.inf
     if not 1 / 100 < ratio < 100:
@@ -219,22 +221,25 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
     results = []
     for frame_index in range(measurement.num_frames):
         frame = measurement.frame(frame_index)
-        common_mask = np.asarray(frame.mask) & np.asarray(mean.mask)
+        mask_of_common_channels = np.asarray(frame.mask) & np.asarray(mean.mask)
         change = Measurement(
-            np.where(common_mask, np.asarray(frame.voltages) - np.asarray(mean.voltages), np.nan),
-            common_mask,
+            np.where(mask_of_common_channels, np.asarray(frame.voltages) - np.asarray(mean.voltages), np.nan),
+            mask_of_common_channels,
             measurement.protocol,
         )
         size = float(np.linalg.norm(np.asarray(change.filled())))
         relative_difference = size / float(
-            np.linalg.norm(np.where(common_mask, np.asarray(mean.filled()), 0)) or np.inf
+            np.linalg.norm(np.where(mask_of_common_channels, np.asarray(mean.filled()), 0)) or np.inf
         )
-        signs = [
+        sign_shares = [
             float(fractions[0]) for fractions in (impossible_signs(frame), reference_signs) if fractions is not None
         ]
-        num_usable = int(common_mask.sum())
+        num_usable = int(mask_of_common_channels.sum())
         cosine = _cosine_similarity(
-            *(np.where(common_mask, np.asarray(each_frame.filled()), 0).ravel() for each_frame in (frame, mean))
+            *(
+                np.where(mask_of_common_channels, np.asarray(each_frame.filled()), 0).ravel()
+                for each_frame in (frame, mean)
+            )
         )
         error, evidence = (
             (reciprocity_error(change, deviations), signal_evidence(change, deviations))
@@ -249,7 +254,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
             f"the reference '{reference.name}'": reference_error,
             "the frame": reciprocity_error(frame),
         }
-        impossible_share = max(signs) if signs else None
+        impossible_share = max(sign_shares) if sign_shares else None
         rounding_fraction = float(np.linalg.norm(rounding_of_difference(frame, mean))) / size if size > 0 else 0.0
         results.append(
             FrameQuality(
@@ -262,7 +267,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
                 rounding=rounding_fraction,
                 noise_share=noise_share,
                 noisy_electrode=noisy_electrode,
-                common_factor=float(np.real(factor)) if common_share > _MOST_COMMON else 0.0,
+                common_factor=float(np.real(factor)) if common_share > _MAX_COMMON_FACTOR_SHARE else 0.0,
                 reason=_rejection_reason(
                     measurement.protocol.num_electrodes,
                     num_usable,
@@ -298,20 +303,27 @@ def _find_noise_share(
     voltages have in common."""
     protocol = change.protocol
     voltages, levels = np.nan_to_num(np.asarray(change.voltages)[0]), np.nan_to_num(np.asarray(mean.voltages)[0])
-    remaining_change = replace(change, voltages=as_array((voltages - factor * levels)[None]))
-    if not (error := reciprocity_error(remaining_change, deviations)):
+    change_without_common_factor = replace(change, voltages=as_array((voltages - factor * levels)[None]))
+    if not (error := reciprocity_error(change_without_common_factor, deviations)):
         return error, None
     noise_share, electrode = min(1.0, error / np.sqrt(2)), None
-    if noise_share > MOST_NOISE:
-        square = np.nan_to_num(channel_reciprocity_error(remaining_change)[0] / deviations) ** 2
+    if noise_share > MAX_NOISE_SHARE:
+        squared_relative_error = (
+            np.nan_to_num(channel_reciprocity_error(change_without_common_factor)[0] / deviations) ** 2
+        )
         touching = np.array(
             [protocol.channels_touching(electrode_index) for electrode_index in range(protocol.num_electrodes)]
         )
-        noisiest_electrode = int(np.argmax(touching @ square / np.maximum(touching.sum(axis=1), 1)))
+        noisiest_electrode = int(np.argmax(touching @ squared_relative_error / np.maximum(touching.sum(axis=1), 1)))
         remaining_error = reciprocity_error(
-            remaining_change.masked(~touching[noisiest_electrode], "they use the noisy electrode."), deviations
+            change_without_common_factor.masked(~touching[noisiest_electrode], "they use the noisy electrode."),
+            deviations,
         )
-        electrode = noisiest_electrode if remaining_error is not None and remaining_error < _MOST_LEFT * error else None
+        electrode = (
+            noisiest_electrode
+            if remaining_error is not None and remaining_error < _MAX_REMAINING_NOISE_SHARE * error
+            else None
+        )
     return noise_share, electrode
 
 
@@ -322,8 +334,8 @@ def rounding_of_difference(frame: Measurement, reference: Measurement) -> Float[
         rounding_deviation(np.asarray(measurement.voltages)[0], np.asarray(measurement.mask)[0])
         for measurement in (frame, reference)
     ]
-    common_mask = np.asarray(frame.mask)[0] & np.asarray(reference.mask)[0]
-    return np.where(common_mask, np.hypot(*deviations), 0.0)
+    mask_of_common_channels = np.asarray(frame.mask)[0] & np.asarray(reference.mask)[0]
+    return np.where(mask_of_common_channels, np.hypot(*deviations), 0.0)
 
 
 def check_imageable(measurement: Measurement, reference: Measurement) -> list[FrameQuality]:
@@ -371,27 +383,27 @@ def _rejection_reason(
         )
     if relative_difference < 1e-12:
         return "it equals its reference, so there is no difference to image. Is it the same file?"
-    if rounding_fraction > _MAX_ROUNDING:
+    if rounding_fraction > _MAX_ROUNDING_SHARE:
         return (
             f"its difference from the reference, {percent(relative_difference)}, is mostly rounding of the voltages: "
             "record them with more digits."
         )
-    if impossible_share is not None and impossible_share > MOST_OPPOSITE_SIGNS:
+    if impossible_share is not None and impossible_share > REVERSED_POLARITY_SIGN_SHARE:
         return (
             f"{percent(impossible_share)} of the voltages have a sign that no passive body gives: reverse the polarity "
             "of it, or of its reference."
         )
-    if impossible_share is not None and impossible_share > MOST_IMPOSSIBLE_SIGNS:
+    if impossible_share is not None and impossible_share > MAX_IMPOSSIBLE_SIGN_SHARE:
         return (
             f"too noisy: {percent(impossible_share)} of the voltages have a sign that no passive body gives, so that "
             "more than half of them lie below the instrument's noise or offset. Measure with more current or gain."
         )
-    if cosine < _MIN_COSINE:
+    if cosine < _OPPOSITE_POLARITY_COSINE:
         return (
             "its voltages have the opposite sign of its reference's: reverse the polarity of it, or of its reference."
         )
     for name, error in errors_by_name.items():
-        if error is not None and error > MOST_RECIPROCITY_ERROR:
+        if error is not None and error > MAX_RECIPROCITY_ERROR:
             return (
                 f"{name} breaks reciprocity by {percent(error)} on its own: it is too noisy, or its channels are in "
                 "another order than described. See `jeit info`."

@@ -15,7 +15,7 @@ from jeit.data.description import Description, TableLayout
 from jeit.data.formats import table
 from jeit.data.formats.text import frames_in_table
 from jeit.data.measurement import Measurement
-from jeit.files import npz_arrays, require_arrays, written_whole
+from jeit.files import atomically_written_file, npz_arrays, require_arrays
 
 
 def join(measurements: Sequence[Measurement]) -> Measurement:
@@ -50,8 +50,8 @@ def join(measurements: Sequence[Measurement]) -> Measurement:
             )
     names = tuple(name for measurement in measurements for name in measurement.frame_names)
     time_arrays: list[Any] = [measurement.times for measurement in measurements]
-    lacks_times = any(times is None for times in time_arrays)
-    times = None if lacks_times else np.concatenate([np.asarray(times) for times in time_arrays])
+    has_missing_times = any(times is None for times in time_arrays)
+    times = None if has_missing_times else np.concatenate([np.asarray(times) for times in time_arrays])
     mask = np.concatenate([np.asarray(measurement.mask) for measurement in measurements])
     return replace(
         first_measurement,
@@ -181,11 +181,9 @@ def _times(values: np.ndarray, name: str, num_frames: int) -> Float[np.ndarray, 
         raise ValueError(f"{name}: some are not finite.")
     if num_frames > 1 and seconds[0] == seconds[-1] and not np.diff(seconds).any():
         raise ValueError(f"{name} are all {seconds[0]:g}: give when each frame came.")
-    falling_frames = np.flatnonzero(np.diff(seconds) < 0)
-    if falling_frames.size:
-        raise ValueError(
-            f"{name} fall after frame {falling_frames[0]}, {seconds[falling_frames[0]]:g} s: sort frames by time."
-        )
+    decreases = np.flatnonzero(np.diff(seconds) < 0)
+    if decreases.size:
+        raise ValueError(f"{name} fall after frame {decreases[0]}, {seconds[decreases[0]]:g} s: sort frames by time.")
     return seconds
 
 
@@ -278,7 +276,7 @@ class GestureSet:
 
     def write(self, path: str | Path) -> None:
         """Write the gesture set to an NPZ file. Raises `OSError` if the file cannot be written."""
-        with written_whole(path) as file:
+        with atomically_written_file(path) as file:
             np.savez_compressed(file, **{name: getattr(self, name) for name in _ARRAY_NAMES})
 
     @classmethod

@@ -24,7 +24,7 @@ from jeit.protocol.patterns import shares_electrode
 # error, divided by the error of the described order, is below the second value.
 _MAX_TRUSTED_ERROR, _MAX_ERROR_RATIO = 0.25, 0.4
 # Cosine of the angle between a frame and its reference below which the frame or the reference has the opposite sign.
-_OPPOSITE_COSINE = -0.5
+_OPPOSITE_SIGN_COSINE = -0.5
 
 
 def fitting_protocol(
@@ -75,10 +75,10 @@ def _mean_frame_error(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) ->
 
 def unmeasured_driven_channels(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) -> Bool[np.ndarray, " M"]:
     """Mask (channels,) of the channels on driven electrodes that are zero in every frame, i.e. were not measured."""
-    shared = shares_electrode(np.asarray(protocol.drive), np.asarray(protocol.measurement))
-    driven = shared[np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)]
-    zero = (np.atleast_2d(frames) == 0).all(axis=0)
-    return driven & zero & ~zero.all()
+    is_on_driven_electrode = shares_electrode(np.asarray(protocol.drive), np.asarray(protocol.measurement))
+    driven = is_on_driven_electrode[np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)]
+    is_zero = (np.atleast_2d(frames) == 0).all(axis=0)
+    return driven & is_zero & ~is_zero.all()
 
 
 def correct_signs(measurement: Measurement, like: Measurement | None = None) -> Measurement:
@@ -88,21 +88,27 @@ def correct_signs(measurement: Measurement, like: Measurement | None = None) -> 
     values, usable = np.asarray(measurement.voltages), np.asarray(measurement.mask)
     if like is not None and like.protocol.same_patterns(measurement.protocol):
         common_channels = usable.all(axis=0) & np.asarray(like.mask).all(axis=0)
-        usable_levels, theirs = (
-            np.real(np.asarray(compared.voltages)).mean(axis=0)[common_channels] for compared in (measurement, like)
+        usable_levels, reference_levels = (
+            np.real(np.asarray(compared_measurement.voltages)).mean(axis=0)[common_channels]
+            for compared_measurement in (measurement, like)
         )
-        size = np.linalg.norm(usable_levels) * np.linalg.norm(theirs)
-        if size and usable_levels @ theirs > -_OPPOSITE_COSINE * size:
+        size = np.linalg.norm(usable_levels) * np.linalg.norm(reference_levels)
+        if size and usable_levels @ reference_levels > -_OPPOSITE_SIGN_COSINE * size:
             return measurement  # the signs agree with the reference
-        if size and usable_levels @ theirs < _OPPOSITE_COSINE * size:
+        if size and usable_levels @ reference_levels < _OPPOSITE_SIGN_COSINE * size:
             sign_note = f"the voltages are reversed, to agree with '{like.name}' (polarity = \"reversed\")."
             return _replace_voltages(measurement, -values, sign_note)
     known_voltages = np.real(values[usable])
     has_one_sign = (known_voltages >= 0).all() or (known_voltages <= 0).all()
-    signs = _signs(measurement)
-    if signs is None or not has_one_sign or not (signs[usable.any(axis=0)] != 0).all() or not known_voltages.any():
+    corrected_signs = _signs(measurement)
+    if (
+        corrected_signs is None
+        or not has_one_sign
+        or not (corrected_signs[usable.any(axis=0)] != 0).all()
+        or not known_voltages.any()
+    ):
         return measurement
-    signed_values = np.abs(np.real(values)) * signs
+    signed_values = np.abs(np.real(values)) * corrected_signs
     if (signed_values[usable] == np.real(values)[usable]).all():
         return measurement
     if (signed_values[usable] == -np.real(values)[usable]).all():

@@ -17,7 +17,7 @@ from jeit.inverse.placement import Uncertainty
 from jeit.mesh import Body, Mesh
 from jeit.mesh.solid_body import as_body
 from jeit.protocol import Protocol
-from jeit_solvers.engines import as_array, either_engine, has_values, namespace, on_host
+from jeit_solvers.engines import as_array, has_values, namespace, numpy_or_compiled, on_host
 from jeit_solvers.module import Module
 
 
@@ -290,17 +290,17 @@ def _frames(values):
     return np.atleast_2d(on_host(values)) if has_values(values) else jnp.atleast_2d(values)
 
 
-@either_engine
+@numpy_or_compiled
 def _fill_masked(voltages, mask, value):
     return namespace(voltages, mask).where(mask, voltages, value)
 
 
-@either_engine
+@numpy_or_compiled
 def _select_rows(voltages, mask, row_indices):
     return voltages[row_indices], mask[row_indices]
 
 
-@either_engine
+@numpy_or_compiled
 def _mean(voltages, mask):
     xp = namespace(voltages, mask)
     num_usable = mask.sum(axis=0)

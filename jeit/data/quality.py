@@ -21,10 +21,10 @@ from jeit.protocol import Protocol
 from jeit.protocol.reciprocity import transfer_between_drives
 
 # Maximum number of frames from which a recording is judged; longer recordings are sampled evenly.
-_MAX_FRAMES = 32
+_MAX_ASSESSED_FRAMES = 32
 # Detection of rounding: largest number of significant digits, relative accuracy of multiples of a step (single
 # precision), and smallest number of voltages that can show rounding.
-_MAX_DIGITS, _RELATIVE_ACCURACY, _MIN_VOLTAGES = 5, 1e-6, 16
+_MAX_SIGNIFICANT_DIGITS, _RELATIVE_STEP_ACCURACY, _MIN_VOLTAGES_FOR_ROUNDING_STEP = 5, 1e-6, 16
 
 
 @dataclass(frozen=True)
@@ -155,24 +155,24 @@ def expected_signs(protocol: Protocol, electrode_order: Int[np.ndarray, " L"]) -
     pairs of electrodes.
     """
     num_electrodes = protocol.num_electrodes
-    rank = np.empty(num_electrodes, dtype=int)
-    rank[electrode_order] = np.arange(len(electrode_order))
+    rank_of_electrode = np.empty(num_electrodes, dtype=int)
+    rank_of_electrode[electrode_order] = np.arange(len(electrode_order))
     drive, measurement = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
-    uses_pairs = (np.count_nonzero(drive, axis=1) == 2) & (np.count_nonzero(measurement, axis=1) == 2)
-    source = rank[drive.argmax(axis=1)]
+    is_pair_of_electrodes = (np.count_nonzero(drive, axis=1) == 2) & (np.count_nonzero(measurement, axis=1) == 2)
+    source = rank_of_electrode[drive.argmax(axis=1)]
     # Ranks are positions along the boundary counted from the source: the potential falls from rank 0 to sink, and rises
     # from sink to num_electrodes.
-    sink = (rank[drive.argmin(axis=1)] - source) % num_electrodes
-    positive_rank = (rank[measurement.argmax(axis=1)] - source) % num_electrodes
-    negative_rank = (rank[measurement.argmin(axis=1)] - source) % num_electrodes
-    is_falling = (positive_rank <= sink) & (negative_rank <= sink)
+    sink_rank = (rank_of_electrode[drive.argmin(axis=1)] - source) % num_electrodes
+    positive_rank = (rank_of_electrode[measurement.argmax(axis=1)] - source) % num_electrodes
+    negative_rank = (rank_of_electrode[measurement.argmin(axis=1)] - source) % num_electrodes
+    is_falling = (positive_rank <= sink_rank) & (negative_rank <= sink_rank)
     signs = np.where(is_falling, np.sign(negative_rank - positive_rank), 0)
     positive_rank, negative_rank = (
         np.where(positive_rank == 0, num_electrodes, positive_rank),
         np.where(negative_rank == 0, num_electrodes, negative_rank),
     )
-    is_rising = (positive_rank >= sink) & (negative_rank >= sink) & ~is_falling
-    return np.where(uses_pairs, np.where(is_rising, np.sign(positive_rank - negative_rank), signs), 0)
+    is_rising = (positive_rank >= sink_rank) & (negative_rank >= sink_rank) & ~is_falling
+    return np.where(is_pair_of_electrodes, np.where(is_rising, np.sign(positive_rank - negative_rank), signs), 0)
 
 
 def impossible_signs(
@@ -199,9 +199,9 @@ def impossible_signs(
     order = boundary_order(measurement) if order is None else order
     if order is None:
         return None
-    signs = expected_signs(measurement.protocol, order)
-    has_known_sign = np.asarray(measurement.mask) & (signs != 0)
-    has_wrong_sign = has_known_sign & (np.sign(np.real(np.asarray(measurement.voltages))) == -signs)
+    expected = expected_signs(measurement.protocol, order)
+    has_known_sign = np.asarray(measurement.mask) & (expected != 0)
+    has_wrong_sign = has_known_sign & (np.sign(np.real(np.asarray(measurement.voltages))) == -expected)
     num_known = has_known_sign.sum(axis=1)
     if not num_known.any():
         return None
@@ -266,26 +266,30 @@ def rounding_deviation(voltages: Float[np.ndarray, " M"], mask: Bool[np.ndarray,
     """
     voltage_magnitudes, mask = np.abs(np.real(np.asarray(voltages))), np.asarray(mask)
     values = voltage_magnitudes[mask & (voltage_magnitudes > 0)]
-    if len(values) < _MIN_VOLTAGES:
+    if len(values) < _MIN_VOLTAGES_FOR_ROUNDING_STEP:
         return np.zeros(len(voltage_magnitudes))
     magnitudes = np.where(mask, np.maximum(voltage_magnitudes, values.min()), values.min())
-    steps = [10.0 ** (np.floor(np.log10(magnitudes) + _RELATIVE_ACCURACY) - digits) for digits in range(_MAX_DIGITS)]
+    steps = [
+        10.0 ** (np.floor(np.log10(magnitudes) + _RELATIVE_STEP_ACCURACY) - digits)
+        for digits in range(_MAX_SIGNIFICANT_DIGITS)
+    ]
     gaps = np.diff(np.unique(np.append(0, values)))
-    smallest_gap = gaps[gaps > _RELATIVE_ACCURACY * values.max()].min()
+    smallest_gap = gaps[gaps > _RELATIVE_STEP_ACCURACY * values.max()].min()
     steps += [np.full(len(voltage_magnitudes), smallest_gap / divisor) for divisor in (1, 2, 3)]
     candidates = [step for step in steps if _are_multiples(voltage_magnitudes[mask], step[mask])]
-    coarsest = max(
+    coarsest_step = max(
         candidates, key=lambda step: float(np.log(step[mask]).sum()), default=np.zeros(len(voltage_magnitudes))
     )
-    return coarsest / np.sqrt(12)
+    return coarsest_step / np.sqrt(12)
 
 
 def _are_multiples(values: np.ndarray, step: np.ndarray) -> bool:
-    """Whether each value is a multiple of its step, with a quotient of at most `_MAX_DIGITS` digits."""
+    """Whether each value is a multiple of its step, with a quotient of at most `_MAX_SIGNIFICANT_DIGITS` digits."""
     quotients = values / step
     remainders = np.abs(quotients - np.round(quotients))
     return bool(
-        (quotients < 10**_MAX_DIGITS).all() and (remainders <= _RELATIVE_ACCURACY * np.maximum(quotients, 1)).all()
+        (quotients < 10**_MAX_SIGNIFICANT_DIGITS).all()
+        and (remainders <= _RELATIVE_STEP_ACCURACY * np.maximum(quotients, 1)).all()
     )
 
 
@@ -301,7 +305,7 @@ def _asymmetry(
     only the diagonal.
     """
     protocol = measurement.protocol
-    frames = np.unique(np.linspace(0, measurement.num_frames - 1, _MAX_FRAMES).round().astype(int))
+    frames = np.unique(np.linspace(0, measurement.num_frames - 1, _MAX_ASSESSED_FRAMES).round().astype(int))
     voltages = np.nan_to_num(np.asarray(measurement.voltages)[frames])
     masks = np.asarray(measurement.mask)[frames]
 
@@ -343,7 +347,7 @@ def _robust_deviation(values: np.ndarray) -> float:
 
 
 # Maximum number of electrodes that a note lists.
-_MAX_LISTED = 40
+_MAX_LISTED_ELECTRODES = 40
 # Maximum difference, between two orders of electrodes, of the fractions of impossible signs that can be due to noise.
 _MAX_CHANCE_DIFFERENCE = 0.01
 
@@ -354,8 +358,8 @@ def describe_electrode_order(measurement: Measurement) -> str | None:
     order = boundary_order(measurement)
     if order is None or len(order) < 4 or is_cyclic_sequence(order):
         return None
-    electrode_list = ", ".join(str(number + 1) for number in _rotate_to_first(order)[:_MAX_LISTED])
-    ellipsis = " …" if len(order) > _MAX_LISTED else ""
+    electrode_list = ", ".join(str(number + 1) for number in _rotate_to_first(order)[:_MAX_LISTED_ELECTRODES])
+    ellipsis = " …" if len(order) > _MAX_LISTED_ELECTRODES else ""
     order_text = f"going round the edge, the positions of the electrodes come in the order {electrode_list}{ellipsis}"
     position_signs, number_signs = (
         impossible_signs(measurement, electrode_order) for electrode_order in (order, np.arange(len(order)))

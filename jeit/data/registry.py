@@ -13,7 +13,7 @@ from jeit.data.measurement import Measurement
 from jeit.files import check_memory
 
 # Maximum bytes of memory per byte of a text file.
-_MEMORY_FACTOR = 4
+_MEMORY_PER_FILE_BYTE = 4
 
 
 @dataclass(frozen=True)
@@ -124,8 +124,8 @@ def read(
         members = sorted(member for member in file.iterdir() if member.is_file() and sciospec.recognises(member))
         if not members or format not in (None, "sciospec"):
             raise ValueError(f"{file} is a folder. Give one data file in it.")
-        check_memory(file.name, _MEMORY_FACTOR * sum(member.stat().st_size for member in members))
-        return replace(sciospec.reader.read_all(members, description), name=file.name, source=str(file))
+        check_memory(file.name, _MEMORY_PER_FILE_BYTE * sum(member.stat().st_size for member in members))
+        return replace(sciospec.reader.read_recordings(members, description), name=file.name, source=str(file))
     if not file.is_file():
         raise ValueError(f"path: there is no file {file}. Check the name and the working directory.")
     if file.stat().st_size == 0:
@@ -178,10 +178,10 @@ def _recognise(file: Path, description: str | Path | None, like: Measurement | N
             f"out what it can, and writes a description. Known: {Kit4.DESCRIPTION}; {Ktc2023.DESCRIPTION}; "
             f"{eidors.DESCRIPTION}."
         )
-    suffix = file.suffix.lower()
-    if known_formats := [name for name, candidate in FORMATS.items() if suffix in candidate.endings]:
+    file_suffix = file.suffix.lower()
+    if known_formats := [name for name, candidate in FORMATS.items() if file_suffix in candidate.endings]:
         raise ValueError(
-            f"{file.name}: its content is that of no known kind of file ending in '{suffix}' "
+            f"{file.name}: its content is that of no known kind of file ending in '{file_suffix}' "
             f"({', '.join(known_formats)}). Is its start damaged, or is it of another program?"
         )
     with file.open("rb") as file_object:
@@ -240,9 +240,9 @@ def _check_signature(file: Path) -> None:
             )
 
 
-def _is_text(head: bytes) -> bool:
+def _is_text(first_bytes: bytes) -> bool:
     try:
-        head.decode("utf-8")
+        first_bytes.decode("utf-8")
     except UnicodeDecodeError as error:
-        return error.start > len(head) - 4 and b"\0" not in head
-    return b"\0" not in head
+        return error.start > len(first_bytes) - 4 and b"\0" not in first_bytes
+    return b"\0" not in first_bytes

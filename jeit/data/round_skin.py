@@ -19,7 +19,7 @@ from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
-from jeit_solvers.engines import either_engine, namespace
+from jeit_solvers.engines import namespace, numpy_or_compiled
 from jeit_solvers.module import Module
 
 
@@ -60,7 +60,7 @@ class RoundSkin(Module):
         return BoundaryElectrodes(position, self.electrode_width, self.contact_impedance)
 
 
-@either_engine
+@numpy_or_compiled
 def pressed_conductivity(
     points: Float[Array, "m 2"], background: float, position, radius: float, strength: float
 ) -> Float[Array, " m"]:

@@ -24,20 +24,20 @@ _MAX_EXTRA_COLUMNS = 4
 # Maximum plausible voltage on an electrode, in volts.
 _MAX_VOLTAGE = 1000.0
 # Minimum number of equal extreme values that count as saturated.
-_MIN_SATURATED = 4
+_MIN_EQUAL_SATURATED_VALUES = 4
 # Minimum deviation of a spike from the value that the other channels imply, in robust standard deviations; minimum
 # fraction of the unexplained power that a spike explains; maximum number of spikes in a frame. The deviation of a spike
 # must also exceed the typical change of a channel.
-_SPIKE_DEVIATIONS, _SPIKE_SHARE, _MAX_SPIKES = 10.0, 0.5, 8
+_MIN_SPIKE_DEVIATIONS, _MIN_SPIKE_POWER_SHARE, _MAX_SPIKES = 10.0, 0.5, 8
 # Of two channels that contradict each other, one is faulty if its change is larger than the change of the other channel
 # by this factor.
-_FAULT_RATIO = 3.0
+_MIN_FAULTY_CHANGE_RATIO = 3.0
 # Minimum fraction of a channel that the other channels leave undetermined; smaller fractions are rounding errors.
-_MIN_FREE_SHARE = 1e-6
+_MIN_UNDETERMINED_SHARE = 1e-6
 # Maximum number of operations to find which voltage changes a body can cause; the search takes up to a second.
 _MAX_OPERATIONS = 2e9
 # Maximum number of distinct masks of frames for which the possible voltage changes are found.
-_MAX_MASKS = 8
+_MAX_DISTINCT_MASKS = 8
 
 
 def screen(
@@ -115,11 +115,11 @@ def screen(
     exclude(_find_saturated(values, usable, saturation), "saturated (stuck at an end of the instrument's range).")
     is_dead, is_alive = _drives_without_and_with_current(values, usable, protocol)
     exclude(is_dead[:, np.asarray(protocol.drive_index)], "their drive's current did not flow.")
-    is_driven, is_read = (np.asarray(patterns) != 0 for patterns in (protocol.drive, protocol.channel_measurement))
+    is_driven, is_measured = (np.asarray(patterns) != 0 for patterns in (protocol.drive, protocol.channel_measurement))
     unconnected = (is_dead @ is_driven) & ~(is_alive @ is_driven)
     numbers = ", ".join(str(electrode + 1) for electrode in np.flatnonzero(unconnected.any(axis=0)))
     connection_note = f"they read electrode {numbers}, through which no drive's current flowed: is it connected?"
-    exclude(unconnected @ is_read.T, connection_note)
+    exclude(unconnected @ is_measured.T, connection_note)
     max_voltage = np.abs(values[usable]).max(initial=0)
     if max_voltage > _MAX_VOLTAGE:
         note_list.append(f"the largest voltage is {max_voltage:.3g} V: are voltages in volts, and currents in amperes?")
@@ -189,8 +189,8 @@ def _find_saturated(values: np.ndarray, usable: np.ndarray, saturation: float | 
         with np.errstate(invalid="ignore"):
             return np.abs(values) >= saturation * (1 - 1e-9)
     result = np.zeros(values.shape, dtype=bool)
-    components = [np.real(values), np.imag(values)] if np.iscomplexobj(values) else [values]
-    for component in components:
+    real_components = [np.real(values), np.imag(values)] if np.iscomplexobj(values) else [values]
+    for component in real_components:
         usable_values = np.where(usable, component, np.nan)
         repeated = _is_minimum_repeated(usable_values) | _is_minimum_repeated(-usable_values)
         for frame in np.flatnonzero(repeated & (usable.sum(axis=1) >= 8)):
@@ -202,7 +202,7 @@ def _find_saturated(values: np.ndarray, usable: np.ndarray, saturation: float | 
                 other_counts = np.delete(counts, [0, len(levels) - 1]) if len(levels) > 2 else np.zeros(1)
                 if (
                     levels[extreme_index] != 0
-                    and counts[extreme_index] >= _MIN_SATURATED
+                    and counts[extreme_index] >= _MIN_EQUAL_SATURATED_VALUES
                     and counts[extreme_index] >= 4 * other_counts.max(initial=0)
                 ):
                     result[frame, np.flatnonzero(row_usable)[level_index == extreme_index]] = True
@@ -210,10 +210,10 @@ def _find_saturated(values: np.ndarray, usable: np.ndarray, saturation: float | 
 
 
 def _is_minimum_repeated(rows: np.ndarray) -> Bool[np.ndarray, " F"]:
-    """Whether at least `_MIN_SATURATED` values of a row equal its minimum. NaN is left out."""
-    if rows.shape[1] < _MIN_SATURATED:
+    """Whether at least `_MIN_EQUAL_SATURATED_VALUES` values of a row equal its minimum. NaN is left out."""
+    if rows.shape[1] < _MIN_EQUAL_SATURATED_VALUES:
         return np.zeros(len(rows), bool)
-    smallest_values = np.partition(rows, _MIN_SATURATED - 1, axis=1)[:, :_MIN_SATURATED]
+    smallest_values = np.partition(rows, _MIN_EQUAL_SATURATED_VALUES - 1, axis=1)[:, :_MIN_EQUAL_SATURATED_VALUES]
     return smallest_values.min(axis=1) == smallest_values.max(axis=1)
 
 
@@ -261,11 +261,11 @@ def mask_spikes(measurement: Measurement, reference: Measurement, *, fill: bool 
         relative_noise(as_array(np.abs(np.where(known_channels, base_voltages, 0))), as_array(known_channels))
     )
     voltages, masks = np.array(measurement.voltages), np.asarray(measurement.mask)
-    spikes, is_filled = np.zeros(masks.shape, bool), np.zeros(masks.shape, bool)
+    spikes, is_filled_frame_channel = np.zeros(masks.shape, bool), np.zeros(masks.shape, bool)
     distinct_masks, mask_index, num_frames = np.unique(
         masks & known_channels, axis=0, return_inverse=True, return_counts=True
     )
-    for pattern_index in np.argsort(-num_frames)[:_MAX_MASKS]:
+    for pattern_index in np.argsort(-num_frames)[:_MAX_DISTINCT_MASKS]:
         mask = distinct_masks[pattern_index]
         basis = _possible_changes(measurement, weight, mask)
         if basis is None:
@@ -278,18 +278,26 @@ def mask_spikes(measurement: Measurement, reference: Measurement, *, fill: bool 
             if fill and is_spike.any():
                 # A channel is determined by the other channels if their rows of the basis span its row.
                 weights = basis[is_spike] @ np.linalg.pinv(basis[~is_spike])
-                is_determined = np.linalg.norm(weights @ basis[~is_spike] - basis[is_spike], axis=1) < _MIN_FREE_SHARE
+                is_determined = (
+                    np.linalg.norm(weights @ basis[~is_spike] - basis[is_spike], axis=1) < _MIN_UNDETERMINED_SHARE
+                )
                 determined_channels = np.flatnonzero(mask)[is_spike][is_determined]
                 voltages[frame, determined_channels] = (
                     base_voltages[determined_channels]
                     + weight[determined_channels] * (weights @ change[~is_spike])[is_determined]
                 )
-                is_filled[frame, determined_channels] = True
+                is_filled_frame_channel[frame, determined_channels] = True
     reason = f"spikes, which contradict the other channels ({_listed_spikes(spikes)})."
-    if is_filled.any():
-        spike_note = f"{counted(int(is_filled.sum()), 'voltage')} replaced by what others determine: {reason}"
+    if is_filled_frame_channel.any():
+        spike_note = (
+            f"{counted(int(is_filled_frame_channel.sum()), 'voltage')} replaced by what others determine: {reason}"
+        )
         measurement = replace(measurement, voltages=voltages, notes=(*measurement.notes, spike_note))
-    return measurement.masked(~spikes | is_filled, reason) if (spikes & ~is_filled).any() else measurement
+    return (
+        measurement.masked(~spikes | is_filled_frame_channel, reason)
+        if (spikes & ~is_filled_frame_channel).any()
+        else measurement
+    )
 
 
 def _listed_spikes(spikes: Bool[np.ndarray, "F M"]) -> str:
@@ -314,8 +322,8 @@ def _possible_changes(
     if len(drive) * len(row) * min(len(drive), len(row)) > _MAX_OPERATIONS or not len(drive):
         return None
     drive = drive / np.abs(drive).max()
-    products = drive[:, row] * measurements[:, column] + drive[:, column] * measurements[:, row]
-    basis, size, _ = np.linalg.svd(products / weight[mask, None], full_matrices=False)
+    drive_measurement_products = drive[:, row] * measurements[:, column] + drive[:, column] * measurements[:, row]
+    basis, size, _ = np.linalg.svd(drive_measurement_products / weight[mask, None], full_matrices=False)
     basis = basis[:, size > 1e-9 * size[0]]
     return basis if basis.shape[1] < len(drive) else None
 
@@ -329,16 +337,22 @@ def _find_spikes(
     If a suspected channel may have any value, its unit vector is added to the basis. The power that this vector
     explains, `gain`, is compared with the power that the basis alone leaves unexplained.
     """
-    residual, free_share = change - basis @ (basis.T @ change), 1 - np.sum(basis**2, axis=1)
-    is_remaining, faulty, spikes = np.ones(len(change), bool), [], []
+    residual, undetermined_share = change - basis @ (basis.T @ change), 1 - np.sum(basis**2, axis=1)
+    is_remaining_channel, faulty_channels, spikes = np.ones(len(change), bool), [], []
     for _ in range(_MAX_SPIKES):
-        is_contradicted = is_remaining & (free_share > _MIN_FREE_SHARE)
-        size = np.where(is_contradicted, np.abs(residual) / np.sqrt(np.maximum(free_share, _MIN_FREE_SHARE)), 0)
-        worst_channels = np.flatnonzero(size > (1 - _MIN_FREE_SHARE) * size.max())
+        is_predicted_by_others = is_remaining_channel & (undetermined_share > _MIN_UNDETERMINED_SHARE)
+        size = np.where(
+            is_predicted_by_others,
+            np.abs(residual) / np.sqrt(np.maximum(undetermined_share, _MIN_UNDETERMINED_SHARE)),
+            0,
+        )
+        worst_channels = np.flatnonzero(size > (1 - _MIN_UNDETERMINED_SHARE) * size.max())
         if not 0 < len(worst_channels) <= 2:
             break
-        deviation = max(1.4826 * float(np.median(size[is_contradicted])), float(rounding_errors[worst_channels].max()))
-        if not size.max() > _SPIKE_DEVIATIONS * deviation:
+        deviation = max(
+            1.4826 * float(np.median(size[is_predicted_by_others])), float(rounding_errors[worst_channels].max())
+        )
+        if not size.max() > _MIN_SPIKE_DEVIATIONS * deviation:
             break
         direction = np.zeros(len(change))
         direction[worst_channels[0]] = 1
@@ -346,14 +360,14 @@ def _find_spikes(
             direction = direction - basis @ (basis.T @ direction)
         direction = direction / np.linalg.norm(direction)
         unexplained_power, gain = float(np.sum(np.abs(residual) ** 2)), float(np.abs(direction @ residual) ** 2)
-        deviation_size = float((size[worst_channels] / np.sqrt(free_share[worst_channels])).max())
+        spike_size = float((size[worst_channels] / np.sqrt(undetermined_share[worst_channels])).max())
         basis = np.column_stack([basis, direction])
-        residual, free_share = residual - direction * (direction @ residual), free_share - direction**2
-        faulty += _faulty_channels(change, worst_channels)
-        is_remaining[worst_channels] = False
-        typical_change = float(np.sqrt(np.mean(np.abs(change[is_remaining]) ** 2)))
-        if deviation_size > typical_change and gain > _SPIKE_SHARE * unexplained_power:
-            spikes = [*faulty]
+        residual, undetermined_share = residual - direction * (direction @ residual), undetermined_share - direction**2
+        faulty_channels += _faulty_channels(change, worst_channels)
+        is_remaining_channel[worst_channels] = False
+        root_mean_square_change = float(np.sqrt(np.mean(np.abs(change[is_remaining_channel]) ** 2)))
+        if spike_size > root_mean_square_change and gain > _MIN_SPIKE_POWER_SHARE * unexplained_power:
+            spikes = [*faulty_channels]
     return spikes
 
 
@@ -361,5 +375,5 @@ def _faulty_channels(change: Inexact[np.ndarray, " n"], channels: np.ndarray) ->
     """Return the faulty channels among one or two channels that contradict the other channels or each other: the
     channel with the far larger change, or both channels if their changes are similar."""
     size = np.abs(change[channels])
-    is_single = size.max() > _FAULT_RATIO * size.min()
-    return [int(channels[size.argmax()])] if is_single else channels.tolist()
+    is_largest_only = size.max() > _MIN_FAULTY_CHANGE_RATIO * size.min()
+    return [int(channels[size.argmax()])] if is_largest_only else channels.tolist()

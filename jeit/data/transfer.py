@@ -19,7 +19,7 @@ from jeit.protocol import Protocol
 # transfer impedance that were not measured.
 _MIN_SINGULAR_VALUE = 1e-9
 # Estimated number of copies of the equations' matrix in memory while the equations are solved.
-_NUM_COPIES = 4
+_NUM_MEMORY_COPIES = 4
 
 
 def transfer_impedance(measurement: Measurement) -> Inexact[np.ndarray, "F L L"]:
@@ -45,21 +45,21 @@ def transfer_impedance(measurement: Measurement) -> Inexact[np.ndarray, "F L L"]
     basis = scipy.linalg.null_space(np.ones((1, num_electrodes)))
     rows, columns = np.triu_indices(num_electrodes - 1)
     check_memory(
-        f"the transfer impedance of '{measurement.name}'", 8 * _NUM_COPIES * len(rows) * measurement.num_channels
+        f"the transfer impedance of '{measurement.name}'", 8 * _NUM_MEMORY_COPIES * len(rows) * measurement.num_channels
     )
     drive, measurement_patterns = (
         np.asarray(protocol.channel_drive) @ basis,
         np.asarray(protocol.channel_measurement) @ basis,
     )
-    products = drive[:, rows] * measurement_patterns[:, columns] + np.where(
+    drive_measurement_products = drive[:, rows] * measurement_patterns[:, columns] + np.where(
         rows == columns, 0, drive[:, columns] * measurement_patterns[:, rows]
     )
     size = np.abs(drive).max()
     voltages, masks = np.asarray(measurement.filled()), np.asarray(measurement.mask)
     impedances = np.empty((measurement.num_frames, num_electrodes, num_electrodes), voltages.dtype)
     for mask in np.unique(masks, axis=0):
-        inverse = np.linalg.pinv(products[mask] / size, rcond=_MIN_SINGULAR_VALUE) / size
-        if np.linalg.norm(inverse @ products[mask] - np.eye(len(rows))) > 1e-6 * len(rows):
+        inverse = np.linalg.pinv(drive_measurement_products[mask] / size, rcond=_MIN_SINGULAR_VALUE) / size
+        if np.linalg.norm(inverse @ drive_measurement_products[mask] - np.eye(len(rows))) > 1e-6 * len(rows):
             raise ValueError(
                 f"'{measurement.name}': its {int(mask.sum())} usable channels leave the transfer impedance open, "
                 f"{len(rows)} numbers. It takes {num_electrodes - 1} independent currents, read on all electrodes."
@@ -71,7 +71,7 @@ def transfer_impedance(measurement: Measurement) -> Inexact[np.ndarray, "F L L"]
     return impedances
 
 
-def as_driven(reference: Measurement, measurement: Measurement) -> Measurement:
+def converted_to_protocol(reference: Measurement, measurement: Measurement) -> Measurement:
     """Convert the reference to the protocol of a measurement on the same electrodes. The reference is returned
     unchanged if only the amplitude of the currents differs, or if its patterns do not determine the voltages of that
     protocol."""
@@ -128,9 +128,9 @@ def driven_by(measurement: Measurement, protocol: Protocol) -> Measurement:
         [np.einsum("km,km->k", measurement_patterns @ transfer, drive_patterns) for transfer in impedance]
     )
     has_same_name = protocol.name == measurement.protocol.name
-    explanation = "other currents of that name read" if has_same_name else f"'{protocol.name}' reads"
+    difference_text = "other currents of that name read" if has_same_name else f"'{protocol.name}' reads"
     transfer_note = (
-        f"'{measurement.name}' was measured with '{measurement.protocol.name}', and turned into what {explanation}."
+        f"'{measurement.name}' was measured with '{measurement.protocol.name}', and turned into what {difference_text}."
     )
     return Measurement(
         voltages,

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jeit.arguments import check_key
-from jeit.design.defaults import CONTRAST, MARGIN, NUM_TAXELS, PLACES, THRESHOLD
+from jeit.design.defaults import CONTRAST, MARGIN, NUM_PLACES_PER_SIDE, NUM_TAXELS, THRESHOLD
 from jeit.design.sensitivity import SensitivityMap
 from jeit.design.skin.skin import Skin, check_skin
 from jeit.design.skin.touch_shapes import TouchGrid, check_grid, touches_away_from_the_edge
@@ -121,7 +121,7 @@ def compare_layouts(
     second: Skin,
     *,
     margin: float = MARGIN,
-    places: int = PLACES,
+    places: int = NUM_PLACES_PER_SIDE,
     contrast: float = CONTRAST,
     num_taxels: int | None = None,
     seed: int = 0,

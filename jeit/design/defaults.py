@@ -32,8 +32,8 @@ BALL_DIAMETER = 15e-3  # m
 CONTRAST = 0.0
 # Number of touched positions along a side of the skin: as in Park et al. for a single layout, and half as many in a
 # study, which covers many layouts.
-PLACES = 48
-STUDY_PLACES = 24
+NUM_PLACES_PER_SIDE = 48
+NUM_STUDY_PLACES_PER_SIDE = 24
 # Minimum distance of a touch from the edge of the skin; a touch closer to the edge would lie partly outside the skin.
 MARGIN = 10e-3  # m
 
@@ -44,7 +44,7 @@ NUM_LAYERS = 5
 
 # Maximum contrast of a touch: at higher contrasts the exact computation does not converge, and the voltages no longer
 # depend on the contrast.
-MOST_CONTRAST = 1e6
+MAX_CONTRAST = 1e6
 
 # Virtual taxels: number of clusters and threshold of the cosine similarity, as in Park et al.
 NUM_TAXELS = 90
@@ -74,4 +74,4 @@ ScoreName = Literal[
 ]
 # Scores that are computed for sheets only, from linearised voltage changes and a prior: see
 # `jeit.design.layout_scores`.
-OPTIMALITY = ("information", "mean_variance", "largest_variance", "localisation_error")
+SHEET_ONLY_SCORES = ("information", "mean_variance", "largest_variance", "localisation_error")

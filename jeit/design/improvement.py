@@ -107,9 +107,11 @@ def improve_layout(
         raise ValueError(f"no layout found: {optimisation.reason}")
     report("confirm")
     num_fine_points = _REFINEMENT_RATIO * num_points
-    fine_skin, objective = _skin_and_objective(layout, num_fine_points, _NUM_SCORED_POSITIONS, noise, material)
-    optimised_skin = fine_skin.with_layout(optimisation.layout, material.get("contact_impedance"))
-    scores = objective.scores(fine_skin), objective.scores(optimised_skin)
+    skin_with_fine_mesh, objective = _skin_and_objective(
+        layout, num_fine_points, _NUM_SCORED_POSITIONS, noise, material
+    )
+    optimised_skin = skin_with_fine_mesh.with_layout(optimisation.layout, material.get("contact_impedance"))
+    scores = objective.scores(skin_with_fine_mesh), objective.scores(optimised_skin)
     return ImprovedLayout(layout, coarse_skin, optimisation, *scores, space, noise, seed, num_points)
 
 

@@ -117,8 +117,8 @@ def _candidates_from_product(jacobian, product, noise, weights) -> Candidates:
 
     SSᵀ is the part of the prior covariance Γ that the measurements depend on; the remaining part does not affect them.
     """
-    kernel = jacobian @ product / (noise[:, None] * noise)
-    eigenvalues, eigenvectors = jnp.linalg.eigh((kernel + kernel.T) / 2)
+    weighted_product = jacobian @ product / (noise[:, None] * noise)
+    eigenvalues, eigenvectors = jnp.linalg.eigh((weighted_product + weighted_product.T) / 2)
     is_significant = eigenvalues > len(eigenvalues) * jnp.finfo(eigenvalues.dtype).eps * eigenvalues[-1]
     root_eigenvalues = jnp.sqrt(jnp.where(is_significant, eigenvalues, 1))
     factor = product @ (eigenvectors / noise[:, None] * jnp.where(is_significant, 1 / root_eigenvalues, 0))
@@ -129,7 +129,7 @@ def _candidates_from_product(jacobian, product, noise, weights) -> Candidates:
 
 Criterion = Literal["D", "A"]
 # Minimum relative gain of information by a swap, since rounding errors of smaller gains could cause endless swaps.
-_MIN_GAIN = 1e-9
+_MIN_INFORMATION_GAIN = 1e-9
 
 
 class Selection(Module):
@@ -310,23 +310,25 @@ def _select_with_swaps(candidates: Candidates, number: int, criterion: Criterion
     total, _ = _information_and_slope(candidates, jnp.ones(candidates.num_candidates), criterion)
 
     def can_improve(state):
-        _, num_swaps, is_settled = state
-        return (num_swaps < swap_limit) & ~is_settled
+        _, num_swaps, has_converged = state
+        return (num_swaps < swap_limit) & ~has_converged
 
     def swap(state):
         selected, num_swaps, _ = state
         swap_gains = _swap_gains(candidates, selected, criterion)
         removed_position, added_candidate = jnp.unravel_index(jnp.argmax(swap_gains), swap_gains.shape)
-        is_gain = swap_gains[removed_position, added_candidate] > _MIN_GAIN * total
+        improves_information = swap_gains[removed_position, added_candidate] > _MIN_INFORMATION_GAIN * total
         return (
-            jnp.where(is_gain, selected.at[removed_position].set(added_candidate), selected),
-            num_swaps + is_gain,
-            ~is_gain,
+            jnp.where(improves_information, selected.at[removed_position].set(added_candidate), selected),
+            num_swaps + improves_information,
+            ~improves_information,
         )
 
-    selected, num_swaps, is_settled = jax.lax.while_loop(can_improve, swap, (selected, jnp.array(0), jnp.array(False)))
+    selected, num_swaps, has_converged = jax.lax.while_loop(
+        can_improve, swap, (selected, jnp.array(0), jnp.array(False))
+    )
     final_information = _information_of_sets(candidates, selected[None], criterion)[0]
-    return Selection(selected, gains, final_information, total, num_swaps, is_settled)
+    return Selection(selected, gains, final_information, total, num_swaps, has_converged)
 
 
 def _greedy_selection(candidates: Candidates, number: int, criterion: Criterion):
@@ -379,15 +381,15 @@ def _swap_gains(candidates: Candidates, chosen, criterion: Criterion) -> Float[A
     """
     rows, weight = candidates.rows, candidates.weight
     selected_rows = rows[chosen]
-    products = selected_rows @ rows.T
+    row_products = selected_rows @ rows.T
     # F_T are the rows of the chosen set. C F_Tᵀ = F_Tᵀ (I + F_T F_Tᵀ)⁻¹ gives c_ij and 1 - c_ii without differences of
     # large numbers.
-    inverse_root = _inverse_root(products[:, chosen])
-    half_products = inverse_root @ products
-    c_j = jnp.maximum(jnp.sum(rows**2, axis=1) - jnp.sum(half_products**2, axis=0), 0)
-    c_ij = inverse_root.T @ half_products
-    complement_i = jnp.sum(inverse_root**2, axis=0)[:, None]  # 1 - c_ii
-    determinant_ratio = (1 + c_j) * complement_i + c_ij**2
+    inverse_root = _inverse_root(row_products[:, chosen])
+    products_with_inverse_root = inverse_root @ row_products
+    c_j = jnp.maximum(jnp.sum(rows**2, axis=1) - jnp.sum(products_with_inverse_root**2, axis=0), 0)
+    c_ij = inverse_root.T @ products_with_inverse_root
+    one_minus_c_ii = jnp.sum(inverse_root**2, axis=0)[:, None]  # 1 - c_ii
+    determinant_ratio = (1 + c_j) * one_minus_c_ii + c_ij**2
     if criterion == "D":
         gains = jnp.log(determinant_ratio)
     else:
@@ -395,7 +397,7 @@ def _swap_gains(candidates: Candidates, chosen, criterion: Criterion) -> Float[A
         weighted_selected = inverse_root.T @ (inverse_root @ selected_rows) @ weight  # rows f_iᵀCV
         b_ij = weighted_selected @ filtered_rows.T
         b_j = jnp.sum((filtered_rows @ weight) * filtered_rows, axis=1)
-        gains = (complement_i * b_j + 2 * c_ij * b_ij - (1 + c_j) * b_j[chosen][:, None]) / determinant_ratio
+        gains = (one_minus_c_ii * b_j + 2 * c_ij * b_ij - (1 + c_j) * b_j[chosen][:, None]) / determinant_ratio
     return gains.at[:, chosen].set(-jnp.inf)
 
 
@@ -422,10 +424,12 @@ def _information_and_slope(candidates: Candidates, fractions: Float[Array, " M"]
     with respect to the weights, from the inverse posterior covariance C⁻¹ (r, r)."""
     rows, weight = candidates.rows, candidates.weight
     inverse_root = _inverse_root(rows.T @ (fractions[:, None] * rows))
-    half_products = inverse_root @ rows.T
+    products_with_inverse_root = inverse_root @ rows.T
     if criterion == "D":
-        return -2 * jnp.sum(jnp.log(jnp.diag(inverse_root))), jnp.sum(half_products**2, axis=0)  # f_jᵀC f_j
-    filtered_rows = inverse_root.T @ half_products
+        return -2 * jnp.sum(jnp.log(jnp.diag(inverse_root))), jnp.sum(
+            products_with_inverse_root**2, axis=0
+        )  # f_jᵀC f_j
+    filtered_rows = inverse_root.T @ products_with_inverse_root
     value = jnp.trace(weight) - jnp.sum((inverse_root @ weight) * inverse_root)
     return value, jnp.sum(filtered_rows * (weight @ filtered_rows), axis=0)  # f_jᵀCVC f_j
 
@@ -439,12 +443,12 @@ def _inverse_root(matrix: Float[Array, "s s"]) -> Float[Array, "s s"]:
 @partial(jax.jit, static_argnames=("number", "criterion", "iterations"))
 def _relaxed_bound(candidates: Candidates, number: int, criterion: Criterion, iterations: int):
     def step(step_index, state):
-        fractions, bound = state
+        fractions, information_bound = state
         value, slope = _information_and_slope(candidates, fractions, criterion)
         _, best_candidates = jax.lax.top_k(slope, number)
-        vertex = jnp.zeros_like(fractions).at[best_candidates].set(1.0)
-        bound = jnp.minimum(bound, value + slope @ (vertex - fractions))
-        return fractions + 2 / (step_index + 2) * (vertex - fractions), bound
+        best_vertex_fractions = jnp.zeros_like(fractions).at[best_candidates].set(1.0)
+        information_bound = jnp.minimum(information_bound, value + slope @ (best_vertex_fractions - fractions))
+        return fractions + 2 / (step_index + 2) * (best_vertex_fractions - fractions), information_bound
 
     initial_fractions = jnp.full(candidates.num_candidates, number / candidates.num_candidates)
     # The Frank-Wolfe step size is 2 / (k + 2) at step k. The loop starts at k = 2, with a step size of 1/2, since the

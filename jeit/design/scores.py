@@ -31,7 +31,7 @@ from jeit.design.skin.touch_shapes import check_places
 from jeit.forward import ForwardModel
 from jeit.forward.system import cell_conductivity, check_conductivity
 from jeit_solvers.dense import inverse_cholesky
-from jeit_solvers.engines import as_array, either_engine, has_values, namespace, undifferentiated
+from jeit_solvers.engines import as_array, has_values, namespace, numpy_or_compiled, undifferentiated
 from jeit_solvers.module import Module
 
 # Number k of matrix squarings. The largest eigenvalue of an r × r matrix then has a relative error of at most ln(r) /
@@ -197,7 +197,7 @@ def _check_arguments(model: ForwardModel, touches: SheetTouches, prior: TouchPri
         raise ValueError(f"temperature must be positive; it is {temperature!r}.")
 
 
-@either_engine
+@numpy_or_compiled
 def _compute_scores(jacobian, conductivity, touches: SheetTouches, prior: TouchPrior, noise, temperature) -> Scores:
     """Compute the scores of a layout from the Jacobian (M, m) of the M voltages with respect to the conductivities of m
     cells."""
@@ -251,5 +251,5 @@ def _localisation_error(
     )
     xx, yy, xy = (x_slope * x_slope).sum(axis=1), (y_slope * y_slope).sum(axis=1), (x_slope * y_slope).sum(axis=1)
     determinant = xx * yy - xy**2
-    is_regular = determinant > 1e-12 * xx * yy
-    return xp.where(is_regular, xp.sqrt((xx + yy) / xp.where(is_regular, determinant, 1.0)), xp.inf)
+    is_invertible = determinant > 1e-12 * xx * yy
+    return xp.where(is_invertible, xp.sqrt((xx + yy) / xp.where(is_invertible, determinant, 1.0)), xp.inf)

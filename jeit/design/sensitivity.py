@@ -12,18 +12,18 @@ from jeit.design.skin.touched_cells import touched_cells
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
-from jeit_solvers.engines import either_engine, has_values, namespace
+from jeit_solvers.engines import has_values, namespace, numpy_or_compiled
 from jeit_solvers.module import Module
 
 
-@either_engine
+@numpy_or_compiled
 def uniformity(sensitivities: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
     """Mean of the sensitivity Θ over n positions divided by its root mean square: 1 if all values are equal, and
     smaller the more the values differ."""
     return sensitivities.mean(axis=-1) / namespace(sensitivities).sqrt((sensitivities**2).mean(axis=-1))
 
 
-@either_engine
+@numpy_or_compiled
 def _fraction_below_level(level, sensitivities: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
     return (sensitivities < level).astype(sensitivities.dtype).mean(axis=-1)
 
@@ -39,25 +39,25 @@ class SensitivityMap(Module):
     changes: Float[Array, "n M"]
 
     @property
-    @either_engine
+    @numpy_or_compiled
     def values(self) -> Float[Array, " n"]:
         """Sensitivity Θ (n,) at each touched position, volts."""
         return namespace(self.changes).linalg.norm(self.changes, axis=-1)
 
     @property
-    @either_engine
+    @numpy_or_compiled
     def minimum(self) -> Float[Array, ""]:
         """Minimum of the sensitivity Θ over the touched positions, volts."""
         return self.values.min(axis=-1)
 
     @property
-    @either_engine
+    @numpy_or_compiled
     def mean(self) -> Float[Array, ""]:
         """Mean of the sensitivity Θ over the touched positions, volts."""
         return self.values.mean(axis=-1)
 
     @property
-    @either_engine
+    @numpy_or_compiled
     def uniformity(self) -> Float[Array, ""]:
         """Mean of the sensitivity Θ divided by its root mean square: 1 if all positions have the same Θ, and smaller
         the more Θ varies."""

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_key
 from jeit.design.defaults import NUM_TAXELS, THRESHOLD
 from jeit_solvers import KMeans, kmeans
-from jeit_solvers.engines import as_array, either_engine, has_values, namespace
+from jeit_solvers.engines import as_array, has_values, namespace, numpy_or_compiled
 from jeit_solvers.module import Module
 
 
@@ -46,14 +46,14 @@ class Taxels(Module):
         return self.clusters.labels
 
     @property
-    @either_engine
+    @numpy_or_compiled
     def members(self) -> Bool[Array, "*layouts k n"]:
         """Mask (k, n) of the touched positions that each taxel covers. Taxels may overlap, and a position may be
         covered by no taxel."""
         return self.similarity >= self.threshold
 
     @property
-    @either_engine
+    @numpy_or_compiled
     def positions(self) -> Float[Array, "*layouts k d"]:
         """Centroid of the touched positions in each cluster, metres; on a curved skin, the centroid lies slightly below
         the surface."""
@@ -62,51 +62,51 @@ class Taxels(Module):
         return weights @ self.places / weights.sum(axis=-1, keepdims=True)
 
     @property
-    @either_engine
+    @numpy_or_compiled
     def areas(self) -> Float[Array, "*layouts k"]:
         """Area that each taxel covers, m²; 0 if no position has a voltage change similar to the mean change of the
         taxel's cluster."""
         return (self.members * self.cell_area[..., None, :]).sum(axis=-1)
 
     @property
-    @either_engine
+    @numpy_or_compiled
     def mean_area(self) -> Float[Array, "*layouts"]:
         """Mean of the taxel `areas`, m²."""
         return self.areas.mean(axis=-1)
 
     @property
-    @either_engine
+    @numpy_or_compiled
     def std_area(self) -> Float[Array, "*layouts"]:
         """Standard deviation of the taxel `areas`, m²."""
         return self.areas.std(axis=-1)
 
     @property
-    @either_engine
+    @numpy_or_compiled
     def max_area(self) -> Float[Array, "*layouts"]:
         """Maximum of the taxel `areas`, m²."""
         return self.areas.max(axis=-1)
 
     @property
-    @either_engine
+    @numpy_or_compiled
     def coverage(self) -> Int[Array, "*layouts n"]:
         """Number of taxels that cover each touched position."""
         return self.members.sum(axis=-2)
 
     @property
-    @either_engine
+    @numpy_or_compiled
     def overlap(self) -> Float[Array, "*layouts"]:
         """Mean number of taxels that cover a point of the skin: the sum of the taxel areas divided by the area of the
         skin."""
         return self.areas.sum(axis=-1) / self.cell_area.sum(axis=-1)
 
     @property
-    @either_engine
+    @numpy_or_compiled
     def diameters(self) -> Float[Array, "*layouts k"]:
         """Diameter of a circle with the area of each taxel, 2 √(area / π), metres."""
         return 2 * namespace(self.areas).sqrt(self.areas / np.pi)
 
     @property
-    @either_engine
+    @numpy_or_compiled
     def two_point_discrimination(self) -> Float[Array, "*layouts"]:
         """Estimate of the minimum distance at which two touches are distinguishable, metres: the mean of the
         `diameters`.
@@ -174,12 +174,12 @@ def find_taxels(
     )
 
 
-@either_engine
+@numpy_or_compiled
 def _cosine_similarities(vectors: Float[Array, "k m"], unit_changes: Float[Array, "n m"]) -> Float[Array, "k n"]:
     return _normalise(vectors) @ unit_changes.T
 
 
-@either_engine
+@numpy_or_compiled
 def _normalise(vectors: Float[Array, "n m"]) -> Float[Array, "n m"]:
     """Scale n vectors (n, m) to length 1; zero vectors remain zero and have a derivative of zero."""
     xp, squared_norms = namespace(vectors), (vectors**2).sum(axis=1, keepdims=True)
@@ -189,8 +189,10 @@ def _normalise(vectors: Float[Array, "n m"]) -> Float[Array, "n m"]:
 def _check_arguments(changes, places, cell_area, num_taxels, threshold) -> None:
     """Raise `ValueError` for invalid arguments; of traced arrays, only the shape is checked."""
     shape = np.shape(changes)
-    is_in_space = np.shape(places) == (*shape[:1], 3) and not (has_values(places) and not np.ptp(places, axis=0).any())
-    has_valid_shape = np.shape(places) == (*shape[:1], 2) or is_in_space
+    has_space_coordinates = np.shape(places) == (*shape[:1], 3) and not (
+        has_values(places) and not np.ptp(places, axis=0).any()
+    )
+    has_valid_shape = np.shape(places) == (*shape[:1], 2) or has_space_coordinates
     if len(shape) != 2 or 0 in shape or not has_valid_shape or np.shape(cell_area) not in ((), shape[:1]):
         raise ValueError(
             f"changes has shape {shape}, places {np.shape(places)} and cell_area {np.shape(cell_area)}; give (n, m), "

@@ -19,9 +19,9 @@ from jeit.mesh.mesh import boundary_loops, facet_measures
 from jeit.mesh.outline.straight_sided import points_on_loop
 from jeit.mesh.topology import project_to_loop
 from jeit_solvers.engines import (
-    either_engine,
     has_values,
     namespace,
+    numpy_or_compiled,
     on_host,
     sum_into,
     undifferentiated,
@@ -104,8 +104,8 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         # The basis functions on an edge are φ_1 = t / length and φ_0 = 1 - φ_1. Simpson's rule is exact for their
         # products over [start, end]. It sums only positive terms, so it is also accurate for edges of which an
         # electrode covers only a small part.
-        phi_end = xp.stack([start, (start + end) / 2, end]) / length
-        phi_start = 1 - phi_end
+        end_hat_function = xp.stack([start, (start + end) / 2, end]) / length
+        start_hat_function = 1 - end_hat_function
         weights = (end - start) * np.array([1.0, 4.0, 1.0], start.dtype)[:, None, None, None] / 6
 
         # The sum over the turns around the loop, (b, L), is explicit, because XLA converts a sum over such a short axis
@@ -114,10 +114,16 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
             values = weights[0] * values[0] + weights[1] * values[1] + weights[2] * values[2]
             return values[0] + values[1] + values[2]
 
-        phi = xp.stack([integral(phi_start), integral(phi_end)])
-        phi_phi = xp.stack([integral(phi_start**2), integral(phi_start * phi_end), integral(phi_end**2)])
+        phi = xp.stack([integral(start_hat_function), integral(end_hat_function)])
+        hat_function_integrals = xp.stack(
+            [
+                integral(start_hat_function**2),
+                integral(start_hat_function * end_hat_function),
+                integral(end_hat_function**2),
+            ]
+        )
         admittance = 1 / self.contact_impedance
-        admittance_entries = phi_phi @ admittance  # (3, b)
+        admittance_entries = hat_function_integrals @ admittance  # (3, b)
         mass = xp.stack([admittance_entries[:2], admittance_entries[1:]]).transpose(2, 0, 1)
         load = sum_into((mesh.num_points, self.num_electrodes), mesh.facets.T, phi * admittance)
         return Contact((mesh.facets,), (mass,), load)
@@ -136,9 +142,9 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
                 f"position: electrode {off_boundary[0] + 1} lies {distance[off_boundary[0]]:.3g} m from the boundary "
                 "of the mesh; they must lie on it (are both in metres?). For electrodes inside a sheet use SheetDiscs."
             )
-        covered = np.clip(end - start, 0, None).sum(axis=0)  # (b, L)
-        rounding_error = max(1e-9, 1e3 * np.finfo(covered.dtype).eps)
-        too_wide = np.flatnonzero(covered.sum(axis=0) < (1 - rounding_error) * width)
+        covered_lengths = np.clip(end - start, 0, None).sum(axis=0)  # (b, L)
+        rounding_error = max(1e-9, 1e3 * np.finfo(covered_lengths.dtype).eps)
+        too_wide = np.flatnonzero(covered_lengths.sum(axis=0) < (1 - rounding_error) * width)
         if too_wide.size:
             raise ValueError(
                 f"width: electrode {too_wide[0] + 1} is {float(self.width[too_wide[0]]):.3g} m wide, more than the "
@@ -162,10 +168,10 @@ def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int
     for first_electrode, second_electrode in np.argwhere(
         np.triu(is_covered @ is_covered.T, 1)
     ).tolist():  # both cover a part of one edge
-        common = np.minimum(end[first_electrode][:, :, None], end[second_electrode][:, None, :]) - np.maximum(
+        common_lengths = np.minimum(end[first_electrode][:, :, None], end[second_electrode][:, None, :]) - np.maximum(
             start[first_electrode][:, :, None], start[second_electrode][:, None, :]
         )
-        if common.max() > max(1e-9, 1e3 * np.finfo(end.dtype).eps) * end.max():
+        if common_lengths.max() > max(1e-9, 1e3 * np.finfo(end.dtype).eps) * end.max():
             pairs.append((first_electrode, second_electrode))
     return pairs
 
@@ -195,7 +201,7 @@ def _arc_points(mesh: Mesh, centre: np.ndarray, width: float) -> np.ndarray:
     return np.stack([np.interp(arc_positions, arc, vertices[:, axis]) for axis in range(2)], axis=1)
 
 
-@either_engine
+@numpy_or_compiled
 def _project(position, mesh: Mesh):
     """Nearest boundary facet (L,) of each position, arc length (L,) of the foot point along this facet, and distance
     (L,) from the boundary.
@@ -209,8 +215,8 @@ def _project(position, mesh: Mesh):
     corners = mesh.points[mesh.facets]
     edge_vectors = corners[:, 1] - corners[:, 0]
     offset = position[:, None, :] - corners[:, 0]  # (L, b, 2)
-    clipped = xp.clip(_dot_products(offset, edge_vectors) / _dot_products(edge_vectors, edge_vectors), 0, 1)
-    perpendicular = offset - clipped[..., None] * edge_vectors
+    clipped_fraction = xp.clip(_dot_products(offset, edge_vectors) / _dot_products(edge_vectors, edge_vectors), 0, 1)
+    perpendicular = offset - clipped_fraction[..., None] * edge_vectors
     squared_distances = undifferentiated(_dot_products(perpendicular, perpendicular))
     facet = xp.argmin(squared_distances, axis=1)
     start_node, end_node = mesh.facets[facet].T
@@ -244,7 +250,7 @@ def _normalised(vectors):
     return vectors / namespace(vectors).sqrt(_dot_products(vectors, vectors))[..., None]
 
 
-@either_engine
+@numpy_or_compiled
 def _covered_intervals(position, width, mesh: Mesh):
     """Interval of each of b edges that each of L electrodes covers: start and end (3, b, L), with 0 ≤ start ≤ end ≤
     length.
@@ -259,8 +265,8 @@ def _covered_intervals(position, width, mesh: Mesh):
     is_same_loop = loop[:, None] == loop[facet]  # (b, L)
     perimeter = xp.sum(xp.where(is_same_loop, length[:, None], 0), axis=0)
     centre = arc_start[facet] + arc_offset
-    turn_offsets = np.array([-1.0, 0.0, 1.0], length.dtype)[:, None] * perimeter
-    electrode_centres = (centre + turn_offsets)[:, None, :] - arc_start[:, None]
+    perimeter_offsets = np.array([-1.0, 0.0, 1.0], length.dtype)[:, None] * perimeter
+    electrode_centres = (centre + perimeter_offsets)[:, None, :] - arc_start[:, None]
     half_width, edge_lengths = 0.5 * width, length[:, None]
     start, end = (
         xp.clip(electrode_centres - half_width, 0, edge_lengths),

@@ -24,7 +24,7 @@ from jeit_solvers.engines import has_values, host, namespace, on_host, sum_into,
 
 # Half-width of the smooth edge of a disc's window, relative to the local cell size. Smaller values approximate the
 # sharp electrode better, until the edge falls between quadrature points; see tests/electrodes for the convergence.
-EDGE_WIDTH = 0.5
+RELATIVE_EDGE_HALF_WIDTH = 0.5
 _MAX_DISCS_PER_TRIANGLE = 8
 
 
@@ -38,9 +38,9 @@ def triangle_quadrature(order: int = 5) -> tuple[np.ndarray, np.ndarray]:
     v, weight_v = roots_jacobi(order, 1, 0)
     u, v = (u + 1) / 2, (v + 1) / 2
     second = np.outer(1 - v, u).ravel()
-    third = np.repeat(v, order)
+    third_coordinates = np.repeat(v, order)
     weights = np.outer(weight_v, weight_u).ravel()
-    return np.stack([1 - second - third, second, third], axis=1), weights / weights.sum()
+    return np.stack([1 - second - third_coordinates, second, third_coordinates], axis=1), weights / weights.sum()
 
 
 def smooth_step(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -98,9 +98,9 @@ class AbstractDiscs(AbstractPlacedElectrodes):
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Draw each electrode as a disc, or as a dot if it is on a wall."""
-        flat_flags = is_undistorted_from_above(mesh, self.position)
+        is_undistorted = is_undistorted_from_above(mesh, self.position)
         for position, radius, is_flat in zip(
-            np.asarray(self.position), np.asarray(self.radius), flat_flags, strict=True
+            np.asarray(self.position), np.asarray(self.radius), is_undistorted, strict=True
         ):
             if is_flat:
                 pen.disc(position, radius)
@@ -155,10 +155,10 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
         area = measures(mesh)
         barycentric, _ = triangle_quadrature()
         points = xp.einsum("pi,mid->mpd", barycentric, mesh.points[mesh.cells])
-        edge_width = EDGE_WIDTH * xp.sqrt(area)
-        nearest = nearest_electrodes(points.mean(axis=1), self.position, self.radius)
-        window = disc_window(points, self.position[nearest], self.radius[nearest], edge_width)
-        return window_contact(mesh.cells, area, window, nearest, self.contact_impedance, mesh.num_points)
+        edge_width = RELATIVE_EDGE_HALF_WIDTH * xp.sqrt(area)
+        nearest_electrode = nearest_electrodes(points.mean(axis=1), self.position, self.radius)
+        window = disc_window(points, self.position[nearest_electrode], self.radius[nearest_electrode], edge_width)
+        return window_contact(mesh.cells, area, window, nearest_electrode, self.contact_impedance, mesh.num_points)
 
     def check(self, mesh: Mesh) -> None:
         """Raise `ValueError` for discs that lie off the sheet, overlap, or are too small for the mesh."""
@@ -213,12 +213,17 @@ class FaceDiscs(AbstractDiscs, AbstractMovableElectrodes):
         area = facet_measures(mesh)
         barycentric, _ = triangle_quadrature()
         points = xp.einsum("pi,bid->bpd", barycentric, mesh.points[mesh.facets])
-        edge_width = EDGE_WIDTH * xp.sqrt(area)
-        nearest = nearest_electrodes(points.mean(axis=1), self.position, self.radius)
-        window = disc_window(points, self.position[nearest], self.radius[nearest], edge_width)
-        is_reached = xp.take_along_axis(same_face(mesh, self.position, self.radius), nearest, axis=1)
+        edge_width = RELATIVE_EDGE_HALF_WIDTH * xp.sqrt(area)
+        nearest_electrode = nearest_electrodes(points.mean(axis=1), self.position, self.radius)
+        window = disc_window(points, self.position[nearest_electrode], self.radius[nearest_electrode], edge_width)
+        is_reached = xp.take_along_axis(same_face(mesh, self.position, self.radius), nearest_electrode, axis=1)
         return window_contact(
-            mesh.facets, area, window * is_reached[..., None], nearest, self.contact_impedance, mesh.num_points
+            mesh.facets,
+            area,
+            window * is_reached[..., None],
+            nearest_electrode,
+            self.contact_impedance,
+            mesh.num_points,
         )
 
     def check(self, mesh: Mesh) -> None:
@@ -280,8 +285,8 @@ def same_face(mesh: Mesh, position: Float[Array, "L 3"], radius: Float[Array, " 
     height = abs(normal @ position.T - (normal * corner).sum(axis=1)[:, None])
     # Near an edge of the body the nearest triangle may lie on the adjacent face; its plane, however, is far from the
     # position.
-    own_facet = nearest_facets(mesh, position, 100 * height.T**2)
-    normal_cosine = normal @ normal[own_facet].T
+    facet_below_electrode = nearest_facets(mesh, position, 100 * height.T**2)
+    normal_cosine = normal @ normal[facet_below_electrode].T
     is_on_curved_face = (height < 0.55 * radius) & (normal_cosine > 0.45)
     return undifferentiated((height < 0.2 * radius) & (normal_cosine > -0.5) | is_on_curved_face).astype(position.dtype)
 
@@ -395,20 +400,25 @@ class SurfaceDiscs(AbstractDiscs):
         barycentric, _ = triangle_quadrature()
         corners = mesh.points[mesh.cells]
         points = xp.einsum("pi,mid->mpd", barycentric, corners)
-        edge_width = EDGE_WIDTH * xp.sqrt(area)
+        edge_width = RELATIVE_EDGE_HALF_WIDTH * xp.sqrt(area)
         cell_centres = points.mean(axis=1)
-        nearest = nearest_electrodes(cell_centres, self.position, self.radius)
+        nearest_electrode = nearest_electrodes(cell_centres, self.position, self.radius)
         longest_side = xp.sqrt(((corners - xp.roll(corners, 1, axis=1)) ** 2).sum(axis=-1).max(axis=1))
         chart = unfold(mesh, self.position, self.radius[:, None] + edge_width + longest_side)
         normal = xp.asarray(undifferentiated(normals(mesh)))
         centre = xp.argmin(undifferentiated(((self.position[:, None] - cell_centres) ** 2).sum(axis=-1)), axis=1)
-        is_exact, is_facing = chart.exact[nearest], xp.take_along_axis(normal @ normal[centre].T, nearest, axis=1) > 0
-        is_covered = xp.where(is_exact, xp.take_along_axis(chart.reached.T, nearest, axis=1), is_facing)
-        squared_distance = xp.where(
-            is_exact[..., None], chart.squared(barycentric, nearest), squared_distances(points, self.position[nearest])
+        is_exact, is_facing = (
+            chart.exact[nearest_electrode],
+            xp.take_along_axis(normal @ normal[centre].T, nearest_electrode, axis=1) > 0,
         )
-        window = window_within(squared_distance, self.radius[nearest], edge_width) * is_covered[..., None]
-        return window_contact(mesh.cells, area, window, nearest, self.contact_impedance, mesh.num_points)
+        is_covered = xp.where(is_exact, xp.take_along_axis(chart.reached.T, nearest_electrode, axis=1), is_facing)
+        squared_distance = xp.where(
+            is_exact[..., None],
+            chart.squared(barycentric, nearest_electrode),
+            squared_distances(points, self.position[nearest_electrode]),
+        )
+        window = window_within(squared_distance, self.radius[nearest_electrode], edge_width) * is_covered[..., None]
+        return window_contact(mesh.cells, area, window, nearest_electrode, self.contact_impedance, mesh.num_points)
 
     def check(self, mesh: Mesh) -> None:
         """Raise `ValueError` for discs that lie off the surface, extend over its border, are as large as the surface's
@@ -429,7 +439,7 @@ def check_on_surface(position, radius, surface: Triangles) -> None:
     than their radius, extend over its border, or are as large as the surface's radius of curvature."""
     position, radius = np.asarray(position), np.asarray(radius)
     nearest_points = surface.nearest(position)
-    margins = surface.distance_to_border(nearest_points.points)
+    border_distances = surface.distance_to_border(nearest_points.points)
     triangle_centres, normal = surface.corners.mean(axis=1), surface.normals
     for number, (centre, disc_radius) in enumerate(zip(position, radius, strict=True)):
         x, y, z = 1e3 * centre
@@ -439,9 +449,10 @@ def check_on_surface(position, radius, surface: Triangles) -> None:
                 f"position: {label} is {1e3 * nearest_points.away[number]:.3g} mm off the surface, farther than its "
                 "radius; move it onto the surface. Are both in metres?"
             )
-        if margins[number] < 0.9 * disc_radius:
+        if border_distances[number] < 0.9 * disc_radius:
             raise ValueError(
-                f"position: {label} lies on the surface's edge, {1e3 * margins[number]:.3g} mm from it; move it inside."
+                f"position: {label} lies on the surface's edge, {1e3 * border_distances[number]:.3g} mm from it; "
+                "move it inside."
             )
         is_inside = np.linalg.norm(triangle_centres - nearest_points.points[number], axis=1) < disc_radius
         normal_cosines = normal[is_inside] @ normal[nearest_points.triangle[number]]

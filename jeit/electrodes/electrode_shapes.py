@@ -58,11 +58,11 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
         """Copy of the electrodes with new contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError` for values
         that are not positive."""
         values = as_electrode_values("contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m²")
-        part_values = jnp.split(values, np.cumsum([part.num_electrodes for part in self.parts])[:-1])
+        values_of_parts = jnp.split(values, np.cumsum([part.num_electrodes for part in self.parts])[:-1])
         return CombinedElectrodes(
             *(
                 part.with_contact_impedance(values_of_part)
-                for part, values_of_part in zip(self.parts, part_values, strict=True)
+                for part, values_of_part in zip(self.parts, values_of_parts, strict=True)
             )
         )
 
@@ -99,7 +99,7 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
             part.check(mesh)
 
 
-_CIRCLE_CORNERS, _SIDE_CORNERS = 32, 8
+_NUM_CIRCLE_CORNERS, _NUM_SIDE_CORNERS = 32, 8
 # Number of triangles near a point, by nearest centroids, that are searched when the point is projected onto the
 # surface.
 _NUM_CANDIDATES = 24
@@ -136,10 +136,10 @@ class ElectrodeShapes:
 
     def middles(self) -> Float[np.ndarray, "L d"]:
         """Mean of the corners of every electrode."""
-        corner_electrodes = np.repeat(self.electrode, self.sizes)
-        num_corners = np.bincount(corner_electrodes, minlength=self.number)
+        electrode_of_corners = np.repeat(self.electrode, self.sizes)
+        num_corners = np.bincount(electrode_of_corners, minlength=self.number)
         return np.stack(
-            [np.bincount(corner_electrodes, coordinate, self.number) / num_corners for coordinate in self.corners.T],
+            [np.bincount(electrode_of_corners, coordinate, self.number) / num_corners for coordinate in self.corners.T],
             axis=1,
         )
 
@@ -191,12 +191,12 @@ def _all_polygons(mesh: Mesh, electrodes: AbstractElectrodes) -> list[list[np.nd
     surface = ProjectionSurface(points, triangles)
     frames = surface.frames(positions)
     if "radius" in geometry:
-        angle = 2 * np.pi * np.arange(_CIRCLE_CORNERS) / _CIRCLE_CORNERS
+        angle = 2 * np.pi * np.arange(_NUM_CIRCLE_CORNERS) / _NUM_CIRCLE_CORNERS
         sizes = np.broadcast_to(geometry["radius"], len(positions))
         flat_shapes = [size * np.stack([np.cos(angle), np.sin(angle)], axis=1) for size in sizes]
     elif "width" in geometry and "height" in geometry:
-        side = np.arange(_SIDE_CORNERS) / _SIDE_CORNERS * 2 - 1
-        ones_array = np.ones(_SIDE_CORNERS)
+        side = np.arange(_NUM_SIDE_CORNERS) / _NUM_SIDE_CORNERS * 2 - 1
+        ones_array = np.ones(_NUM_SIDE_CORNERS)
         unit_square = np.concatenate(
             [
                 np.stack(pair, axis=1)
@@ -260,13 +260,13 @@ class ProjectionSurface:
         offset_normal = np.cross(offset, first_edge)
         second_coordinate = offset_normal @ normal / volume
         depth = np.sum(second_edge * offset_normal, axis=-1) / volume
-        is_hit = (
+        ray_hits_facet = (
             ~is_parallel
             & (first_coordinate > -1e-6)
             & (second_coordinate > -1e-6)
             & (first_coordinate + second_coordinate < 1 + 1e-6)
         )
-        distances = np.where(is_hit, np.abs(depth), np.inf)
+        distances = np.where(ray_hits_facet, np.abs(depth), np.inf)
         nearest_triangles, row = distances.argmin(axis=1), np.arange(len(positions))
         shift = np.where(np.isfinite(distances[row, nearest_triangles]), depth[row, nearest_triangles], 0.0)
         return positions + shift[:, None] * normal
@@ -283,7 +283,7 @@ class _PlanePen:
         self.polygons.append([piece[k : k + 2] for piece in lines for k in range(len(piece) - 1)])
 
     def disc(self, centre: np.ndarray, radius: float) -> None:
-        angle = 2 * np.pi * np.arange(_CIRCLE_CORNERS) / _CIRCLE_CORNERS
+        angle = 2 * np.pi * np.arange(_NUM_CIRCLE_CORNERS) / _NUM_CIRCLE_CORNERS
         self.polygons.append([centre[:2] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
 
     def rectangle(self, centre: np.ndarray, width: float, height: float) -> None:

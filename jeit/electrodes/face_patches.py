@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import IN_MILLIMETRES
+from jeit.arguments import MILLIMETRE_HINT
 from jeit.electrodes.discs import facet_normals, is_undistorted_from_above, tangent_frames
 from jeit.electrodes.electrodes import (
     AbstractElectrodes,
@@ -84,14 +84,14 @@ def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int | None
     vertical_ends = positions[~is_horizontal, 2, None] + half_sizes[~is_horizontal, 1:] * np.array([-1.0, 1.0])
     if isinstance(outline, Rectangle):
         is_on_x_wall = (np.abs(positions[:, 0] - x_min) < tolerance) | (np.abs(positions[:, 0] - x_max) < tolerance)
-        ends_x = _electrode_ends(positions[:, 0], half_sizes[:, 0], is_horizontal | ~is_on_x_wall)
-        ends_y = np.concatenate(
+        electrode_ends_x = _electrode_ends(positions[:, 0], half_sizes[:, 0], is_horizontal | ~is_on_x_wall)
+        electrode_ends_y = np.concatenate(
             [
                 _electrode_ends(positions[:, 1], half_sizes[:, 1], is_horizontal),
                 _electrode_ends(positions[:, 1], half_sizes[:, 0], is_on_x_wall & ~is_horizontal),
             ]
         )
-        return graded_box(outline, height, (ends_x, ends_y, vertical_ends.ravel()), num_points)
+        return graded_box(outline, height, (electrode_ends_x, electrode_ends_y, vertical_ends.ravel()), num_points)
     rim_points = [
         np.zeros((0, 2)),
         *(_rim_points(outline, *patch) for patch in zip(positions, half_sizes, is_horizontal, strict=True)),
@@ -128,11 +128,11 @@ def _rim_points(outline, centre, half_size, is_horizontal: bool) -> Float[np.nda
 # Distance between two electrodes, divided by the size of the smaller electrode, below which they count as coincident.
 _MIN_SEPARATION = 1e-3
 
-Distance = Callable[[Float[np.ndarray, "L 3"]], Float[np.ndarray, " L"]]
+DistanceFunction = Callable[[Float[np.ndarray, "L 3"]], Float[np.ndarray, " L"]]
 
 
 def check_on_surface(
-    position: Float[np.ndarray, "L 3"], max_distances: Float[np.ndarray, " L"], distance_from_surface: Distance
+    position: Float[np.ndarray, "L 3"], max_distances: Float[np.ndarray, " L"], distance_from_surface: DistanceFunction
 ) -> None:
     """Raise `ValueError` for the first electrode whose distance from the surface of the body exceeds `max_distances`
     metres. `distance_from_surface`: function that returns the distances (L,) of positions (L, 3), metres."""
@@ -140,7 +140,7 @@ def check_on_surface(
     for number in np.flatnonzero(distances > max_distances)[:1]:
         remedy = "give a place on it."
         if _all_on_surface(position / 1000, max_distances, distance_from_surface):
-            remedy = IN_MILLIMETRES
+            remedy = MILLIMETRE_HINT
         elif _all_on_surface(position * 1000, 1000 * max_distances, distance_from_surface):
             remedy = "is the mesh in millimetres? Read it with scale = 1e-3."
         raise ValueError(
@@ -149,7 +149,7 @@ def check_on_surface(
         )
 
 
-def _all_on_surface(position, max_distances, distance_from_surface: Distance) -> bool:
+def _all_on_surface(position, max_distances, distance_from_surface: DistanceFunction) -> bool:
     """Whether all positions lie on the surface and are not all nearly the same. Positions that nearly coincide may lie
     on the surface by chance."""
     return bool(
@@ -175,7 +175,7 @@ def check_size(name: str, sizes: Float[np.ndarray, " L"], max_size: float, objec
     the object that the electrode lies on; `object_name` names this object."""
     for number in np.flatnonzero(sizes > (1 + _MIN_SEPARATION) * max_size)[:1]:
         size = float(sizes[number])
-        unit_hint = IN_MILLIMETRES if 10 * max_size < size <= 1000 * max_size else "give the size of what lies on it."
+        unit_hint = MILLIMETRE_HINT if 10 * max_size < size <= 1000 * max_size else "give the size of what lies on it."
         raise ValueError(
             f"{name}: electrode {number + 1}'s is {_length_text(size)}, larger than {object_name}, "
             f"{_length_text(max_size)}; {unit_hint}"
@@ -291,9 +291,9 @@ class FacePatches(AbstractMovableElectrodes):
         shape = mesh.num_points, self.num_electrodes
         load = sum_into(shape, (nodes[:, None], nearest_indices[..., None]), current[..., None] * covered_area)
         if xp is np:
-            all_masses: Any = np.zeros((len(area), 3, 3), mass.dtype)
-            all_masses[reached_facets] = mass
-            mass = all_masses
+            masses_of_all_patches: Any = np.zeros((len(area), 3, 3), mass.dtype)
+            masses_of_all_patches[reached_facets] = mass
+            mass = masses_of_all_patches
         return Contact((mesh.facets,), (mass,), load)
 
     def check(self, mesh: Mesh) -> None:

@@ -50,8 +50,8 @@ def covered_moments(
     is_inside = (abs(corners) <= limits).all(axis=(-1, -2))
     is_beyond_a_side = ((corners >= limits).all(axis=-2) | (corners <= -limits).all(axis=-2)).any(axis=-1)
     mass: Any = np.where(is_inside[..., None, None], (1 + np.eye(3)) / 12, 0).astype(corners.dtype)
-    is_cut = ~(is_inside | is_beyond_a_side)
-    mass[is_cut] = _clipped_moments(corners[is_cut], limits[is_cut][..., 0, :])[1]
+    is_partly_covered = ~(is_inside | is_beyond_a_side)
+    mass[is_partly_covered] = _clipped_moments(corners[is_partly_covered], limits[is_partly_covered][..., 0, :])[1]
     return mass.sum(axis=-1), mass
 
 
@@ -77,8 +77,10 @@ def _clipped_moments(corners, half_size):
         xp.concatenate([1 - point.sum(axis=-1, keepdims=True), point], axis=-1)
         for point in (coordinates, next_coordinates)
     ]
-    end_sum = barycentric[0] + barycentric[1] + np.array([1.0, 0.0, 0.0]).astype(coordinates.dtype)
-    mass = sum(xp.einsum("...k,...ki,...kj->...ij", fan_areas, point, point) for point in (end_sum, *barycentric))
+    barycentric_sum = barycentric[0] + barycentric[1] + np.array([1.0, 0.0, 0.0]).astype(coordinates.dtype)
+    mass = sum(
+        xp.einsum("...k,...ki,...kj->...ij", fan_areas, point, point) for point in (barycentric_sum, *barycentric)
+    )
     corner = np.zeros((3, 3))
     corner[0, 0] = 1
     mass = (mass + fan_areas.sum(axis=-1)[..., None, None] * corner.astype(coordinates.dtype)) / 12
@@ -103,9 +105,11 @@ def _clip_to_band(outline: Float[Array, "*q k 2"], axis: int, half_width: Float[
     )
     corners = outline[..., None, :] + fractions[..., None] * step[..., None, :]
     corners = corners.reshape(*corners.shape[:-3], 3 * corners.shape[-3], 2)  # also if there are no triangles
-    clipped = xp.clip(corners[..., axis], -half_width, half_width)
+    clipped_coordinates = xp.clip(corners[..., axis], -half_width, half_width)
     other_coordinate = corners[..., 1 - axis]
-    return xp.stack([clipped, other_coordinate] if axis == 0 else [other_coordinate, clipped], axis=-1)
+    return xp.stack(
+        [clipped_coordinates, other_coordinate] if axis == 0 else [other_coordinate, clipped_coordinates], axis=-1
+    )
 
 
 def _cross_product(first_vectors: Float[Array, "*q 2"], second_vectors: Float[Array, "*q 2"]) -> Float[Array, "*q"]:

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from jeit.electrodes.electrodes import AbstractElectrodes, AbstractPointElectrodes, Contact, ElectrodePen, as_positions
 from jeit.mesh import Body, Mesh, Refine, gradients, measures, normals
 from jeit_solvers.engines import (
-    either_engine,
     has_values,
     namespace,
+    numpy_or_compiled,
     on_device,
     on_host,
     sum_into,
@@ -146,9 +146,11 @@ class NodeElectrodes(AbstractPointElectrodes):
     @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
         """`load` (n, L) with 1 at the node of each electrode, and zero mass."""
-        ones = namespace(self, mesh).ones(self.num_electrodes, mesh.points.dtype)
+        unit_weights = namespace(self, mesh).ones(self.num_electrodes, mesh.points.dtype)
         index = self.nodes, np.arange(self.num_electrodes)
-        return _point_contact(self.contact_nodes(mesh), sum_into((mesh.num_points, self.num_electrodes), index, ones))
+        return _point_contact(
+            self.contact_nodes(mesh), sum_into((mesh.num_points, self.num_electrodes), index, unit_weights)
+        )
 
     def check(self, mesh: Mesh) -> None:
         """Raise `ValueError` for an electrode whose index is not that of a node of `mesh`."""
@@ -163,7 +165,7 @@ def _point_contact(nodes, load) -> Contact:
     return Contact(nodes, (namespace(load).zeros((1, 1, 1), load.dtype),), load)
 
 
-@either_engine
+@numpy_or_compiled
 def _find_containing_cells(position, mesh: Mesh):
     """Cell that contains each position, barycentric coordinates in the cell, and the smallest of the coordinates, which
     is negative for a position outside the mesh."""

@@ -1,6 +1,6 @@
-from .atomic_write import clear_unfinished, whole_files, written_whole
+from .atomic_write import atomically_written_file, atomically_written_files, remove_unfinished_files
 from .limits import (
-    MOST_ELECTRODES,
+    MAX_ELECTRODES,
     check_electrodes,
     check_memory,
     check_size,
@@ -14,12 +14,13 @@ from .limits import (
 from .npz_file import check_archive, npy_array, npz_arrays, npz_shapes, require_arrays
 
 __all__ = [
-    "MOST_ELECTRODES",
+    "MAX_ELECTRODES",
+    "atomically_written_file",
+    "atomically_written_files",
     "check_archive",
     "check_electrodes",
     "check_memory",
     "check_size",
-    "clear_unfinished",
     "error_text",
     "npy_array",
     "npz_arrays",
@@ -29,7 +30,6 @@ __all__ = [
     "read_json",
     "read_text",
     "read_toml",
+    "remove_unfinished_files",
     "require_arrays",
-    "whole_files",
-    "written_whole",
 ]

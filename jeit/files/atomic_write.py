@@ -35,18 +35,18 @@ def is_alive(pid: object) -> bool:
     return True
 
 
-_UNFINISHED_NAME = re.compile(r"\.jeit-([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.part")
+_UNFINISHED_NAME_PATTERN = re.compile(r"\.jeit-([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.part")
 
 
 @contextmanager
-def written_whole(path: str | Path) -> Iterator[BinaryIO]:
+def atomically_written_file(path: str | Path) -> Iterator[BinaryIO]:
     """Context that yields a temporary file to write to; the temporary file replaces `path` once it is completely on the
     disk. If the process is killed earlier, the old file remains.
 
     A link at `path` is replaced, not followed. Raises `OSError` if the file cannot be written.
     """
     path = Path(path)
-    clear_unfinished(path.parent)
+    remove_unfinished_files(path.parent)
     temporary_path = path.parent / _unfinished_name()
     try:
         with temporary_path.open("xb") as file:
@@ -59,13 +59,13 @@ def written_whole(path: str | Path) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def whole_files(folder: Path) -> Iterator[Path]:
+def atomically_written_files(folder: Path) -> Iterator[Path]:
     """Context that yields a temporary folder to write several files to; its files are moved to `folder` once all of
     them are written.
 
     Links in `folder` with the same names are replaced, not followed. Raises `OSError` if the files cannot be written.
     """
-    clear_unfinished(folder)
+    remove_unfinished_files(folder)
     temporary_folder = folder / _unfinished_name()
     temporary_folder.mkdir()
     try:
@@ -79,11 +79,11 @@ def whole_files(folder: Path) -> Iterator[Path]:
         shutil.rmtree(temporary_folder, ignore_errors=True)
 
 
-def clear_unfinished(folder: Path) -> None:
+def remove_unfinished_files(folder: Path) -> None:
     """Remove unfinished temporary files that killed processes of this machine have left in a folder."""
     with suppress(OSError):
         for path in folder.iterdir():
-            match = _UNFINISHED_NAME.fullmatch(path.name)
+            match = _UNFINISHED_NAME_PATTERN.fullmatch(path.name)
             if match and match[1] == _machine_hash() and not is_alive(int(match[2])):
                 shutil.rmtree(path, ignore_errors=True) if path.is_dir() and not path.is_symlink() else path.unlink()
 

@@ -12,41 +12,42 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-MOST_ELECTRODES = 1024
+MAX_ELECTRODES = 1024
 """Maximum number of electrodes that a file may describe: the number of channels of a protocol grows with the square of
 the number of electrodes."""
 
-_LIMIT_VARIABLE, _DEFAULT_GIGABYTES = "JEIT_FILE_GB", 1.0
+_MEMORY_LIMIT_VARIABLE, _DEFAULT_MEMORY_LIMIT_GB = "JEIT_FILE_GB", 1.0
 
 
-class TooLarge(ValueError):
+class FileTooLargeError(ValueError):
     """Raised for a file whose content would take more memory than allowed."""
 
 
 def check_memory(name: str, size: float) -> None:
-    """Raise `TooLarge`, a `ValueError`, if the content of the file `name` needs more memory than the limit; `size`:
-    memory that the content needs, in bytes.
+    """Raise `FileTooLargeError`, a `ValueError`, if the content of the file `name` needs more memory than the limit;
+    `size`: memory that the content needs, in bytes.
 
     The limit is a gigabyte, or the value of the environment variable JEIT_FILE_GB, in gigabytes.
     """
     max_gigabytes = _max_gigabytes()
     if size > 1e9 * max_gigabytes:
-        raise TooLarge(
+        raise FileTooLargeError(
             f"{name} would take {size / 1e9:.3g} GB in memory, more than the {max_gigabytes:g} GB that a file may. If "
-            f"that is meant, allow it by setting the environment variable {_LIMIT_VARIABLE}={size / 1e9 + 0.5:.0f}."
+            "that is meant, allow it by setting the environment variable "
+            f"{_MEMORY_LIMIT_VARIABLE}={size / 1e9 + 0.5:.0f}."
         )
 
 
 def check_electrodes(name: str, num_electrodes: int) -> None:
-    """Raise `ValueError` if the file `name` describes more than `MOST_ELECTRODES`."""
-    if num_electrodes > MOST_ELECTRODES:
+    """Raise `ValueError` if the file `name` describes more than `MAX_ELECTRODES`."""
+    if num_electrodes > MAX_ELECTRODES:
         raise ValueError(
-            f"{name} describes {num_electrodes} electrodes, more than {MOST_ELECTRODES}, whose "
-            f"{MOST_ELECTRODES**2 // 10**6} million channels are no longer imaged; in Python there is no such limit."
+            f"{name} describes {num_electrodes} electrodes, more than {MAX_ELECTRODES}, whose "
+            f"{MAX_ELECTRODES**2 // 10**6} million channels are no longer imaged; in Python there is no such limit."
         )
 
 
-def most_bytes() -> float:
+def max_file_memory() -> float:
     """Maximum memory in bytes for the content of a file, from the environment variable JEIT_FILE_GB. Raises
     `ValueError` if the variable is not a positive number."""
     return 1e9 * _max_gigabytes()
@@ -55,12 +56,13 @@ def most_bytes() -> float:
 def _max_gigabytes() -> float:
     """Maximum memory in gigabytes for the content of a file, from the environment variable JEIT_FILE_GB."""
     try:
-        gigabytes = float(os.environ.get(_LIMIT_VARIABLE, _DEFAULT_GIGABYTES))
+        gigabytes = float(os.environ.get(_MEMORY_LIMIT_VARIABLE, _DEFAULT_MEMORY_LIMIT_GB))
     except ValueError:
         gigabytes = -1.0
     if not 0 < gigabytes < float("inf"):
         raise ValueError(
-            f"{_LIMIT_VARIABLE} must be a positive number of gigabytes; it is {os.environ[_LIMIT_VARIABLE][:40]!r}."
+            f"{_MEMORY_LIMIT_VARIABLE} must be a positive number of gigabytes; "
+            f"it is {os.environ[_MEMORY_LIMIT_VARIABLE][:40]!r}."
         )
     return gigabytes
 
@@ -68,24 +70,24 @@ def _max_gigabytes() -> float:
 MAX_KEY_LENGTH = 40
 """Maximum number of characters of a key in a message."""
 # Maximum number of characters of a message.
-_MAX_MESSAGE = 390
+_MAX_MESSAGE_LENGTH = 390
 # Maximum number of faults that are described in sentences.
-_MAX_SENTENCES = 4
+_MAX_LISTED_FAULTS = 4
 # Maximum number of further faults that are listed by their keys.
-_MAX_KEYS = 10
-WORD_LIST_PREFIX = "; there are "
+_MAX_LISTED_KEYS = 10
+ALLOWED_NAMES_PREFIX = "; there are "
 """Text that precedes a list of all valid words in a message."""
 
 
 def faults_message(origin: str, sentences: list[str], keys: Sequence[str] = ()) -> str:
     """Combine several faults in the file `origin` into one error message. It contains the first of the `sentences`, as
     many of the following sentences as fit, and the `keys` of up to ten of the remaining faults."""
-    first_sentence = shorten(f"{shorten(origin, 2 * MAX_KEY_LENGTH)}: {sentences[0]}", _MAX_MESSAGE - 20)
+    first_sentence = shorten(f"{shorten(origin, 2 * MAX_KEY_LENGTH)}: {sentences[0]}", _MAX_MESSAGE_LENGTH - 20)
     num_listed = 1
-    for num_sentences in range(min(len(sentences), _MAX_SENTENCES), 0, -1):
+    for num_sentences in range(min(len(sentences), _MAX_LISTED_FAULTS), 0, -1):
         # If a message proposes a valid word, its list of all valid words is omitted first to save room.
         short_sentences = [
-            f"{sentence.split(WORD_LIST_PREFIX)[0]}." if "?)" + WORD_LIST_PREFIX in sentence else sentence
+            f"{sentence.split(ALLOWED_NAMES_PREFIX)[0]}." if "?)" + ALLOWED_NAMES_PREFIX in sentence else sentence
             for sentence in sentences[1:num_sentences]
         ]
         for later_sentences in (sentences[1:num_sentences], short_sentences):
@@ -93,20 +95,21 @@ def faults_message(origin: str, sentences: list[str], keys: Sequence[str] = ()) 
                 [
                     first_sentence,
                     *later_sentences,
-                    *_further_faults(keys[num_sentences:], len(sentences) - num_sentences, _MAX_KEYS),
+                    *_text_of_further_faults(keys[num_sentences:], len(sentences) - num_sentences, _MAX_LISTED_KEYS),
                 ]
             )
-            if len(message) <= _MAX_MESSAGE:
+            if len(message) <= _MAX_MESSAGE_LENGTH:
                 return message
     while (
-        len(" ".join([first_sentence, *_further_faults(keys[1:], len(sentences) - 1, num_listed)])) <= _MAX_MESSAGE
-        and num_listed < _MAX_KEYS
+        len(" ".join([first_sentence, *_text_of_further_faults(keys[1:], len(sentences) - 1, num_listed)]))
+        <= _MAX_MESSAGE_LENGTH
+        and num_listed < _MAX_LISTED_KEYS
     ):
         num_listed += 1
-    return " ".join([first_sentence, *_further_faults(keys[1:], len(sentences) - 1, num_listed - 1)])
+    return " ".join([first_sentence, *_text_of_further_faults(keys[1:], len(sentences) - 1, num_listed - 1)])
 
 
-def _further_faults(keys: Sequence[str], num_faults: int, max_keys: int) -> list[str]:
+def _text_of_further_faults(keys: Sequence[str], num_faults: int, max_keys: int) -> list[str]:
     """Sentences about `num_faults` further faults in a file; at most `max_keys` faults are named by their keys in the
     file."""
     named_keys = keys[:max_keys]
@@ -119,7 +122,7 @@ def shorten(text: str, max_length: int) -> str:
     return text if len(text) <= max_length else f"{text[: max_length - 1]}…"
 
 
-_MAX_REASON = 120
+_MAX_REASON_LENGTH = 120
 
 
 @contextmanager
@@ -143,7 +146,7 @@ def read_as(message: str) -> Iterator[None]:
 def error_text(error: Exception) -> str:
     """Message of an error in one short line; the type of the error if it has no message."""
     text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-    return text if len(text) <= _MAX_REASON else f"{text[: _MAX_REASON - 1]}…"
+    return text if len(text) <= _MAX_REASON_LENGTH else f"{text[: _MAX_REASON_LENGTH - 1]}…"
 
 
 # Maximum size in bytes of a hand-written TOML file.

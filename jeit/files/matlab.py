@@ -118,7 +118,7 @@ def _unreadable_message(path: Path) -> str:
 
 def _is_format_4(path: Path) -> bool:
     """Whether a .mat file is of format 4, which begins with a number below 5,000; other formats begin with text. Raises
-    `TooLarge` if the file exceeds the memory limit."""
+    `FileTooLargeError` if the file exceeds the memory limit."""
     check_memory(path.name, path.stat().st_size)
     with path.open("rb") as file:
         return 0 in file.read(4)
@@ -212,13 +212,13 @@ def _values(variable: _Variable) -> np.ndarray:
     return dense
 
 
-def _decompressed(variable: _Variable) -> bytes:
+def _decompressed(compressed_element: _Variable) -> bytes:
     """Decompressed content of an element of a .mat file, without its tag. Raises `ValueError` if the content is larger
     than the declared shape implies."""
-    if not variable.is_compressed:
-        return variable.content
-    max_bytes = variable.size + _MAX_OTHER_BYTES
-    element = zlib.decompressobj().decompress(variable.content, max_bytes + 1)
+    if not compressed_element.is_compressed:
+        return compressed_element.content
+    max_bytes = compressed_element.size + _MAX_OTHER_BYTES
+    element = zlib.decompressobj().decompress(compressed_element.content, max_bytes + 1)
     if len(element) > max_bytes:
-        raise ValueError(f"'{variable.name[:40]}' is larger than its shape {variable.shape} says")
+        raise ValueError(f"'{compressed_element.name[:40]}' is larger than its shape {compressed_element.shape} says")
     return element[8:]

@@ -16,14 +16,14 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from jeit.files.limits import TooLarge, check_memory, error_text
+from jeit.files.limits import FileTooLargeError, check_memory, error_text
 
 _NUM_COPIES = 2
 # Maximum size in bytes of a file in an NPZ archive that is not an array, such as a JSON header.
 _MAX_TEXT_BYTES = 2**24
 _NPY_MARK, _ZIP_MARK = b"\x93NUM", b"PK\x03\x04"
 # Errors that NumPy and zipfile raise for files that are damaged, encrypted, or compressed by an unknown method.
-FAULTS = (
+ARCHIVE_READ_ERRORS = (
     ValueError,
     EOFError,
     TypeError,
@@ -88,9 +88,9 @@ def _open_archive(path: Path, otherwise: str = "not an NPZ file") -> Iterator[zi
         try:
             with zipfile.ZipFile(file) as archive:
                 yield archive
-        except TooLarge:
+        except FileTooLargeError:
             raise
-        except (*FAULTS, OSError) as error:  # the archive may place a member before the start of the file
+        except (*ARCHIVE_READ_ERRORS, OSError) as error:  # the archive may place a member before the start of the file
             raise _unreadable_error("NPZ file of plain arrays", error) from None
 
 
@@ -110,9 +110,9 @@ def npy_array(path: Path) -> np.ndarray:
                 raise ValueError(f"it says {header.size} bytes of numbers, and has {num_bytes_left}; is it cut off?")
             file.seek(0)
             return _read_array(file)
-        except TooLarge:
+        except FileTooLargeError:
             raise
-        except FAULTS as error:
+        except ARCHIVE_READ_ERRORS as error:
             raise _unreadable_error("NPY file of plain numbers", error) from None
 
 
@@ -128,9 +128,9 @@ def check_archive(path: Path) -> None:
                     _member_header(archive, member.filename, member)
                 elif member.file_size > _MAX_TEXT_BYTES:
                     raise ValueError(f"'{member.filename[:40]}' in it has {member.file_size} bytes of text")
-    except (TooLarge, FileNotFoundError):
+    except (FileTooLargeError, FileNotFoundError):
         raise
-    except (*FAULTS, OSError) as error:
+    except (*ARCHIVE_READ_ERRORS, OSError) as error:
         raise _unreadable_error("archive", error) from None
 
 
@@ -180,7 +180,7 @@ def _member_header(archive: zipfile.ZipFile, name: str, member: zipfile.ZipInfo)
     with archive.open(member) as file:
         try:
             header = _header(file)
-        except FAULTS as error:
+        except ARCHIVE_READ_ERRORS as error:
             raise ValueError(f"'{name[:40]}': {error}") from None
     if header.size > member.file_size:
         raise ValueError(f"'{name[:40]}' says {header.size} bytes of numbers, and has {member.file_size}")

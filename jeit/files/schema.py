@@ -4,7 +4,7 @@ file are reported at once.
 A table is defined by a class derived from `Table`, with one line per key:
 
     class SkinTable(Table):
-        subject = "a skin"
+        name_in_messages = "a skin"
         model: Literal["sheet", "layer"] = "sheet"
         width_mm: Annotated[float, Number(5, 5000, "mm")]
 
@@ -27,8 +27,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, FailFast, Field, GetCoreSchemaHandler, ValidationError, model_validator
 from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError, core_schema
 
-from jeit.arguments import IN_MILLIMETRES, describe, did_you_mean
-from jeit.files.limits import MAX_KEY_LENGTH, WORD_LIST_PREFIX, faults_message, shorten
+from jeit.arguments import MILLIMETRE_HINT, describe, did_you_mean
+from jeit.files.limits import ALLOWED_NAMES_PREFIX, MAX_KEY_LENGTH, faults_message, shorten
 
 # Maximum number of characters of a list of names in a message.
 _MAX_LIST_LENGTH = 160
@@ -45,7 +45,7 @@ class Table(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True, defer_build=True)
 
-    subject: ClassVar[str] = "the file"
+    name_in_messages: ClassVar[str] = "the file"
     """Name, in messages, of the object that the table describes, such as "a study"."""
     hints: ClassVar[dict[str, str]] = {}
     """For each key whose value users often do not know: advice on what to write if the key is missing, which continues
@@ -57,8 +57,8 @@ class Table(BaseModel):
         """Validate a table of a file, and convert each fault to a sentence that begins with the faulty key."""
         if isinstance(value, Mapping) and len(value) > len(cls.model_fields) + _MAX_UNKNOWN_KEYS:
             # Without this limit, each unknown key would be reported, possibly a million.
-            unknown = itertools.islice((key for key in value if key not in cls.model_fields), _MAX_UNKNOWN_KEYS)
-            value = {key: value[key] for key in [*(key for key in cls.model_fields if key in value), *unknown]}
+            unknown_keys = itertools.islice((key for key in value if key not in cls.model_fields), _MAX_UNKNOWN_KEYS)
+            value = {key: value[key] for key in [*(key for key in cls.model_fields if key in value), *unknown_keys]}
         try:
             return validate(cls._with_known_spelling(value) if isinstance(value, Mapping) else value)
         except ValidationError as error:
@@ -66,7 +66,7 @@ class Table(BaseModel):
                 InitErrorDetails(type=fault(cls._fault_message(details)), loc=_fault_path(details), input=0)
                 for details in error.errors(include_url=False)
             ]
-            raise ValidationError.from_exception_data(cls.subject, line_errors) from None
+            raise ValidationError.from_exception_data(cls.name_in_messages, line_errors) from None
 
     @classmethod
     def _with_known_spelling(cls, table: Mapping[Any, Any]) -> dict[Any, Any]:
@@ -89,7 +89,9 @@ class Table(BaseModel):
             case "extra_forbidden":
                 known_keys = [*cls.model_fields]
                 suggestion = did_you_mean(str(details["loc"][-1])[:MAX_KEY_LENGTH], known_keys)
-                return f"is no key of {cls.subject}{suggestion}{WORD_LIST_PREFIX}{_list_names(known_keys)}."
+                return (
+                    f"is no key of {cls.name_in_messages}{suggestion}{ALLOWED_NAMES_PREFIX}{_list_names(known_keys)}."
+                )
             case "literal_error":
                 return not_among(value, re.findall("'([^']+)'", context["expected"]))
             case "bool_type" if not isinstance(value, list):
@@ -202,7 +204,7 @@ class Number:
             if not (self.low <= 1000 * value <= self.high if is_larger else self.low <= value / 1000 <= self.high):
                 continue
             if self.unit == "m":
-                return "" if is_larger else f" {value:g} mm are {value / 1000:g} m. {IN_MILLIMETRES.capitalize()}"
+                return "" if is_larger else f" {value:g} mm are {value / 1000:g} m. {MILLIMETRE_HINT.capitalize()}"
             suggestion = f"in {metric}" if self.unit == "mm" else "off by a factor of 1000"
             return f" Is it {suggestion}? Then write {1000 * value if is_larger else value / 1000:g}."
         return ""
@@ -243,8 +245,8 @@ class Numbers:
 
     def _check_length(self, values: Any, axis: int) -> Any:
         if not isinstance(values, (list, tuple)):
-            subject = "it is" if axis == 0 or len(self.axes) == 1 else "a row is"
-            raise fault(f"must be {self._expected}; {subject} {describe(values)}.")
+            beginning = "it is" if axis == 0 or len(self.axes) == 1 else "a row is"
+            raise fault(f"must be {self._expected}; {beginning} {describe(values)}.")
         minimum, maximum = self.axes[axis]
         if not minimum <= len(values) <= maximum:
             raise fault(
@@ -271,13 +273,11 @@ class Numbers:
     @property
     def _expected(self) -> str:
         name = {float: "numbers", int: "whole numbers", bool: "true or false"}[self.kind]
-        unbounded = math.isinf(self.low)
-        return (
-            f"{self._expected_counts} {name}{'' if unbounded else f', {Number(self.low, self.high, self.unit).span}'}"
-        )
+        limits = "" if math.isinf(self.low) else f", {Number(self.low, self.high, self.unit).span}"
+        return f"{self._expected_counts} {name}{limits}"
 
 
-class Swept:
+class SweptValues:
     """Annotation of a key whose value is a list of distinct items; a value that is not a list counts as a list of one
     item."""
 
@@ -298,11 +298,11 @@ class Swept:
 
 
 Item = TypeVar("Item")
-Several = Annotated[list[Item], FailFast(), Swept()]
+SweptList = Annotated[list[Item], FailFast(), SweptValues()]
 """A list of distinct items, or a single item."""
 
 
-class OneOf:
+class TableOfKind:
     """Annotation of a key whose value is a table of one of several kinds; the word that the table contains under `key`
     selects the kind.
 
@@ -393,8 +393,8 @@ def _full_key_name(path: tuple[int | str, ...]) -> str:
 
 
 def _short_key(name: str) -> str:
-    shortened = shorten(name, MAX_KEY_LENGTH)
-    return shortened if re.fullmatch(r"[\w.-]+…?", shortened) else repr(shortened)
+    shortened_name = shorten(name, MAX_KEY_LENGTH)
+    return shortened_name if re.fullmatch(r"[\w.-]+…?", shortened_name) else repr(shortened_name)
 
 
 def _swept_values(value: Any) -> list:

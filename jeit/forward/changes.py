@@ -81,7 +81,7 @@ def solved_fields(model: ForwardModel, conductivity: Float[np.ndarray, " m"]) ->
     return SolvedFields(*on_host((model.mesh, model.protocol, model.system.pattern, fields, impedance)))
 
 
-def _field_energies(mesh: Mesh, fields, cells, slope) -> Float[np.ndarray, "q L L"]:
+def _field_energies(mesh: Mesh, fields, cells, conductivity_slope) -> Float[np.ndarray, "q L L"]:
     """Integrals ∫ dσ ∇F_k · ∇F_l over some cells as matrices (q, L, L) over pairs of L electrodes, one for each of q
     coefficients.
 
@@ -91,17 +91,19 @@ def _field_energies(mesh: Mesh, fields, cells, slope) -> Float[np.ndarray, "q L 
     nodes = np.asarray(mesh.cells)[cells]
     gradient, measure = (np.asarray(values)[cells] for values in cached_geometry(mesh))
     weighted_gradient = np.ascontiguousarray(gradient.transpose(0, 2, 1)) * np.sqrt(measure)[:, None, None]
-    num_fields, is_nonzero = fields.shape[1], slope != 0
+    num_fields, is_nonzero = fields.shape[1], conductivity_slope != 0
     num_nonzero = is_nonzero.sum(axis=1)
-    energy = np.zeros((slope.shape[1], num_fields**2), np.result_type(fields, slope))
-    for index_part in _split_indices(np.flatnonzero(num_nonzero > 1)):
-        local_fields = weighted_gradient[index_part] @ fields[nodes[index_part]]
-        energy += slope[index_part].T @ (local_fields.transpose(0, 2, 1) @ local_fields).reshape(len(index_part), -1)
+    energy = np.zeros((conductivity_slope.shape[1], num_fields**2), np.result_type(fields, conductivity_slope))
+    for chunk_of_indices in _split_indices(np.flatnonzero(num_nonzero > 1)):
+        local_fields = weighted_gradient[chunk_of_indices] @ fields[nodes[chunk_of_indices]]
+        energy += conductivity_slope[chunk_of_indices].T @ (local_fields.transpose(0, 2, 1) @ local_fields).reshape(
+            len(chunk_of_indices), -1
+        )
     energy = energy.reshape(-1, num_fields, num_fields)
-    for coefficient, is_alone in enumerate((is_nonzero & (num_nonzero == 1)[:, None]).T):
-        for index_part in _split_indices(np.flatnonzero(is_alone)):
-            local_fields = weighted_gradient[index_part] @ fields[nodes[index_part]]
-            weighted = slope[index_part, coefficient, None, None] * local_fields
+    for coefficient, is_only_nonzero in enumerate((is_nonzero & (num_nonzero == 1)[:, None]).T):
+        for chunk_of_indices in _split_indices(np.flatnonzero(is_only_nonzero)):
+            local_fields = weighted_gradient[chunk_of_indices] @ fields[nodes[chunk_of_indices]]
+            weighted = conductivity_slope[chunk_of_indices, coefficient, None, None] * local_fields
             energy[coefficient] += local_fields.reshape(-1, num_fields).T @ weighted.reshape(-1, num_fields)
     return energy
 
@@ -113,7 +115,7 @@ def _split_indices(indices: Int[np.ndarray, " k"]) -> list[Int[np.ndarray, " p"]
 
 # Contact impedance in ohm·m² of an electrode that carries no current, compared with an electrode of unit contact
 # impedance.
-_OPEN_CONTACT = 1e30
+_OPEN_CONTACT_IMPEDANCE = 1e30
 
 
 class _ContactMass(NamedTuple):
@@ -124,18 +126,18 @@ class _ContactMass(NamedTuple):
 def _select_contact(mesh: Mesh, electrodes: AbstractElectrodes, members: Bool[np.ndarray, " L"]) -> Contact:
     """Contact integrals for unit contact impedance of the electrodes that are `members`, and open contacts of all
     others."""
-    contact_impedance = np.where(members, 1.0, _OPEN_CONTACT)
+    contact_impedance = np.where(members, 1.0, _OPEN_CONTACT_IMPEDANCE)
     return on_host(electrodes.with_contact_impedance(contact_impedance)).contact(mesh)
 
 
-def _groups_without_neighbours(shares_cell: Bool[np.ndarray, "L L"]) -> list[Bool[np.ndarray, " L"]]:
+def _groups_without_neighbours(shares_cell_matrix: Bool[np.ndarray, "L L"]) -> list[Bool[np.ndarray, " L"]]:
     """Divide electrodes into as few groups as a simple search finds, so that no two electrodes of a group share a facet
-    or cell. `shares_cell`: whether two electrodes share one. Each group is a mask of its members."""
+    or cell. `shares_cell_matrix`: whether two electrodes share one. Each group is a mask of its members."""
     groups: list[Bool[np.ndarray, " L"]] = []
-    for electrode, neighbours in enumerate(shares_cell):
+    for electrode, neighbours in enumerate(shares_cell_matrix):
         group = next((group for group in groups if not (group & neighbours).any()), None)
         if group is None:
-            groups.append(group := np.zeros(len(shares_cell), bool))
+            groups.append(group := np.zeros(len(shares_cell_matrix), bool))
         group[electrode] = True
     return groups
 
@@ -159,10 +161,12 @@ class ContactSensitivity:
             for nodes, mass, touched in zip(own_contact.nodes, own_contact.mass, is_touched, strict=True):
                 nodes, mass = np.asarray(nodes), np.asarray(mass)
                 size = np.abs(mass).max(axis=(1, 2), initial=0)
-                is_covered = size > 2 / _OPEN_CONTACT * size.max(initial=0)
+                is_covered = size > 2 / _OPEN_CONTACT_IMPEDANCE * size.max(initial=0)
                 for electrode in np.flatnonzero(members):
-                    own = np.flatnonzero(is_covered & touched[:, electrode])
-                    self._contact_masses[electrode].append(_ContactMass(nodes[own], mass[own]))
+                    nodes_of_electrode = np.flatnonzero(is_covered & touched[:, electrode])
+                    self._contact_masses[electrode].append(
+                        _ContactMass(nodes[nodes_of_electrode], mass[nodes_of_electrode])
+                    )
 
     def __call__(
         self, fields: Float[np.ndarray, "n L"], impedance: Float[np.ndarray, "L L"], contact_impedance
@@ -185,7 +189,7 @@ class ContactSensitivity:
 
 
 # Fraction of the mesh's width by which electrodes are shifted for finite differences.
-_DIFFERENCE_SHIFT = 1e-4
+_RELATIVE_FINITE_DIFFERENCE_SHIFT = 1e-4
 
 
 class PlacementSensitivity:
@@ -197,7 +201,7 @@ class PlacementSensitivity:
         mesh = on_host(mesh)
         self.directions = np.asarray(electrodes.directions(mesh))
         self._contact_impedance = np.asarray(electrodes.contact_impedance)
-        self._step = _DIFFERENCE_SHIFT * float(np.ptp(np.asarray(mesh.points), axis=0).max())
+        self._step = _RELATIVE_FINITE_DIFFERENCE_SHIFT * float(np.ptp(np.asarray(mesh.points), axis=0).max())
         self._sensitivity = ContactSensitivity(mesh, electrodes)
         self._shifted_sensitivities = []
         for direction in range(self.directions.shape[1]):

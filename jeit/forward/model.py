@@ -24,7 +24,7 @@ from jeit.mesh import Mesh
 from jeit.protocol import Protocol
 from jeit_solvers import in_turn, on_cores
 from jeit_solvers.engines import (
-    Recent,
+    RecentResultsCache,
     empty_for_jax,
     gather,
     has_values,
@@ -37,7 +37,7 @@ from jeit_solvers.engines import (
 from jeit_solvers.module import Module
 
 # Maximum number of entries of a block of the Jacobian, so that the block fits in the cache of a core.
-_BLOCK_ENTRIES = 250_000
+_MAX_BLOCK_ENTRIES = 250_000
 # Minimum number of blocks that are distributed over the cores.
 _MIN_PARALLEL_BLOCKS = 20
 # Number of cells processed at a time, so that their fields fit in the cache of a core.
@@ -356,7 +356,7 @@ def _whole_jacobian(mesh: Mesh, protocol: Protocol, fields: Inexact[Array, "n L"
 
 
 def _blocks_of_cells(mesh: Mesh, protocol: Protocol) -> list[slice]:
-    size = max(1, _BLOCK_ENTRIES // protocol.num_measurements)
+    size = max(1, _MAX_BLOCK_ENTRIES // protocol.num_measurements)
     return [slice(start, min(start + size, mesh.num_cells)) for start in range(0, mesh.num_cells, size)]
 
 
@@ -439,7 +439,7 @@ def _integrate_on_host(
 
 
 # A model is usually evaluated many times, and its electrodes may change while its mesh stays the same.
-integrated_model = Recent(_integrate_electrodes)
+integrated_model = RecentResultsCache(_integrate_electrodes)
 """The `IntegratedModel` of a mesh, electrodes, a protocol and a system whose values are all known."""
-host_model = Recent(_integrate_on_host)
+host_model = RecentResultsCache(_integrate_on_host)
 """The same as `integrated_model`, but in NumPy, for calls outside compiled code, which then need no compilation."""

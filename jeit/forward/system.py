@@ -32,7 +32,7 @@ from jeit_solvers import (
     find_fronts,
     quadratic_form,
 )
-from jeit_solvers.engines import Recent, gather, has_values, host, namespace, undifferentiated
+from jeit_solvers.engines import RecentResultsCache, gather, has_values, host, namespace, undifferentiated
 from jeit_solvers.module import Module
 
 
@@ -110,7 +110,7 @@ def _gradients_and_measures(mesh: Mesh):
     return gradients(mesh), measures(mesh)
 
 
-_last_geometry = Recent(_gradients_and_measures, 1)
+_last_geometry = RecentResultsCache(_gradients_and_measures, 1)
 
 
 def _unit_stiffness(mesh: Mesh) -> Inexact[Array, "p m"]:
@@ -131,7 +131,7 @@ def _scaled_stiffness(gradient, flux, weight) -> Inexact[Array, "p m"]:
     )
 
 
-_last_unit_stiffness = Recent(_unit_stiffness, 1)
+_last_unit_stiffness = RecentResultsCache(_unit_stiffness, 1)
 
 
 def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Array, "p m"]:
@@ -206,7 +206,7 @@ class System(Module):
             return cls(pattern, ConjugateGradient())
         raise ValueError(f"solver must be 'auto', 'cholesky', 'cg' or a lineax solver, not '{solver}'.")
 
-    def grounded(
+    def grounded_system(
         self, mesh: Mesh, conductivity, electrodes: AbstractElectrodes, contact: Contact
     ) -> tuple[SparseSymmetric, Inexact[Array, "n c"]]:
         """Return the system matrix A and the loads (right-hand sides). A, (n, n) in siemens, is symmetric positive

@@ -75,13 +75,15 @@ def transfer_impedance(mesh: Mesh, conductivity: ArrayLike, electrodes: Abstract
 def impedance_parts(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System) -> ElectrodeImpedance:
     """The transfer impedance in two parts, body and contacts, as an `ElectrodeImpedance`; `conductivity` in S/m (2-D:
     S)."""
-    formula = _impedance_by_quadratic_form if namespace(mesh, conductivity, electrodes) is np else _differentiable
-    return formula(mesh, conductivity, electrodes, system)
+    impedance_function = (
+        _impedance_by_quadratic_form if namespace(mesh, conductivity, electrodes) is np else _differentiable
+    )
+    return impedance_function(mesh, conductivity, electrodes, system)
 
 
 def _impedance_by_quadratic_form(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System):
     contact = electrodes.contact(mesh)
-    operator, load = system.grounded(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
+    operator, load = system.grounded_system(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
     return electrode_impedance(system.quadratic_form(operator, load), contact_resistance(electrodes, contact))
 
 
@@ -95,11 +97,11 @@ def _impedance_parts_jvp(primals, tangents):
     impedance, (fields, potentials) = solved.impedance(), solved.fields()
 
     def stationary(mesh, conductivity, electrodes):
-        form = _stationary_form(mesh, conductivity, electrodes, fields, potentials)
+        stationary_form = _stationary_form(mesh, conductivity, electrodes, fields, potentials)
         resistance = contact_resistance(electrodes, electrodes.contact(mesh))
         if resistance is None:
-            return ElectrodeImpedance(form, jnp.zeros_like(impedance.contact))
-        return ElectrodeImpedance(form - jnp.diag(resistance), resistance)
+            return ElectrodeImpedance(stationary_form, jnp.zeros_like(impedance.contact))
+        return ElectrodeImpedance(stationary_form - jnp.diag(resistance), resistance)
 
     return impedance, eqx.filter_jvp(stationary, (mesh, conductivity, electrodes), tangents[:3])[1]
 
@@ -157,7 +159,7 @@ def unit_fields(
 def solved_system(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System) -> SolvedSystem:
     """Solve the finite-element system for the loads of the electrodes; `conductivity` in S/m (2-D: S)."""
     contact = electrodes.contact(mesh)
-    operator, load = system.grounded(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
+    operator, load = system.grounded_system(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
     return SolvedSystem(operator, load, system.solve(operator, load), contact_resistance(electrodes, contact))
 
 
@@ -234,13 +236,13 @@ def _refinement_correction(
     """
     xp = namespace(other_impedance)
     if xp is np:
-        flow = np.stack(
+        electrode_currents = np.stack(
             [row @ (potential - impedance) for row, potential in zip(other_impedance, impedance, strict=True)]
         )
     else:
-        flow = (other_impedance[:, :, None] * (impedance[:, None] - impedance)).sum(axis=1)
-    correction = impedance @ (current - flow)
-    return (correction + correction.T) / 2
+        electrode_currents = (other_impedance[:, :, None] * (impedance[:, None] - impedance)).sum(axis=1)
+    potential_correction = impedance @ (current - electrode_currents)
+    return (potential_correction + potential_correction.T) / 2
 
 
 def centred(matrix: Inexact[Array, "L L"]) -> Inexact[Array, "L L"]:

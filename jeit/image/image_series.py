@@ -120,7 +120,7 @@ class ImageSeries:
 Window = Literal["hann", "none"]
 # Resolution of each window in units of 1 / T; number of trial frequencies per resolution in the search for the
 # strongest frequency.
-_WINDOW_RESOLUTION = {"hann": 2.0, "none": 1.0}
+_RESOLUTION_OF_WINDOW = {"hann": 2.0, "none": 1.0}
 _FREQUENCIES_PER_RESOLUTION = 8
 # Minimum number of periods in the measured time.
 _MIN_PERIODS = 1.0
@@ -180,9 +180,9 @@ def oscillation(
     ```
     """
     finite_values, finite_times = _finite_rows(values, times)
-    check_name("window", window, _WINDOW_RESOLUTION)
+    check_name("window", window, _RESOLUTION_OF_WINDOW)
     duration = float(finite_times[-1] - finite_times[0])
-    resolution = _WINDOW_RESOLUTION[window] / duration
+    resolution = _RESOLUTION_OF_WINDOW[window] / duration
     min_frequency, max_frequency = _check_band(frequency)
     rate = (len(finite_times) - 1) / duration
     if max_frequency >= rate / 2:
@@ -238,10 +238,10 @@ def amplitude_spectrum(
     ```
     """
     finite_values, finite_times = _finite_rows(values, times)
-    check_name("window", window, _WINDOW_RESOLUTION)
+    check_name("window", window, _RESOLUTION_OF_WINDOW)
     duration = float(finite_times[-1] - finite_times[0])
     frequencies = np.arange(
-        1 / duration, (len(finite_times) - 1) / duration / 2, _WINDOW_RESOLUTION[window] / duration / 2
+        1 / duration, (len(finite_times) - 1) / duration / 2, _RESOLUTION_OF_WINDOW[window] / duration / 2
     )
     weight = _window_weights(finite_times, window)
     centred = finite_values - np.tensordot(weight, finite_values, 1) / weight.sum()
@@ -321,9 +321,11 @@ def _strongest_frequency(
         max(int(np.ceil((max_frequency - min_frequency) / resolution * _FREQUENCIES_PER_RESOLUTION)), 2) + 1,
     )
     best_index = int(np.argmin([power(frequency) for frequency in trial_frequencies]))
-    bracket = (
+    search_interval = (
         trial_frequencies[max(best_index - 1, 0)],
         trial_frequencies[min(best_index + 1, len(trial_frequencies) - 1)],
     )
-    result: Any = scipy.optimize.minimize_scalar(power, bounds=bracket, method="bounded", options={"xatol": 1e-9})
+    result: Any = scipy.optimize.minimize_scalar(
+        power, bounds=search_interval, method="bounded", options={"xatol": 1e-9}
+    )
     return float(result.x)

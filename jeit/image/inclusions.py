@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 from scipy import sparse
 
 from jeit.arguments.checks import Interval
-from jeit.image.segmentation import basins, shared_facets
+from jeit.image.segmentation import shared_facets, watershed_basins
 from jeit.mesh import Mesh, centroids, measures
 from jeit_solvers.module import Module
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _SURFACE_COLUMNS, _SURFACE_ROWS = 48, 24
 # Level of the image at the edge of the strongest region, as a share of the region's peak.
-_REGION_LEVEL = 0.5
+_RELATIVE_REGION_THRESHOLD = 0.5
 
 
 class SolidForm(Module):
@@ -54,12 +54,12 @@ class SolidForm(Module):
         )
         axes = np.array(self.axes)
         axes[0] *= np.sign(np.linalg.det(axes))  # a right-handed system, so that all normals point outward
-        lower_nodes = _SURFACE_COLUMNS * np.arange(len(height) - 1)[:, None] + np.arange(_SURFACE_COLUMNS)
-        next_lower_nodes = np.roll(lower_nodes, -1, axis=1)
-        upper_nodes, next_upper_nodes = lower_nodes + _SURFACE_COLUMNS, next_lower_nodes + _SURFACE_COLUMNS
+        lower_ring_nodes = _SURFACE_COLUMNS * np.arange(len(height) - 1)[:, None] + np.arange(_SURFACE_COLUMNS)
+        next_lower_nodes = np.roll(lower_ring_nodes, -1, axis=1)
+        upper_ring_nodes, next_upper_nodes = lower_ring_nodes + _SURFACE_COLUMNS, next_lower_nodes + _SURFACE_COLUMNS
         corners = [
-            np.stack([lower_nodes, next_lower_nodes, upper_nodes], axis=-1),
-            np.stack([next_lower_nodes, next_upper_nodes, upper_nodes], axis=-1),
+            np.stack([lower_ring_nodes, next_lower_nodes, upper_ring_nodes], axis=-1),
+            np.stack([next_lower_nodes, next_upper_nodes, upper_ring_nodes], axis=-1),
         ]
         return TriangleSurface(
             unit_points.reshape(-1, 3) @ axes + np.array(self.centre), np.stack(corners).reshape(-1, 3)
@@ -69,9 +69,9 @@ class SolidForm(Module):
 # Minimum area of an inclusion as a fraction of a sheet (a disc with a fourteenth of the sheet's width), and minimum
 # volume as a fraction of a solid (a ball with an eighth of the solid's width). Images of solids have a coarser
 # resolution.
-_LEAST_AREA = {2: 0.004, 3: 0.001}
+_MIN_RELATIVE_AREA = {2: 0.004, 3: 0.001}
 # Default minimum peak of an inclusion as a multiple of the noise of the image.
-LEAST_SIGNIFICANCE = 5.5
+DEFAULT_MIN_SIGNIFICANCE = 5.5
 
 
 class Inclusion(Module):
@@ -139,7 +139,7 @@ def find_inclusions(
     least_prominence: float = 0.1,
     least_area: float | None = None,
     noise: Float[Array, " m"] | None = None,
-    least_significance: float = LEAST_SIGNIFICANCE,
+    least_significance: float = DEFAULT_MIN_SIGNIFICANCE,
 ) -> list[Inclusion]:
     """Find inclusions: the peaks of an image, each with the surrounding region where the change exceeds `level` times
     the peak. The strongest inclusion comes first. Peaks below the minimum values in the arguments are regarded as
@@ -200,7 +200,7 @@ class StrongestRegion:
         """Return the centroid of the strongest region, in metres, and the signed peak of a `change` (m,) per cell."""
         peak = int(np.abs(change).argmax())
         relative = change / change[peak] if change[peak] else np.zeros_like(change)
-        candidates = relative >= _REGION_LEVEL
+        candidates = relative >= _RELATIVE_REGION_THRESHOLD
         region = np.zeros(len(change), np.float32)
         region[peak] = 1
         count = 0
@@ -208,7 +208,7 @@ class StrongestRegion:
             region = ((self._incidence @ (self._transposed @ region) > 0) & candidates).astype(np.float32)
             region[peak] = 1
         cells = region > 0
-        weight = self._measures[cells] * np.maximum(relative[cells], _REGION_LEVEL)
+        weight = self._measures[cells] * np.maximum(relative[cells], _RELATIVE_REGION_THRESHOLD)
         return weight @ self._centroids[cells] / weight.sum(), float(change[peak])
 
 
@@ -221,7 +221,7 @@ def inclusion_regions(
     least_prominence: float = 0.1,
     least_area: float | None = None,
     noise: Float[Array, " m"] | None = None,
-    least_significance: float = LEAST_SIGNIFICANCE,
+    least_significance: float = DEFAULT_MIN_SIGNIFICANCE,
 ) -> list[tuple[Inclusion, Bool[np.ndarray, " m"]]]:
     """Return the inclusions of `find_inclusions`, each with a mask (m,) of the cells of its region. Raises `ValueError`
     as `find_inclusions` does."""
@@ -244,14 +244,16 @@ def inclusion_regions(
     # adjacent cells of higher value.
     shared = np.asarray(mesh.cells) if mesh.dimension == 3 else shared_facets(mesh)
     if least_area is None:
-        least_area = _LEAST_AREA[mesh.dimension]
+        least_area = _MIN_RELATIVE_AREA[mesh.dimension]
     inclusions = []
     for sign in (1, -1):
         change = sign * values
-        basin = basins(change, shared, floor=level * least_peak * max_change, least_prominence=least_prominence)
-        for label in np.unique(basin[basin >= 0]):
+        basin_indices = watershed_basins(
+            change, shared, min_value=level * least_peak * max_change, least_prominence=least_prominence
+        )
+        for label in np.unique(basin_indices[basin_indices >= 0]):
             peak = change[label]
-            region = (basin == label) & (change >= level * peak)
+            region = (basin_indices == label) & (change >= level * peak)
             if noise is not None and peak < least_significance * noise[label]:
                 continue
             if peak < least_peak * max_change or cell_measures[region].sum() < least_area * cell_measures.sum():

@@ -176,8 +176,14 @@ def isosurface_of(mesh: Mesh, values: Float[np.ndarray, "..."], level: float) ->
     sign = 1.0 if level > 0 else -1.0
     height = sign * node_values(mesh, values) - abs(level)
     points = np.asarray(mesh.points)
-    inner, wall = crossed_cells(np.asarray(mesh.cells), height), cut_above_level(np.asarray(mesh.facets), height)
-    end_nodes, edge_fractions = np.concatenate([inner.ends, wall.ends]), np.concatenate([inner.share, wall.share])
+    inner_surface, wall_surface = (
+        crossed_cells(np.asarray(mesh.cells), height),
+        cut_above_level(np.asarray(mesh.facets), height),
+    )
+    end_nodes, edge_fractions = (
+        np.concatenate([inner_surface.ends, wall_surface.ends]),
+        np.concatenate([inner_surface.share, wall_surface.share]),
+    )
     # One point for each crossed edge and each node of the wall, shared between cells.
     end_nodes = np.where(
         ((edge_fractions == 0) | (edge_fractions == 1))[..., None],
@@ -197,11 +203,11 @@ def isosurface_of(mesh: Mesh, values: Float[np.ndarray, "..."], level: float) ->
         end_nodes[:, 1]
     ]
     # Normals point from values above the level to values below; facets of the wall have outward normals already.
-    inward_directions = points[inner.ends[..., 1]].sum(axis=1) - points[inner.ends[..., 0]].sum(axis=1)
-    outward = np.concatenate([inward_directions, _normals(points[np.asarray(mesh.facets)[wall.cell]])])
+    inward_directions = points[inner_surface.ends[..., 1]].sum(axis=1) - points[inner_surface.ends[..., 0]].sum(axis=1)
+    outward = np.concatenate([inward_directions, _normals(points[np.asarray(mesh.facets)[wall_surface.cell]])])
     triangles = np.concatenate([number[:, [0, 1, 2]], number[:, [0, 2, 3]]])
-    is_inverted = np.sum(_normals(points_on_edges[triangles]) * np.concatenate([outward, outward]), axis=1) < 0
-    triangles[is_inverted] = triangles[is_inverted][:, ::-1]
+    needs_flip = np.sum(_normals(points_on_edges[triangles]) * np.concatenate([outward, outward]), axis=1) < 0
+    triangles[needs_flip] = triangles[needs_flip][:, ::-1]
     a, b, c = triangles.T
     return TriangleSurface(points_on_edges, triangles[(a != b) & (b != c) & (a != c)])
 

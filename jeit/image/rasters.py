@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Inexact, Int
 
 from jeit.arguments import object_html, object_text, picture
 from jeit.mesh import Mesh, check_flat
-from jeit_solvers.engines import as_array, either_engine, has_values, namespace
+from jeit_solvers.engines import as_array, has_values, namespace, numpy_or_compiled
 from jeit_solvers.module import Module
 
 
@@ -87,7 +87,7 @@ class Raster(Module):
         return _sample(self.cell, image)
 
 
-@either_engine
+@numpy_or_compiled
 def _sample(cell, image):
     xp = namespace(cell, image)
     return xp.where(cell >= 0, image[..., xp.maximum(cell, 0)], xp.nan)
@@ -131,7 +131,7 @@ def _cells_of_pixels(points, cells, x, y, height: float | None) -> Int[np.ndarra
 
 
 # Pixels above this fraction of the image's maximum belong to the target.
-_TARGET_LEVEL = 0.25
+_RELATIVE_TARGET_THRESHOLD = 0.25
 
 
 class FiguresOfMerit(Module):
@@ -247,11 +247,11 @@ def _figures_of_one_image(raster, extent, position, area, change):
     x = x_min + (jnp.arange(columns) + 0.5) * (x_max - x_min) / columns
     y = (y_max - (jnp.arange(rows) + 0.5) * (y_max - y_min) / rows)[:, None]
     pixel_area = (x_max - x_min) * (y_max - y_min) / raster.size
-    is_body = jnp.isfinite(raster)
-    value = jnp.where(is_body, raster, 0) / change  # positive values have the target's sign
+    is_body_pixel = jnp.isfinite(raster)
+    value = jnp.where(is_body_pixel, raster, 0) / change  # positive values have the target's sign
     max_value = value.max()
-    target_pixels = is_body & (value >= _TARGET_LEVEL * max_value) & (max_value > 0)
-    body_centre, body_size = _centre_of_gravity(is_body, x, y), jnp.sum(is_body)
+    target_pixels = is_body_pixel & (value >= _RELATIVE_TARGET_THRESHOLD * max_value) & (max_value > 0)
+    body_centre, body_size = _centre_of_gravity(is_body_pixel, x, y), jnp.sum(is_body_pixel)
     target_centre, target_size = _centre_of_gravity(target_pixels, x, y), jnp.sum(target_pixels)
     is_in_circle = (x - target_centre[0]) ** 2 + (y - target_centre[1]) ** 2 <= target_size * pixel_area / jnp.pi
     distance = jnp.hypot(*(position - body_centre))

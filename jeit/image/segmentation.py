@@ -60,8 +60,8 @@ def box_region(mesh: Mesh, lower: ArrayLike, upper: ArrayLike) -> Bool[np.ndarra
     )
     if not (np.asarray(lower, float) < np.asarray(upper, float)).all():
         raise ValueError("upper must be larger than lower in every coordinate.")
-    is_between = (offsets_from_lower >= 0).all(axis=1) & (offsets_from_upper <= 0).all(axis=1)
-    return _check_not_empty(mesh, is_between, "no centroid of a cell lies between lower and upper")
+    is_inside_box = (offsets_from_lower >= 0).all(axis=1) & (offsets_from_upper <= 0).all(axis=1)
+    return _check_not_empty(mesh, is_inside_box, "no centroid of a cell lies between lower and upper")
 
 
 def half_region(mesh: Mesh, direction: ArrayLike, point: ArrayLike | None = None) -> Bool[np.ndarray, " m"]:
@@ -122,15 +122,15 @@ def shared_facets(mesh: Mesh) -> Int[np.ndarray, "m k"]:
     return shared
 
 
-def basins(
+def watershed_basins(
     change: Float[np.ndarray, " m"],
     shared: Int[np.ndarray, "m k"],
     *,
-    floor: float,
+    min_value: float,
     least_prominence: float,
 ) -> Int[np.ndarray, " m"]:
-    """Segment an image by a watershed from the peaks down. Returns, for every cell above `floor`, the index of the cell
-    at the peak of its basin, and -1 for cells below `floor`.
+    """Segment an image by a watershed from the peaks down. Returns, for every cell above `min_value`, the index of the
+    cell at the peak of its basin, and -1 for cells below `min_value`.
 
     `change`: (m,) value of every cell; `shared`: (m, k) indices of the facets (`shared_facets`) or nodes that cells
     share, -1 for none. Where two basins meet, the basin with the lower peak is merged into the other basin, unless the
@@ -145,16 +145,16 @@ def basins(
             label = merged_labels[label]
         return label
 
-    cells = np.flatnonzero(change > floor)
+    cells = np.flatnonzero(change > min_value)
     for cell in cells[np.argsort(-change[cells], kind="stable")].tolist():
-        shared_places = [neighbour for neighbour in shared[cell].tolist() if neighbour >= 0]
-        labels = {find_root(label_of_place[neighbour]) for neighbour in shared_places if neighbour in label_of_place}
+        neighbours = [neighbour for neighbour in shared[cell].tolist() if neighbour >= 0]
+        labels = {find_root(label_of_place[neighbour]) for neighbour in neighbours if neighbour in label_of_place}
         highest = max(labels, key=lambda label: change[label], default=cell)
         for label in labels - {highest}:
             if change[label] - change[cell] < least_prominence * change[label]:
                 merged_labels[label] = highest
         peak[cell] = highest
-        label_of_place.update(dict.fromkeys(shared_places, highest))
+        label_of_place.update(dict.fromkeys(neighbours, highest))
     peak[cells] = [find_root(label) for label in peak[cells].tolist()]
     return peak
 
@@ -204,9 +204,9 @@ def segment(
         peak = (sign * values).max()
         if peak <= 0 or peak < least_peak * max_value:
             continue
-        islands = np.zeros(values.shape, np.int32)
-        ndimage.label(sign * values > level * peak, output=islands)
-        island_sizes = np.bincount(islands.ravel())
-        island_sizes[0] = 0
-        labels[island_sizes[islands] >= max(1, least_area * is_inside.sum())] = label
+        connected_regions = np.zeros(values.shape, np.int32)
+        ndimage.label(sign * values > level * peak, output=connected_regions)
+        region_sizes = np.bincount(connected_regions.ravel())
+        region_sizes[0] = 0
+        labels[region_sizes[connected_regions] >= max(1, least_area * is_inside.sum())] = label
     return labels

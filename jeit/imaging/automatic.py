@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Inexact
 
 from jeit.arguments import percent
-from jeit.imaging.method import METHODS, Imaged, MethodOptions, image_of_shapes, shapes_in
+from jeit.imaging.method import METHODS, Imaged, MethodOptions, conductivity_change_of_shapes, shapes_in
 from jeit.imaging.preparation import PreparedDifference
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
@@ -21,8 +21,8 @@ from jeit_solvers.engines import as_array
 
 # Changes of conductivity relative to the background above which voltages are not linear in conductivity: in general,
 # and for noisy data, whose images show far less than the true change. Data are noisy if the share of noise in the
-# voltage difference exceeds `_NOISY_SHARE`.
-_STRONG_CHANGE, _STRONG_NOISY_CHANGE, _NOISY_SHARE = 0.3, 0.1, 0.3
+# voltage difference exceeds `_MIN_NOISY_NOISE_SHARE`.
+_STRONG_CONDUCTIVITY_CHANGE, _STRONG_CONDUCTIVITY_CHANGE_IN_NOISE, _MIN_NOISY_NOISE_SHARE = 0.3, 0.1, 0.3
 # A linear image has a fault if the voltages computed from it leave too large a share of the voltage difference
 # unexplained: more than `_LARGE_MISFIT`, and more than `_MAX_MISFIT_RATIO` times the share that linearised voltages
 # leave unexplained.
@@ -30,11 +30,11 @@ _MAX_MISFIT_RATIO, _LARGE_MISFIT = 1.1, 0.1
 # Lower bound of the conductivity of a linear image, as a share of the background conductivity.
 _MIN_CONDUCTIVITY = 0.01
 # Bodies are fitted in a solid if the largest change of conductivity in an image exceeds this share of the background.
-_MIN_BODY_CHANGE = 0.05
+_MIN_RELATIVE_BODY_CHANGE = 0.05
 # Fitted bodies, a few numbers, are preferred to a smooth image, which has many, unless their misfit is so many times
 # larger. On simulated tanks where it exceeds one standard deviation, it was 1.0 to 1.2 times as large for homogeneous
 # bodies, and 2.2 to 18 times for smooth conductivity.
-_MAX_SHAPES_RATIO = 1.5
+_MAX_SHAPE_MISFIT_RATIO = 1.5
 # Step along the linear image for the finite difference that approximates the derivative of the voltages.
 _DERIVATIVE_STEP = 1e-4
 
@@ -71,7 +71,7 @@ def image_automatically(prepared: PreparedDifference, options: MethodOptions, se
         except ValueError as error:
             return ChosenMethod("one-step", f"{fault}; but Gauss-Newton found no image. {error}", imaged)
         assert isinstance(gauss_newton[0], Reconstruction)
-        shapes, outline_note = (None, "") if uses_own_prior else _shapes(prepared, gauss_newton[0], options)
+        shapes, outline_note = (None, "") if uses_own_prior else _fit_shapes(prepared, gauss_newton[0], options)
         if shapes is not None or not segmented:
             return _add_bodies(
                 prepared, f"{fault}: solved for conductivity itself{outline_note}.", gauss_newton, shapes
@@ -97,21 +97,21 @@ def _image_for_bodies(prepared: PreparedDifference, options: MethodOptions) -> I
     needs, is computed at the same time."""
     if prepared.mesh.dimension < 3:
         return _image_with_method("gauss-newton", prepared, options)
-    jobs = [lambda: _image_with_method("gauss-newton", prepared, options), lambda: prepared.accuracy]
-    return results_on_cores(lambda job: job(), jobs)[0]
+    functions = [lambda: _image_with_method("gauss-newton", prepared, options), lambda: prepared.accuracy]
+    return results_on_cores(lambda job: job(), functions)[0]
 
 
 def _bodies_in_solid(
     prepared: PreparedDifference, options: MethodOptions, change: Float[Array, " m"]
 ) -> ChosenMethod | None:
-    """Fit bodies to the data of a solid. Returns None for sheets, weak changes (see `_MIN_BODY_CHANGE`) and noisy data,
-    and if no bodies explain the voltages."""
+    """Fit bodies to the data of a solid. Returns None for sheets, weak changes (see `_MIN_RELATIVE_BODY_CHANGE`) and
+    noisy data, and if no bodies explain the voltages."""
     noise = prepared.quality.difference_noise
     max_change = np.abs(np.asarray(change)).max() / float(prepared.calibration.conductivity)
     if (
         prepared.mesh.dimension < 3
-        or max_change < _MIN_BODY_CHANGE
-        or (noise is not None and noise.relative > _NOISY_SHARE)
+        or max_change < _MIN_RELATIVE_BODY_CHANGE
+        or (noise is not None and noise.relative > _MIN_NOISY_NOISE_SHARE)
     ):
         return None
     try:
@@ -119,7 +119,7 @@ def _bodies_in_solid(
     except ValueError:
         return None
     assert isinstance(smooth_image[0], Reconstruction)
-    shapes, _ = _shapes(prepared, smooth_image[0], options)
+    shapes, _ = _fit_shapes(prepared, smooth_image[0], options)
     reason = f"the voltages show bodies, which a linear image of a solid blurs: their {_edges(prepared)} were fitted."
     return shapes and _add_bodies(prepared, reason, smooth_image, shapes)
 
@@ -132,7 +132,7 @@ def _add_bodies(
     contrast, with artefacts about as strong."""
     if shapes is None or prepared.mesh.dimension < 3:
         return ChosenMethod("gauss-newton", reason, smooth_image, shapes)
-    return ChosenMethod("shapes", reason, image_of_shapes(prepared, shapes), shapes)
+    return ChosenMethod("shapes", reason, conductivity_change_of_shapes(prepared, shapes), shapes)
 
 
 def _edges(prepared: PreparedDifference) -> str:
@@ -140,18 +140,18 @@ def _edges(prepared: PreparedDifference) -> str:
     return "surfaces" if prepared.mesh.dimension == 3 else "outlines"
 
 
-def _shapes(
+def _fit_shapes(
     prepared: PreparedDifference, smooth_image: Reconstruction, options: MethodOptions
 ) -> tuple[ShapeReconstruction | None, str]:
     """Fit the bodies of a smooth image as shapes. Returns the shapes and a clause for the message. Returns None and the
     reason if no bodies are found, or if the misfit of the shapes exceeds both one standard deviation of
-    `PreparedDifference.sharp_noise` and `_MAX_SHAPES_RATIO` times the misfit of the smooth image."""
+    `PreparedDifference.sharp_noise` and `_MAX_SHAPE_MISFIT_RATIO` times the misfit of the smooth image."""
     shapes, edges = shapes_in(prepared, smooth_image, options), _edges(prepared)
     if not shapes.bodies:
         return None, f"; no body's {edges[:-1]} explains the voltages better than errors of the model do"
     # Where the noise is not known, it is estimated so that the smooth image has a misfit of at most 1.
     smooth_misfit = float(smooth_image.misfit) if prepared.noise is not None else min(float(smooth_image.misfit), 1.0)
-    if (misfit := float(shapes.misfit)) > (max_misfit := max(1.0, _MAX_SHAPES_RATIO * smooth_misfit)):
+    if (misfit := float(shapes.misfit)) > (max_misfit := max(1.0, _MAX_SHAPE_MISFIT_RATIO * smooth_misfit)):
         return (
             None,
             f"; {edges} of bodies miss the voltages by {misfit:.2g} standard deviations, {max_misfit:.2g} at most",
@@ -167,8 +167,12 @@ def linear_image_fault(prepared: PreparedDifference, change: Float[Array, " m"])
     min_change, max_change = float(relative_change.min()), float(relative_change.max())
     if min_change < -1:
         return f"the linear image falls to {percent(min_change)} of the background, below -100 %"
-    is_noisy = (quality := prepared.quality.difference_noise) is not None and quality.relative > _NOISY_SHARE
-    if max(-min_change, max_change) > (_STRONG_NOISY_CHANGE if is_noisy else _STRONG_CHANGE):
+    is_difference_noisy = (
+        quality := prepared.quality.difference_noise
+    ) is not None and quality.relative > _MIN_NOISY_NOISE_SHARE
+    if max(-min_change, max_change) > (
+        _STRONG_CONDUCTIVITY_CHANGE_IN_NOISE if is_difference_noisy else _STRONG_CONDUCTIVITY_CHANGE
+    ):
         extreme_change = min_change if -min_change > max_change else max_change
         return (
             f"the linear image reaches {percent(extreme_change)} of the background, where voltages are no longer linear"
@@ -197,7 +201,7 @@ def estimate_unexplained_noise(
         return prepared
     background, relative_noise = float(prepared.calibration.conductivity), np.asarray(prepared.relative_noise)
     is_used, difference = np.asarray(prepared.mask), np.asarray(prepared.difference)
-    size, rest, modelled = (
+    size, unexplained_difference, modelled_difference = (
         float(np.sqrt(np.mean((np.asarray(volts) / relative_noise)[is_used] ** 2)))
         for volts in (difference, difference - prepared.common_change, prepared.modelled_noise)
     )
@@ -209,7 +213,9 @@ def estimate_unexplained_noise(
             (replace(prepared, difference=as_array(random)), reconstruction.image(random)),
         )
     )
-    return prepared.with_noise_from(unexplained * size / modelled, unexplained / unexplained_noise * size / rest)
+    return prepared.with_noise_from(
+        unexplained * size / modelled_difference, unexplained / unexplained_noise * size / unexplained_difference
+    )
 
 
 def change_and_noise(
@@ -230,6 +236,8 @@ def _unexplained_share(prepared: PreparedDifference, background: float, change: 
     difference quotient of width `step`. Channels are divided by their noise."""
     model, is_used = prepared.model, np.asarray(prepared.mask)
     conductivity = background * np.maximum(1 + step * change, _MIN_CONDUCTIVITY)
-    predicted = (np.asarray(model.voltages(conductivity)) - np.asarray(model.voltages(background))) / step
+    predicted_difference = (np.asarray(model.voltages(conductivity)) - np.asarray(model.voltages(background))) / step
     noise, difference = np.asarray(prepared.relative_noise)[is_used], np.asarray(prepared.difference)[is_used]
-    return float(np.linalg.norm((predicted[is_used] - difference) / noise) / np.linalg.norm(difference / noise))
+    return float(
+        np.linalg.norm((predicted_difference[is_used] - difference) / noise) / np.linalg.norm(difference / noise)
+    )

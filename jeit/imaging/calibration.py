@@ -27,11 +27,11 @@ from jeit_solvers import one_thread_of_blas
 from jeit_solvers.engines import as_array
 
 # Default number of mesh nodes for a solid and for a sheet.
-SOLID_POINTS, SHEET_POINTS = 10_000, 2000
+DEFAULT_SOLID_NUM_POINTS, DEFAULT_SHEET_NUM_POINTS = 10_000, 2000
 # Misfit of the model to the reference up to which the described electrode positions are used. Above it, estimated
 # positions are used if the ratios of the misfit with estimated to the misfit with described positions are below these
 # limits: with each channel relative to its noise, and with equal weights.
-_MAX_EXACT_MISFIT, _MAX_RELATIVE_RATIO, _MAX_MISFIT_RATIO = 0.01, 0.7, 2.0
+_MAX_MISFIT_OF_DESCRIBED_POSITIONS, _MAX_RELATIVE_RATIO, _MAX_MISFIT_RATIO = 0.01, 0.7, 2.0
 
 
 _Arguments = ParamSpec("_Arguments")
@@ -56,8 +56,8 @@ def keep_last_result(function: Callable[_Arguments, _Result]) -> Callable[_Argum
             or stored_call[1] != structure
             or not all(map(_are_equal_arguments, stored_call[0], leaves))
         ):
-            copies = [leaf.copy() if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
-            last_call = stored_call = copies, structure, function(*args, **kwargs)
+            copied_leaves = [leaf.copy() if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
+            last_call = stored_call = copied_leaves, structure, function(*args, **kwargs)
         return stored_call[2]
 
     return call_or_reuse
@@ -67,16 +67,16 @@ def _are_equal_arguments(first_argument, second_argument) -> bool:
     """Whether two leaves of arguments are the same object, or arrays or numbers of equal types and values."""
     if first_argument is second_argument:
         return True
-    same_type = type(first_argument) is type(second_argument) and getattr(first_argument, "dtype", None) == getattr(
-        second_argument, "dtype", None
-    )
+    have_same_type = type(first_argument) is type(second_argument) and getattr(
+        first_argument, "dtype", None
+    ) == getattr(second_argument, "dtype", None)
     # Masked voltages may be NaN.
-    return same_type and np.array_equal(
+    return have_same_type and np.array_equal(
         first_argument, second_argument, equal_nan=np.asarray(first_argument).dtype.kind in "fc"
     )
 
 
-class Clock:
+class StepTimer:
     """Timer of steps: reports the start of each step to `progress`, and stores its duration in `seconds`."""
 
     def __init__(self, progress: Callable[[str], None] | None):
@@ -114,7 +114,7 @@ def imaging_mesh(
     ```
     """
     if num_points is None and not isinstance(domain, OwnMesh):
-        num_points = usual or (SOLID_POINTS if isinstance(domain, Solid) else SHEET_POINTS)
+        num_points = usual or (DEFAULT_SOLID_NUM_POINTS if isinstance(domain, Solid) else DEFAULT_SHEET_NUM_POINTS)
     return body_mesh(domain, electrodes, num_points)
 
 
@@ -127,7 +127,7 @@ def described_model(
 
 
 def calibrated_model(
-    model: ForwardModel, base: Measurement, *, contact: str | None = None, clock: Clock | None = None
+    model: ForwardModel, base: Measurement, *, contact: str | None = None, clock: StepTimer | None = None
 ) -> tuple[Calibration, str]:
     """Calibrate the forward model on a frame of the undisturbed body; return the `Calibration`, and the kind of
     calibration of the contact impedance.
@@ -149,7 +149,7 @@ def calibrated_model(
     fit.conductivity, fit.misfit
     ```
     """
-    clock = Clock(None) if clock is None else clock
+    clock = StepTimer(None) if clock is None else clock
     with clock("calibrate"), one_thread_of_blas():
         return _calibrate(model, base, contact)
 
@@ -185,20 +185,20 @@ def _estimate_positions(calibration: Calibration, model: ForwardModel, voltages,
     """
     described_misfit = relative_misfit(calibration.voltages, voltages, mask)
     if (
-        not described_misfit > _MAX_EXACT_MISFIT
+        not described_misfit > _MAX_MISFIT_OF_DESCRIBED_POSITIONS
         or (placement := estimated_positions(model, voltages, mask, deviation)) is None
     ):
         return calibration
-    predicted = np.asarray(placement.model.voltages(placement.conductivity))
-    misfit = float(np.linalg.norm((predicted - voltages)[mask]) / np.linalg.norm(voltages[mask]))
-    is_better = relative_misfit(predicted, voltages, mask) < _MAX_RELATIVE_RATIO * described_misfit
+    predicted_voltages = np.asarray(placement.model.voltages(placement.conductivity))
+    misfit = float(np.linalg.norm((predicted_voltages - voltages)[mask]) / np.linalg.norm(voltages[mask]))
+    is_better = relative_misfit(predicted_voltages, voltages, mask) < _MAX_RELATIVE_RATIO * described_misfit
     if not (is_better and misfit < _MAX_MISFIT_RATIO * float(calibration.misfit)):
         return replace(calibration, model_error=placement.error)
     return replace(
         calibration,
         model=placement.model,
         conductivity=as_array(placement.conductivity),
-        voltages=as_array(predicted),
+        voltages=as_array(predicted_voltages),
         misfit=as_array(misfit),
         contact_deviation=as_array(np.linalg.norm(placement.error.factor, axis=1)[placement.shift.size :]),
         shift=as_array(placement.shift),
@@ -206,11 +206,11 @@ def _estimate_positions(calibration: Calibration, model: ForwardModel, voltages,
     )
 
 
-def relative_misfit(predicted, measured, mask) -> float:
+def relative_misfit(predicted_voltages, measured, mask) -> float:
     """Norm of the errors of predicted voltages (M,), as a share of the norm of the measured voltages, with each channel
     divided by its expected noise."""
     noise = np.asarray(relative_noise(measured, mask))[mask]
-    errors = (np.asarray(predicted) - measured)[mask]
+    errors = (np.asarray(predicted_voltages) - measured)[mask]
     return float(np.linalg.norm(errors / noise) / np.linalg.norm(measured[mask] / noise))
 
 

@@ -37,21 +37,21 @@ from jeit.imaging.wiring import find_wiring, uniform_impedances
 from jeit.mesh import Solid
 
 # Number of nodes of the mesh on which protocols are compared, for a sheet and for a solid.
-_NODES = {2: 700, 3: 4000}
+_NUM_NODES_BY_DIMENSION = {2: 700, 3: 4000}
 # Unexplained share of the empty body's voltages above which the best protocol is refused: in general; and if its kind
 # is known, or if the order of the channels matters (`Candidate.ordered`).
-_MAX_UNEXPLAINED, _MAX_UNEXPLAINED_KNOWN = 0.25, 0.5
+_MAX_UNEXPLAINED_SHARE, _MAX_UNEXPLAINED_SHARE_IF_KNOWN = 0.25, 0.5
 # Maximum spread of the frames of an empty body.
-_MAX_SPREAD = 0.2
+_MAX_SHAPE_DEVIATION = 0.2
 # Maximum number of candidate protocols whose misfit is computed. A candidate is ruled out if its unexplained share is
-# at least `_RIVAL_RATIO` times that of the best candidate plus `_RIVAL_MARGIN`.
-_MAX_COMPARED, _RIVAL_RATIO, _RIVAL_MARGIN = 12, 1.3, 0.01
+# at least `_EXCLUSION_RATIO` times that of the best candidate plus `_EXCLUSION_MARGIN`.
+_MAX_COMPARED_CANDIDATES, _EXCLUSION_RATIO, _EXCLUSION_MARGIN = 12, 1.3, 0.01
 # Minimum reciprocity error for which gains are estimated.
 _MIN_GAIN_ERROR = 0.03
 # Maximum ratio of the reciprocity error after the correction by estimated gains to the error before.
 _MAX_GAIN_RATIO = 0.4
 # Contact impedance of a new description, times conductivity, divided by the size of the body.
-_RELATIVE_CONTACT = 0.01
+_RELATIVE_CONTACT_IMPEDANCE = 0.01
 
 # For each number of electrodes: the model of the empty body, and its impedances (`uniform_impedances`).
 _Models = dict[int, tuple[ForwardModel, list[np.ndarray]]]
@@ -73,10 +73,12 @@ class Findings:
         """Reason why the best protocol explains the file too poorly to be used; empty if it explains the file well
         enough."""
         best = self.candidates[0]
-        max_unexplained = _MAX_UNEXPLAINED_KNOWN if self.known or best.ordered else _MAX_UNEXPLAINED
-        if best.unexplained < max_unexplained and best.spread < _MAX_SPREAD:
+        max_unexplained = (
+            _MAX_UNEXPLAINED_SHARE_IF_KNOWN if self.known or best.depends_on_channel_order else _MAX_UNEXPLAINED_SHARE
+        )
+        if best.unexplained < max_unexplained and best.spread < _MAX_SHAPE_DEVIATION:
             return ""
-        if best.spread >= _MAX_SPREAD:
+        if best.spread >= _MAX_SHAPE_DEVIATION:
             remedy = " If its two columns are real and imaginary parts, keep one of them." if best.frames == 2 else ""
             return (
                 f"the best explanation, {best.name}, makes frames of the empty body differ by {percent(best.spread)}: "
@@ -135,9 +137,11 @@ def find_description(
         raise ValueError(f"number must be from {MIN_ELECTRODES} to {MAX_ELECTRODES} electrodes; it is {number}.")
     progress("read")
     numbers = FileNumbers.read(path, keys[0], excluded=keys[1] if reference is None else None)
-    base_numbers = numbers if reference is None and keys[1] is None else FileNumbers.read(reference or path, keys[1])
+    reference_numbers = (
+        numbers if reference is None and keys[1] is None else FileNumbers.read(reference or path, keys[1])
+    )
     progress("protocols that fit")
-    candidates = list(fitting_candidates(numbers, base_numbers, geometry, electrodes, known or {}, current))
+    candidates = list(fitting_candidates(numbers, reference_numbers, geometry, electrodes, known or {}, current))
     if not candidates:
         counts = channel_counts(known or {})
         count_text = f" (of what is known: {names_text(counts)})" if counts else ""
@@ -147,37 +151,40 @@ def find_description(
             "[protocol], see docs/reference/description.md."
         )
     if any(item.explains_zeros for item in candidates):
-        candidates = [item for item in candidates if item.num_unread == 0]
+        candidates = [item for item in candidates if item.num_unread_channels == 0]
     candidates.sort(key=lambda item: np.hypot(item.spread, 0.3 if item.reciprocity is None else item.reciprocity))
     progress("uniform body")
     models: _Models = {}
-    compared: list[Candidate] = []
-    for candidate in candidates[:_MAX_COMPARED]:
-        rival_limit = min((_rival_limit(item) for item in compared), default=np.inf)
-        is_ruled_out = candidate.least_unexplained >= rival_limit
-        compared.append(candidate if is_ruled_out else _compute_misfit(candidate, models))
-    compared.sort(key=lambda item: (round(item.unexplained, 3), len(item.protocol)))
-    best_candidate = compared[0]
-    rival_candidates = [item for item in compared[1:] if item.unexplained < _rival_limit(best_candidate)]
+    compared_candidates: list[Candidate] = []
+    for candidate in candidates[:_MAX_COMPARED_CANDIDATES]:
+        min_exclusion_share = min((_exclusion_share(item) for item in compared_candidates), default=np.inf)
+        is_excluded = candidate.least_unexplained >= min_exclusion_share
+        compared_candidates.append(candidate if is_excluded else _compute_misfit(candidate, models))
+    compared_candidates.sort(key=lambda item: (round(item.unexplained, 3), len(item.protocol)))
+    best_candidate = compared_candidates[0]
+    rival_candidates = [item for item in compared_candidates[1:] if item.unexplained < _exclusion_share(best_candidate)]
     if not best_candidate.is_cut_off:
         rival_candidates = [item for item in rival_candidates if not item.is_cut_off]
     best_candidate = _fit_gains(best_candidate, models)
-    compared[0] = best_candidate
+    compared_candidates[0] = best_candidate
     contact = {"contact_impedance": _contact_impedance(best_candidate, models[best_candidate.protocol["number"]][0])}
     tables = {
         "geometry": geometry,
         "electrodes": {**contact, **electrodes, "number": best_candidate.protocol["number"]},
     }
     tables["protocol"] = {**best_candidate.protocol, "current": current}
-    text = _text(path, numbers.shape, numbers.data, best_candidate, rival_candidates, tables)
+    text = _description_text(path, numbers.shape, numbers.data, best_candidate, rival_candidates, tables)
     return Findings(
-        (*compared, *candidates[_MAX_COMPARED:]), tuple(rival_candidates), text, known="kind" in (known or {})
+        (*compared_candidates, *candidates[_MAX_COMPARED_CANDIDATES:]),
+        tuple(rival_candidates),
+        text,
+        known="kind" in (known or {}),
     )
 
 
-def _rival_limit(candidate: Candidate) -> float:
+def _exclusion_share(candidate: Candidate) -> float:
     """Unexplained share above which other candidates are ruled out by this one."""
-    return _RIVAL_RATIO * candidate.unexplained + _RIVAL_MARGIN
+    return _EXCLUSION_RATIO * candidate.unexplained + _EXCLUSION_MARGIN
 
 
 def _described_body(
@@ -186,12 +193,12 @@ def _described_body(
     geometry: dict[str, Any],
     electrodes: dict[str, Any],
     reference: Path,
-    known: dict[str, Any],
+    known_options: dict[str, Any],
 ) -> Findings:
     """Findings for a file that contains its protocol; the description states only the body and its electrodes."""
-    data, base = read(path, format), read(reference, format)
+    data, reference_measurement = read(path, format), read(reference, format)
     number = data.protocol.num_electrodes
-    if known.get("number", number) != number or "kind" in known or "order" in known:
+    if known_options.get("number", number) != number or "kind" in known_options or "order" in known_options:
         raise ValueError(
             f"number: {path.name} is of format '{format}', and states its protocol, of {number} electrodes: leave out "
             "what is said of it."
@@ -202,16 +209,20 @@ def _described_body(
         placements, electrode_entries = {**sizes, "positions": places.tolist()}, sizes
     tables = {"geometry": geometry, "electrodes": {"contact_impedance": 1.0, **placements}}
     description = parse_description(tables, "the description")
-    empty_frame = replace(base.mean_frame(), domain=description.domain, electrodes=description.electrodes)
+    empty_frame = replace(
+        reference_measurement.mean_frame(), domain=description.domain, electrodes=description.electrodes
+    )
     empty_frame = correct_signs(replace(empty_frame, voltages=np.real(np.asarray(empty_frame.voltages))))
-    deviation_of_frames = relative_deviation(np.real(np.asarray(base.filled())))
+    deviation_of_frames = relative_deviation(np.real(np.asarray(reference_measurement.filled())))
     models: _Models = {}
     protocol = {"kind": format, "number": number}
     candidate = Candidate(protocol, data.num_frames, deviation_of_frames, reciprocity_error(empty_frame), empty_frame)
     candidate = _compute_misfit(candidate, models)
     contact = {"contact_impedance": _contact_impedance(candidate, models[number][0])}
     shape = f"{counted(data.num_frames, 'frame')} of {data.num_channels}"
-    text = _text(path, shape, {}, candidate, (), {"geometry": geometry, "electrodes": {**contact, **electrode_entries}})
+    text = _description_text(
+        path, shape, {}, candidate, (), {"geometry": geometry, "electrodes": {**contact, **electrode_entries}}
+    )
     return Findings((candidate,), (), text, known=True)
 
 
@@ -223,7 +234,7 @@ def _compute_misfit(candidate: Candidate, models: _Models) -> Candidate:
     assert empty_frame.electrodes is not None
     if number not in models:
         is_solid = isinstance(empty_frame.domain, Solid)
-        mesh = body_mesh(empty_frame.domain, empty_frame.electrodes, _NODES[3 if is_solid else 2])
+        mesh = body_mesh(empty_frame.domain, empty_frame.electrodes, _NUM_NODES_BY_DIMENSION[3 if is_solid else 2])
         model = ForwardModel(mesh, empty_frame.electrodes, empty_frame.protocol)
         models[number] = model, uniform_impedances(model)
     model, impedances = models[number]
@@ -241,10 +252,10 @@ def _fit_gains(candidate: Candidate, models: _Models) -> Candidate:
     values = (
         np.asarray(candidate.measurement.voltages) / gains[np.asarray(candidate.measurement.protocol.measurement_index)]
     )
-    corrected = replace(
+    corrected_frame = replace(
         candidate, measurement=replace(candidate.measurement, voltages=values), reciprocity=error, gains=gains
     )
-    return _compute_misfit(corrected, models)
+    return _compute_misfit(corrected_frame, models)
 
 
 def _contact_impedance(best_candidate: Candidate, model: ForwardModel) -> float:
@@ -252,7 +263,7 @@ def _contact_impedance(best_candidate: Candidate, model: ForwardModel) -> float:
     empty body."""
     size = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
     winner_model = model.with_protocol(best_candidate.measurement.protocol)
-    contacts = np.full(best_candidate.protocol["number"], _RELATIVE_CONTACT * size)
+    contacts = np.full(best_candidate.protocol["number"], _RELATIVE_CONTACT_IMPEDANCE * size)
     winner_model = winner_model.with_electrodes(winner_model.electrodes.with_contact_impedance(contacts))
     is_used = np.asarray(best_candidate.measurement.mask)[0]
     expected_voltages, measured = (
@@ -260,36 +271,45 @@ def _contact_impedance(best_candidate: Candidate, model: ForwardModel) -> float:
         np.asarray(best_candidate.measurement.voltages)[0][is_used],
     )
     resistivity = abs(np.vdot(expected_voltages, measured)) / np.vdot(expected_voltages, expected_voltages).real
-    return float(f"{_RELATIVE_CONTACT * size * resistivity:.2g}")
+    return float(f"{_RELATIVE_CONTACT_IMPEDANCE * size * resistivity:.2g}")
 
 
-def _text(
+def _description_text(
     path: Path,
     shape: str,
     data: dict[str, Any],
-    best: Candidate,
+    best_candidate: Candidate,
     rival_candidates: Sequence[Candidate],
     tables: dict[str, dict[str, Any]],
 ) -> str:
     """The file's description in TOML, with the evidence as comments. `shape`: shape of the numbers in words; `data`:
     entries of the table `[data]`, which describe the arrangement of the numbers."""
-    notes = [note for note in best.measurement.notes if not note.startswith("[protocol]")]
-    reversed_signs = best.reversed_signs or any("polarity" in note for note in notes)
+    notes = [note for note in best_candidate.measurement.notes if not note.startswith("[protocol]")]
+    reversed_signs = best_candidate.reversed_signs or any("polarity" in note for note in notes)
     reciprocity_text = (
-        "no two channels are reciprocal" if best.reciprocity is None else f"broken by {percent(best.reciprocity)}"
+        "no two channels are reciprocal"
+        if best_candidate.reciprocity is None
+        else f"broken by {percent(best_candidate.reciprocity)}"
     )
-    explanation = best.wiring.explanation if best.wiring is not None and not best.reversed_signs else ""
+    explanation = (
+        best_candidate.wiring.explanation
+        if best_candidate.wiring is not None and not best_candidate.reversed_signs
+        else ""
+    )
     lines = [
         f"Written by `jeit describe {path.name}` ({shape} numbers). Lengths in metres, currents in amperes.",
-        f"{best.name}: a uniform body misses {percent(best.misfit)} of the empty one; reciprocity: {reciprocity_text}.",
+        f"{best_candidate.name}: a uniform body misses {percent(best_candidate.misfit)} of the empty one; "
+        f"reciprocity: {reciprocity_text}.",
         *(f"It may as well be {candidate.name}: {percent(candidate.misfit)}." for candidate in rival_candidates),
         *notes,
         *([explanation] if explanation else []),
     ]
     data = {**data, **({"polarity": "reversed"} if reversed_signs else {})}
-    if best.gains is not None:
-        lines.append(f"Gains of the measurements differ by {percent(float(np.std(best.gains)))}, found by reciprocity.")
-        data["gains"] = [round(float(gain), 4) for gain in best.gains]
+    if best_candidate.gains is not None:
+        lines.append(
+            f"Gains of the measurements differ by {percent(float(np.std(best_candidate.gains)))}, found by reciprocity."
+        )
+        data["gains"] = [round(float(gain), 4) for gain in best_candidate.gains]
     placement_text = "Electrodes are where the file places them."
     if "layout" in tables["electrodes"]:
         placement_text = (

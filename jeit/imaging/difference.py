@@ -21,7 +21,7 @@ from jeit.image import Inclusion, Raster, SolidForm
 from jeit.image.inclusions import inclusion_regions
 from jeit.image.rasters import CONDUCTIVE, RESISTIVE
 from jeit.imaging.automatic import change_and_noise, estimate_unexplained_noise, image_automatically
-from jeit.imaging.calibration import Clock
+from jeit.imaging.calibration import StepTimer
 from jeit.imaging.doubts import doubts_of_data
 from jeit.imaging.electrode_changes import ElectrodeChange
 from jeit.imaging.method import AUTO, METHODS, ImagingSettings, MethodOptions, as_settings
@@ -36,9 +36,9 @@ from jeit.mesh import Mesh
 from jeit_solvers import Status, one_thread_of_blas
 from jeit_solvers.engines import as_array
 
-_SEGMENTATION_LEVEL = 0.5
+_RELATIVE_SEGMENTATION_THRESHOLD = 0.5
 # Maximum misfit of an image's voltages, in standard deviations, that raises no doubt.
-_MISFIT = 3.0
+_MAX_UNDOUBTED_MISFIT = 3.0
 
 
 @dataclass(frozen=True)
@@ -163,21 +163,21 @@ class ImagedDifference:
         that did not converge, voltages not explained by the image, or bodies whose kind the data do not determine."""
         reconstruction = self.reconstruction
         data = self.measurement, self.reference, self.calibration, self.quality
-        warnings = doubts_of_data(*data, self.electrode_change)
+        doubt_texts = doubts_of_data(*data, self.electrode_change)
         if isinstance(reconstruction, LinearReconstruction):
             if self.lowest < -1:
-                warnings.append(
+                doubt_texts.append(
                     f"the linear image falls to {percent(self.lowest)} of the background, below -100 %: bodies may be "
                     "out of place, missing, or shown where none are; leave out --method, or take gauss-newton."
                 )
-            return tuple(warnings)
+            return tuple(doubt_texts)
         if isinstance(reconstruction, Reconstruction) and reconstruction.status != Status.CONVERGED:
-            warnings.append(
+            doubt_texts.append(
                 f"the iteration did not converge ({reconstruction.status}): neither peaks nor places are to be "
                 "trusted. Take the default hyperparameter, or a larger one."
             )
-        if (misfit := float(reconstruction.misfit)) > _MISFIT:
-            warnings.append(
+        if (misfit := float(reconstruction.misfit)) > _MAX_UNDOUBTED_MISFIT:
+            doubt_texts.append(
                 f"its voltages miss the data by {misfit:.2g} standard deviations: bodies may be missing, or shown "
                 "where none are."
             )
@@ -185,18 +185,18 @@ class ImagedDifference:
             if body is not None:
                 x, y = 1e3 * body.centroid[:2]
                 kind = "a column through the whole height" if body.column else "no column but an ellipsoid"
-                warnings.append(
+                doubt_texts.append(
                     f"the body at x {x:.0f} mm, y {y:.0f} mm may as well be {kind}, of "
                     f"{np.exp(body.sign * body.contrast):.2g} times the background and {1e6 * body.volume:.3g} cm³: "
                     "these electrodes do not determine which. If you know, bodies (--bodies) says so."
                 )
-        return tuple(warnings)
+        return tuple(doubt_texts)
 
     @property
     def level(self) -> float:
         """Level at which an inclusion ends, as a share of its peak: 0.5, the middle of its blurred edge, in segmented
         images, otherwise the level of the settings."""
-        return _SEGMENTATION_LEVEL if self.settings.segment else self.settings.level
+        return _RELATIVE_SEGMENTATION_THRESHOLD if self.settings.segment else self.settings.level
 
     @property
     def is_complex(self) -> bool:
@@ -219,8 +219,8 @@ class ImagedDifference:
 
 def _model_of_reconstruction(reconstruction, calibration: Calibration) -> ForwardModel:
     """Forward model on the mesh of a reconstruction."""
-    finer_image = reconstruction.finer if isinstance(reconstruction, ShapeReconstruction) else None
-    return calibration.model if finer_image is None else finer_image.model
+    finer_mesh_image = reconstruction.finer if isinstance(reconstruction, ShapeReconstruction) else None
+    return calibration.model if finer_mesh_image is None else finer_mesh_image.model
 
 
 def image_difference(
@@ -253,7 +253,7 @@ def image_difference(
     ```
     """
     settings = as_settings(settings)
-    clock = Clock(progress)
+    clock = StepTimer(progress)
     prepared = prepare_difference(
         measurement,
         reference,

@@ -16,14 +16,14 @@ from jeit.mesh import Domain
 # Minimum width of electrodes relative to their distance that raises no doubt. Misfit of the reference above which frame
 # and reference may be exchanged, and ratio of the frame's misfit to the reference's misfit below which an exchange is
 # likely, both with the scale that fits the voltages best.
-_MIN_RELATIVE_WIDTH, _MIN_SUSPICIOUS_MISFIT, _MAX_EXCHANGED_MISFIT = 0.005, 0.1, 0.7
+_MIN_RELATIVE_WIDTH, _MIN_SUSPICIOUS_REFERENCE_MISFIT, _MAX_EXCHANGED_MISFIT = 0.005, 0.1, 0.7
 # Minimum share of usable voltages that raises no doubt.
-_MIN_USABLE_SHARE = 0.5
+_MIN_USABLE_VOLTAGE_SHARE = 0.5
 # Ranges of plausible conductivities: of sheets in S, from a megohm a square to metal; of solids in S/m, from tap water
 # and fat to brine, with a margin on both sides.
-_CONDUCTIVITIES = {2: (1e-6, 1e5), 3: (1e-3, 30.0)}
+_PLAUSIBLE_CONDUCTIVITY_RANGES = {2: (1e-6, 1e5), 3: (1e-3, 30.0)}
 # Voltage above the range of an EIT instrument's amplifiers.
-_MAX_VOLTS = 60.0
+_MAX_AMPLIFIER_VOLTAGE = 60.0
 # Units smaller than a volt, with their number per volt.
 _SMALLER_UNITS = (("mV", 1e3), ("uV", 1e6))
 
@@ -37,9 +37,9 @@ def doubts_of_data(
 ) -> list[str]:
     """Reasons to doubt the data: few usable voltages, an implausible level of the voltages, implausible lengths, a
     frame that may be the reference, an `electrode_change`, or, with the frame's `quality`, noise."""
-    is_used, warnings = np.asarray(measurement.mask)[0], []
-    if (usable_share := np.mean(is_used)) < _MIN_USABLE_SHARE:
-        warnings.append(
+    is_used, doubt_texts = np.asarray(measurement.mask)[0], []
+    if (usable_share := np.mean(is_used)) < _MIN_USABLE_VOLTAGE_SHARE:
+        doubt_texts.append(
             f"only {is_used.sum()} of {is_used.size} voltages are left ({percent(float(usable_share))}): they "
             "determine little of what is where."
         )
@@ -47,7 +47,7 @@ def doubts_of_data(
     order_warning = _doubt_of_order(measurement, reference, calibration)
     movement = "" if electrode_change is None else electrode_change.doubt
     noise = "" if quality is None else quality.doubt
-    return [*warnings, *filter(None, (level, lengths, order_warning, movement, noise))]
+    return [*doubt_texts, *filter(None, (level, lengths, order_warning, movement, noise))]
 
 
 def _doubt_of_lengths(measurement: Measurement) -> str:
@@ -70,17 +70,17 @@ def _doubt_of_order(measurement: Measurement, reference: Measurement, calibratio
     """Return a sentence if the frame fits an undisturbed body much better than the reference does; otherwise an empty
     string."""
     usable = np.asarray(measurement.mask)[0] & np.asarray(reference.mask)[0]
-    if not (float(calibration.misfit) > _MIN_SUSPICIOUS_MISFIT and usable.any()):
+    if not (float(calibration.misfit) > _MIN_SUSPICIOUS_REFERENCE_MISFIT and usable.any()):
         return ""
-    predicted = np.asarray(calibration.voltages)[usable]
+    predicted_voltages = np.asarray(calibration.voltages)[usable]
 
     def compute_misfit(measured: Measurement) -> float:
         voltages = np.asarray(measured.voltages)[0][usable]
-        scale = np.vdot(predicted, voltages) / np.vdot(predicted, predicted)
-        return float(np.linalg.norm(voltages - scale * predicted) / np.linalg.norm(voltages))
+        scale = np.vdot(predicted_voltages, voltages) / np.vdot(predicted_voltages, predicted_voltages)
+        return float(np.linalg.norm(voltages - scale * predicted_voltages) / np.linalg.norm(voltages))
 
     misfit = compute_misfit(reference)
-    if misfit <= _MIN_SUSPICIOUS_MISFIT:
+    if misfit <= _MIN_SUSPICIOUS_REFERENCE_MISFIT:
         return ""
     frame_misfit = compute_misfit(measurement)
     if frame_misfit > _MAX_EXCHANGED_MISFIT * misfit:
@@ -94,12 +94,12 @@ def _doubt_of_order(measurement: Measurement, reference: Measurement, calibratio
 def _doubt_of_units(measurement: Measurement, reference: Measurement, calibration: Calibration) -> str:
     """Return a sentence that suggests a unit if the level of the voltages is implausible. Returns an empty string
     otherwise, and if notes of the measurement or its reference say that the scale is not known."""
-    min_conductivity, max_conductivity = _CONDUCTIVITIES[calibration.model.mesh.dimension]
+    min_conductivity, max_conductivity = _PLAUSIBLE_CONDUCTIVITY_RANGES[calibration.model.mesh.dimension]
     background = abs(complex(calibration.conductivity))
     frames = [np.abs(np.asarray(frame.voltages)[np.asarray(frame.mask)]) for frame in (measurement, reference)]
     max_voltage = max(float(voltages.max(initial=0)) for voltages in frames)
     is_scale_unknown = any("trust relative changes" in note for note in (*measurement.notes, *reference.notes))
-    if is_scale_unknown or (min_conductivity < background < max_conductivity and max_voltage < _MAX_VOLTS):
+    if is_scale_unknown or (min_conductivity < background < max_conductivity and max_voltage < _MAX_AMPLIFIER_VOLTAGE):
         return ""
     is_solid = calibration.model.mesh.dimension == 3
     unit, comparison = ("S/m", "no water's, gel's or tissue's") if is_solid else ("S", "no sheet's or shallow tank's")
@@ -114,7 +114,8 @@ def _doubt_of_units(measurement: Measurement, reference: Measurement, calibratio
         likely_units = [
             f'"{name}" (a background of {background * factor:.3g} {unit})'
             for name, factor in _SMALLER_UNITS
-            if min_conductivity < background * factor < max_conductivity and max_voltage < _MAX_VOLTS * factor
+            if min_conductivity < background * factor < max_conductivity
+            and max_voltage < _MAX_AMPLIFIER_VOLTAGE * factor
         ]
         key = "[data] unit"
     else:

@@ -47,30 +47,36 @@ from jeit_solvers.engines import as_array, on_host
 # were 41 to 1,000 (with 8 electrodes 4 to 30), 0 to 0.7, and 3 to 17. With electrodes at rest, the rise exceeded 30
 # only for bodies smaller than an electrode beside it, with a number of at most 2.7, and was 6 for patches along the
 # wall of a tank with 8 electrodes; in measured tanks it was 8 at most.
-_MIN_RISE, _MIN_RISE_PER_CHANNEL, _MAX_REST, _MIN_NUMBER = 30.0, 0.4, 0.95, 3.0
+(
+    _MIN_LOG_EVIDENCE_INCREASE,
+    _MIN_LOG_EVIDENCE_INCREASE_PER_CHANNEL,
+    _MAX_UNEXPLAINED_DIFFERENCE_SHARE,
+    _MIN_NUM_EFFECTIVE_CHANNELS,
+) = 30.0, 0.4, 0.95, 3.0
 # Maximum share of the difference that is left by a change of a single electrode, and maximum size of this change in
 # standard deviations. In simulated disks, displacements by 0.3 to 4° left 0.03 to 0.2 in the linear approximation, and
 # bodies 0.19 or more, also those smaller than the electrode beside them.
-_MAX_SINGLE_REST, _MAX_SINGLE_CHANGE = 0.15, 3.0
+_MAX_UNEXPLAINED_SHARE_OF_SINGLE_CHANGE, _MAX_SINGLE_CHANGE_SIZE = 0.15, 3.0
 # Error of the voltages that a change of a single electrode explains, as a share of them.
 _SINGLE_CHANGE_ERROR = 0.1
 # A change is looked for if the electrodes alone, at plausible displacements, explain this share of the difference where
-# errors are `_ASSUMED_ERROR` of it. The share was 0.1 to 0.7 at rest, and 0.87 to 1 after movements by 0.3° or more.
-_MIN_SUSPICIOUS_SHARE, _ASSUMED_ERROR = 0.6, 0.3
+# errors are `_ASSUMED_RELATIVE_ERROR` of it. The share was 0.1 to 0.7 at rest, and 0.87 to 1 after movements by 0.3° or
+# more.
+_MIN_SUSPICIOUS_SHARE, _ASSUMED_RELATIVE_ERROR = 0.6, 0.3
 # Standard deviation of the logarithms of contact impedances, and largest common factor, in units of the difference.
-_CONTACT_DEVIATION, _MAX_FACTOR = 1.0, 100.0
+_CONTACT_DEVIATION, _MAX_COMMON_CONTACT_FACTOR = 1.0, 100.0
 # Initial logarithms of the standard deviations, of conductivity, of errors that break reciprocity and of those that do
 # not, relative to the difference, and of changes of electrodes; width of the prior about the first three.
-_INITIAL_LOGARITHMS, _LOGARITHMS_WIDTH = np.array([-0.3, -3.0, -3.0, -2.0]), 3.0
+_INITIAL_LOG_DEVIATIONS, _LOG_DEVIATIONS_PRIOR_WIDTH = np.array([-0.3, -3.0, -3.0, -2.0]), 3.0
 # Eigenvalues below this share of the largest one belong to errors alone.
 _RANK_TOLERANCE = 1e-10
 # Maximum number of steps by which the change of the voltages is computed without the linear approximation, and shares
 # of a step that are tried until less of the difference remains: contact impedances may have changed by factors.
-_NUM_CORRECTIONS, _STEP_SHARES = 8, (1.0, 0.5, 0.25, 0.125)
+_NUM_CORRECTIONS, _STEP_FRACTIONS = 8, (1.0, 0.5, 0.25, 0.125)
 # Factor by which contact impedances have usually changed, above which a doubt states it.
 _MIN_STATED_FACTOR = 1.1
 # Number of frames of a series among which one with changed electrodes is searched.
-_NUM_CANDIDATES = 5
+_NUM_CANDIDATE_FRAMES = 5
 
 
 class ElectrodeChange(NamedTuple):
@@ -91,14 +97,14 @@ class ElectrodeChange(NamedTuple):
     def relative_error(self) -> float:
         """Error of the `voltages`, as a share of them, that bodies in the image are held against: that of a single
         electrode. If many are displaced, their displacements adapt to errors."""
-        is_single = np.count_nonzero(self.shift) + np.count_nonzero(self.contact_factor != 1) == 1
-        return _SINGLE_CHANGE_ERROR if is_single else 0.0
+        is_single_change = np.count_nonzero(self.shift) + np.count_nonzero(self.contact_factor != 1) == 1
+        return _SINGLE_CHANGE_ERROR if is_single_change else 0.0
 
     @property
     def description(self) -> str:
         """What seems to have changed, without a full stop: "electrodes had moved since the reference, by about …"."""
         distances = 1e3 * np.linalg.norm(self.shift, axis=1)
-        largest = int(np.argmax(distances))
+        electrode = int(np.argmax(distances))
         logarithm = np.log(self.contact_factor)
         contact, usual_factor = int(np.argmax(np.abs(logarithm))), float(np.exp(np.sqrt(np.mean(logarithm**2))))
         if np.count_nonzero(distances) + np.count_nonzero(logarithm) > 1:
@@ -110,11 +116,11 @@ class ElectrodeChange(NamedTuple):
             )
             return (
                 f"electrodes had moved since the reference, by about {np.sqrt(np.mean(distances**2)):.2g} mm (root "
-                f"mean square; electrode {largest + 1} by about {distances[largest]:.2g} mm){contacts}, or as if a "
+                f"mean square; electrode {electrode + 1} by about {distances[electrode]:.2g} mm){contacts}, or as if a "
                 "layer along the wall had changed"
             )
         if distances.any():
-            return f"electrode {largest + 1} had moved by about {distances[largest]:.2g} mm since the reference"
+            return f"electrode {electrode + 1} had moved by about {distances[electrode]:.2g} mm since the reference"
         return (
             f"the contact impedance of electrode {contact + 1} had changed by a factor of about "
             f"{self.contact_factor[contact]:.2g} since the reference"
@@ -174,31 +180,39 @@ class ElectrodeChanges:
         estimator = self.estimator(difference) if estimator is None else estimator
         if estimator is None:
             return None
-        linear = estimator @ difference
-        linear_change = self._patterns @ linear
-        linear_rest = float(self._size(difference - linear_change) / self._size(difference))
+        linear_coefficients = estimator @ difference
+        linear_change = self._patterns @ linear_coefficients
+        linear_remaining_share = float(
+            self._noise_weighted_norm(difference - linear_change) / self._noise_weighted_norm(difference)
+        )
         coefficients, change = np.zeros(len(estimator)), np.zeros(len(difference))
-        rest, max_rest = 1.0, _max_rest(estimator)
+        remaining_share, max_remaining_share = 1.0, _max_remaining_share(estimator)
         for _ in range(_NUM_CORRECTIONS):
             step = estimator @ (difference - change + self._patterns @ coefficients) - coefficients
-            for share in _STEP_SHARES:
+            for share in _STEP_FRACTIONS:
                 try:
-                    trial = self._change_of_voltages(coefficients + share * step)
+                    trial_change = self._change_of_voltages(coefficients + share * step)
                 except ValueError:  # electrodes would overlap or leave the body
                     continue
-                trial_rest = float(self._size(difference - trial) / self._size(difference))
-                if trial_rest < rest:
-                    coefficients, change, rest = coefficients + share * step, trial, trial_rest
+                trial_remaining_share = float(
+                    self._noise_weighted_norm(difference - trial_change) / self._noise_weighted_norm(difference)
+                )
+                if trial_remaining_share < remaining_share:
+                    coefficients, change, remaining_share = (
+                        coefficients + share * step,
+                        trial_change,
+                        trial_remaining_share,
+                    )
                     break
             else:
                 break
         # On a coarse mesh, voltages jump where an electrode passes a node, and the linear approximation is better.
-        if linear_rest < rest:
-            coefficients, change, rest = linear, linear_change, linear_rest
-        if rest >= max_rest:
+        if linear_remaining_share < remaining_share:
+            coefficients, change, remaining_share = linear_coefficients, linear_change, linear_remaining_share
+        if remaining_share >= max_remaining_share:
             return None
-        contact_factor = np.exp(self._log_contact(coefficients))
-        return ElectrodeChange(self._shift(coefficients), contact_factor, change, rest)
+        contact_factor = np.exp(self._log_contact_factors(coefficients))
+        return ElectrodeChange(self._electrode_shifts(coefficients), contact_factor, change, remaining_share)
 
     def voltages(
         self, differences: Float[np.ndarray, "N M"], estimator: Float[np.ndarray, "p M"]
@@ -207,28 +221,38 @@ class ElectrodeChanges:
         `estimator`; zero for differences (N, M) of which they explain little. All are in volts."""
         coefficients = differences @ estimator.T
         changes = coefficients @ self._patterns.T
-        is_large = self._size(differences - changes) < _max_rest(estimator) * self._size(differences)
+        explains_difference = self._noise_weighted_norm(differences - changes) < _max_remaining_share(
+            estimator
+        ) * self._noise_weighted_norm(differences)
         # If n electrodes are displaced equally, the square of the sum of squares is n times the sum of fourth powers.
         squares = (coefficients**2)[:, : self._num_shifts]
         num_electrodes = self.model.electrodes.num_electrodes
-        square = squares.reshape(len(squares), num_electrodes, -1).sum(axis=2)
-        effective_number = square.sum(axis=1) ** 2 / np.maximum((square**2).sum(axis=1), np.finfo(float).tiny)
-        is_spread = _is_single(estimator) | (effective_number > min(_MIN_NUMBER, num_electrodes / 4))
-        is_change = self.are_suspicious(differences) & is_large & is_spread
-        return np.where(is_change[:, None], changes, 0.0)
+        sums_of_squares = squares.reshape(len(squares), num_electrodes, -1).sum(axis=2)
+        num_effective_electrodes = sums_of_squares.sum(axis=1) ** 2 / np.maximum(
+            (sums_of_squares**2).sum(axis=1), np.finfo(float).tiny
+        )
+        affects_several_electrodes = _is_single(estimator) | (
+            num_effective_electrodes > min(_MIN_NUM_EFFECTIVE_CHANNELS, num_electrodes / 4)
+        )
+        is_electrode_change = self.are_suspicious(differences) & explains_difference & affects_several_electrodes
+        return np.where(is_electrode_change[:, None], changes, 0.0)
 
     def estimator_for(self, differences: Float[np.ndarray, "N M"]) -> Float[np.ndarray, "p M"] | None:
         """`estimator` for the largest of several differences (N, M) that shows changes of the electrodes, of many
-        rather than of a single one; None if none of the `_NUM_CANDIDATES` largest suspicious ones does."""
-        suspicious = np.flatnonzero(self.are_suspicious(differences))
-        largest = suspicious[np.argsort(-self._size(differences[suspicious]), kind="stable")[:_NUM_CANDIDATES]]
-        single = None
-        for one in largest:
-            if (estimator := self.estimator(differences[one])) is not None:
+        rather than of a single one; None if none of the `_NUM_CANDIDATE_FRAMES` largest suspicious ones does."""
+        suspicious_indices = np.flatnonzero(self.are_suspicious(differences))
+        largest_indices = suspicious_indices[
+            np.argsort(-self._noise_weighted_norm(differences[suspicious_indices]), kind="stable")[
+                :_NUM_CANDIDATE_FRAMES
+            ]
+        ]
+        single_change_estimator = None
+        for index in largest_indices:
+            if (estimator := self.estimator(differences[index])) is not None:
                 if not _is_single(estimator):
                     return estimator
-                single = estimator if single is None else single
-        return single
+                single_change_estimator = estimator if single_change_estimator is None else single_change_estimator
+        return single_change_estimator
 
     def estimator(self, difference: Float[np.ndarray, " M"]) -> Float[np.ndarray, "p M"] | None:
         """Matrix (p, M) that estimates changes of the electrodes, in units of their standard deviations, from a
@@ -252,8 +276,10 @@ class ElectrodeChanges:
         explained = products**2 / np.maximum(squares, np.finfo(float).tiny)
         best = int(np.argmax(explained))
         # The linear approximation leaves up to twice as much as the displaced electrode itself.
-        is_enough = weighted @ weighted - explained[best] < (2 * _MAX_SINGLE_REST) ** 2 * (weighted @ weighted)
-        if not is_enough or abs(products[best]) > _MAX_SINGLE_CHANGE * squares[best]:
+        explains_enough = weighted @ weighted - explained[best] < (2 * _MAX_UNEXPLAINED_SHARE_OF_SINGLE_CHANGE) ** 2 * (
+            weighted @ weighted
+        )
+        if not explains_enough or abs(products[best]) > _MAX_SINGLE_CHANGE_SIZE * squares[best]:
             return None
         estimator = np.zeros_like(rows)
         estimator[best] = rows[best] * self._weights / squares[best]
@@ -262,15 +288,15 @@ class ElectrodeChanges:
     def are_suspicious(self, differences: Float[np.ndarray, "N M"]) -> Bool[np.ndarray, " N"]:
         """Whether plausible changes of the electrodes alone, beside a common factor, explain enough of differences
         (N, M) to be looked for."""
-        (squares, modes), weighted = self._modes, self._without_common_factor(differences)
+        (squares, modes), weighted = self._orthogonal_combinations, self._without_common_factor(differences)
         size = np.linalg.norm(weighted, axis=1)
-        error = _ASSUMED_ERROR * size / np.sqrt(np.count_nonzero(self.mask))
-        damped = (weighted @ modes.T) / (squares + np.where(size > 0, error, 1)[:, None] ** 2)
-        explained = np.linalg.norm(damped @ modes, axis=1)
+        error = _ASSUMED_RELATIVE_ERROR * size / np.sqrt(np.count_nonzero(self.mask))
+        damped_coefficients = (weighted @ modes.T) / (squares + np.where(size > 0, error, 1)[:, None] ** 2)
+        explained = np.linalg.norm(damped_coefficients @ modes, axis=1)
         return explained > _MIN_SUSPICIOUS_SHARE * size
 
     @functools.cached_property
-    def _modes(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p M"]]:
+    def _orthogonal_combinations(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p M"]]:
         """Orthogonal combinations (p, M) of the changes of the voltages due to plausible changes of the electrodes,
         and the squares (p,) of their norms."""
         rows = self._without_common_factor(self._patterns.T)
@@ -281,17 +307,17 @@ class ElectrodeChanges:
         """Change of the voltages (M,) due to changes of the electrodes. Raises `ValueError` if they would overlap or
         leave the body."""
         described: Any = self.model.electrodes
-        shift = self._shift(coefficients)
+        shift = self._electrode_shifts(coefficients)
         electrodes = shift_electrodes(described, np.asarray(described.directions(self.model.mesh)), shift)
-        impedance = np.asarray(described.contact_impedance) * np.exp(self._log_contact(coefficients))
+        impedance = np.asarray(described.contact_impedance) * np.exp(self._log_contact_factors(coefficients))
         electrodes = electrodes.with_contact_impedance(impedance)
         moved = self.model.with_electrodes(electrodes)
         return np.where(self.mask, np.asarray(moved.voltages(self.background)) - self._reference, 0.0)
 
-    def _shift(self, coefficients: Float[np.ndarray, " p"]) -> Float[np.ndarray, "L a"]:
+    def _electrode_shifts(self, coefficients: Float[np.ndarray, " p"]) -> Float[np.ndarray, "L a"]:
         return (self._spread * coefficients)[: self._num_shifts].reshape(self.model.electrodes.num_electrodes, -1)
 
-    def _log_contact(self, coefficients: Float[np.ndarray, " p"]) -> Float[np.ndarray, " L"]:
+    def _log_contact_factors(self, coefficients: Float[np.ndarray, " p"]) -> Float[np.ndarray, " L"]:
         """Changes of the logarithms of the contact impedances."""
         changes = (self._spread * coefficients)[self._num_shifts :]
         return changes if changes.size else np.zeros(self.model.electrodes.num_electrodes)
@@ -301,7 +327,7 @@ class ElectrodeChanges:
         weighted, level = voltages * self._weights, self._reference * self._weights
         return weighted - np.outer(weighted @ level, level) / (level @ level)
 
-    def _size(self, voltages: Float[np.ndarray, "*N M"]) -> Float[np.ndarray, "*N"]:
+    def _noise_weighted_norm(self, voltages: Float[np.ndarray, "*N M"]) -> Float[np.ndarray, "*N"]:
         """Norm of voltages that are divided by the noise of their channels, without the part that is a factor common
         to all."""
         return np.linalg.norm(self._without_common_factor(np.atleast_2d(voltages)), axis=-1).reshape(
@@ -317,30 +343,40 @@ class _WhitenedProblem:
         spectrum: Any = linearisation.spectrum
         self._channels, self._num_channels = linearisation.channels, len(difference)
         self._root_weight = np.asarray(linearisation.root_weight)
-        data, *columns = (self._root_weight * one[self._channels] for one in (difference, reference, *patterns.T))
+        data, *columns = (
+            self._root_weight * voltages[self._channels] for voltages in (difference, reference, *patterns.T)
+        )
         eigenvalues = np.asarray(spectrum.eigenvalues)
-        is_reciprocal = eigenvalues > _RANK_TOLERANCE * eigenvalues.max()
-        self._basis = np.asarray(spectrum.basis)[:, is_reciprocal]
-        self._size = float(np.sqrt(np.mean(data**2)))
+        is_nonzero_eigenvalue = eigenvalues > _RANK_TOLERANCE * eigenvalues.max()
+        self._basis = np.asarray(spectrum.basis)[:, is_nonzero_eigenvalue]
+        self._noise_weighted_norm = float(np.sqrt(np.mean(data**2)))
         self._data = self._basis.T @ data
         self._num_others = len(data) - len(self._data)
         self._others = max(float(data @ data - self._data @ self._data), 0.0)
-        self._eigenvalues = eigenvalues[is_reciprocal] * (len(data) / eigenvalues.sum())
+        self._eigenvalues = eigenvalues[is_nonzero_eigenvalue] * (len(data) / eigenvalues.sum())
         level, *patterns = (self._basis.T @ column for column in columns)
-        self._level = level * (_MAX_FACTOR * self._size * np.sqrt(len(data)) / np.linalg.norm(level))
+        self._level = level * (
+            _MAX_COMMON_CONTACT_FACTOR * self._noise_weighted_norm * np.sqrt(len(data)) / np.linalg.norm(level)
+        )
         self._patterns = np.stack(patterns, axis=1)
 
     def estimator(self) -> Float[np.ndarray, "p M"] | None:
         """See `ElectrodeChanges.estimator`; None if the evidence is not for changes of the electrodes."""
         options = {"maxiter": 400, "xatol": 0.02, "fatol": 0.05}
-        at_rest, changed = (
-            scipy.optimize.minimize(self._cost, _INITIAL_LOGARITHMS[:number], method="Nelder-Mead", options=options)
+        optimum_without_change, optimum = (
+            scipy.optimize.minimize(
+                self._negative_log_posterior, _INITIAL_LOG_DEVIATIONS[:number], method="Nelder-Mead", options=options
+            )
             for number in (3, 4)
         )
-        if at_rest.fun - changed.fun < min(_MIN_RISE, _MIN_RISE_PER_CHANNEL * len(self._data)):
+        if optimum_without_change.fun - optimum.fun < min(
+            _MIN_LOG_EVIDENCE_INCREASE, _MIN_LOG_EVIDENCE_INCREASE_PER_CHANNEL * len(self._data)
+        ):
             return None
-        variance, columns, inner = self._covariance(changed.x)
-        rows = np.exp(changed.x[3]) * np.linalg.solve(inner, (columns / variance[:, None]).T)[:-1] @ self._basis.T
+        variance, columns, inner_matrix = self._covariance(optimum.x)
+        rows = (
+            np.exp(optimum.x[3]) * np.linalg.solve(inner_matrix, (columns / variance[:, None]).T)[:-1] @ self._basis.T
+        )
         estimator = np.zeros((len(rows), self._num_channels))
         estimator[:, self._channels] = rows * self._root_weight
         return estimator
@@ -348,24 +384,25 @@ class _WhitenedProblem:
     def _covariance(self, logarithms):
         """Variances (r,), columns (r, q) and the inner matrix (q, q) of the covariance D + C Cᵀ of the data, whose
         inverse is D⁻¹ - D⁻¹ C (I + Cᵀ D⁻¹ C)⁻¹ Cᵀ D⁻¹."""
-        conductivity, noise, error = np.exp(2 * logarithms[:3]) * self._size**2
+        conductivity, noise, error = np.exp(2 * logarithms[:3]) * self._noise_weighted_norm**2
         variance = conductivity * self._eigenvalues + noise + error
         columns = self._level[:, None]
         if len(logarithms) > 3:
             columns = np.column_stack([np.exp(logarithms[3]) * self._patterns, self._level])
         return variance, columns, np.eye(columns.shape[1]) + (columns.T / variance) @ columns
 
-    def _cost(self, logarithms) -> float:
+    def _negative_log_posterior(self, logarithms) -> float:
         """Negative logarithm of the evidence and of the prior of the `logarithms` of the standard deviations."""
-        variance, columns, inner = self._covariance(logarithms)
+        variance, columns, inner_matrix = self._covariance(logarithms)
         projected = (columns.T / variance) @ self._data
-        square = self._data**2 @ (1 / variance) - projected @ np.linalg.solve(inner, projected)
-        noise = np.exp(2 * logarithms[1]) * self._size**2
-        square += self._others / noise
-        determinant = np.log(variance).sum() + np.linalg.slogdet(inner)[1] + self._num_others * np.log(noise)
-        departure = (logarithms[:3] - _INITIAL_LOGARITHMS[:3]) / _LOGARITHMS_WIDTH
-        excess = 2 * max(logarithms[3], 0) if len(logarithms) > 3 else 0.0  # beyond the stated standard deviation
-        return 0.5 * (square + determinant + departure @ departure + excess**2)
+        weighted_sum_of_squares = self._data**2 @ (1 / variance) - projected @ np.linalg.solve(inner_matrix, projected)
+        noise = np.exp(2 * logarithms[1]) * self._noise_weighted_norm**2
+        weighted_sum_of_squares += self._others / noise
+        determinant = np.log(variance).sum() + np.linalg.slogdet(inner_matrix)[1] + self._num_others * np.log(noise)
+        departure = (logarithms[:3] - _INITIAL_LOG_DEVIATIONS[:3]) / _LOG_DEVIATIONS_PRIOR_WIDTH
+        # Excess over the stated standard deviation.
+        excess_log_deviation = 2 * max(logarithms[3], 0) if len(logarithms) > 3 else 0.0
+        return 0.5 * (weighted_sum_of_squares + determinant + departure @ departure + excess_log_deviation**2)
 
 
 @keep_last_result
@@ -387,9 +424,9 @@ def _is_single(estimator: Float[np.ndarray, "p M"]) -> bool:
     return np.count_nonzero(estimator.any(axis=1)) == 1
 
 
-def _max_rest(estimator: Float[np.ndarray, "p M"]) -> float:
+def _max_remaining_share(estimator: Float[np.ndarray, "p M"]) -> float:
     """Maximum share of a difference that may be left, or the difference is not due to changes of electrodes."""
-    return _MAX_SINGLE_REST if _is_single(estimator) else _MAX_REST
+    return _MAX_UNEXPLAINED_SHARE_OF_SINGLE_CHANGE if _is_single(estimator) else _MAX_UNEXPLAINED_DIFFERENCE_SHARE
 
 
 def _num_contacts(model: ForwardModel) -> int:

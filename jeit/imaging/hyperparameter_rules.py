@@ -18,7 +18,7 @@ from jeit.data import Measurement
 from jeit.image import Inclusion
 from jeit.image.inclusions import inclusion_regions
 from jeit.imaging.automatic import change_and_noise, estimate_unexplained_noise
-from jeit.imaging.calibration import Clock
+from jeit.imaging.calibration import StepTimer
 from jeit.imaging.method import ImagingSettings, as_settings, choose_rule, prior_for
 from jeit.imaging.preparation import PreparedDifference, check_real, prepare_difference
 from jeit.inverse import RULES
@@ -116,7 +116,7 @@ def compare_on_data(
         check_name("rules", name, RULES)
     if not names:
         raise ValueError(f"rules: none is named; give some of {', '.join(RULES)}.")
-    clock = Clock(progress)
+    clock = StepTimer(progress)
     prepared = prepare_difference(
         measurement,
         reference,

@@ -15,7 +15,7 @@ from jeit.arguments import check_kind, check_name, describe, is_number
 from jeit.image import find_inclusions
 from jeit.imaging.preparation import PreparedDifference
 from jeit.inverse import RULES, TotalVariation, back_projection, one_step, reconstruct
-from jeit.inverse.hyperparameter.choice import DEFAULT_RULE, EDGE_PRICE, GAUSS_NEWTON_HYPERPARAMETER
+from jeit.inverse.hyperparameter.choice import DEFAULT_RULE, EDGE_HYPERPARAMETER_PENALTY, GAUSS_NEWTON_HYPERPARAMETER
 from jeit.inverse.hyperparameter.rules import Rule, discrepancy
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.nonlinear import GaussNewton, LevenbergMarquardt
@@ -23,7 +23,7 @@ from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.nonlinear.solvers import AbstractSolver
 from jeit.inverse.prior.matern import MEASURED_DATA_PRIOR, PRIORS
 from jeit.inverse.prior.priors import AbstractPrior
-from jeit.inverse.shapes import KINDS, LEAST_RISE, EllipsoidPrior, ShapeReconstruction, reconstruct_shapes
+from jeit.inverse.shapes import KINDS, MIN_OBJECTIVE_RATIO, EllipsoidPrior, ShapeReconstruction, reconstruct_shapes
 from jeit.mesh import Body
 from jeit_solvers import Status
 from jeit_solvers.engines import as_array, host
@@ -158,7 +158,7 @@ class MethodOptions(NamedTuple):
 
 # Fits of shapes start from the inclusions of a smooth image, some of which are artefacts: minimum peak and minimum area
 # of these inclusions, see `jeit.image.find_inclusions`, and their maximum number.
-_MIN_PEAK, _MIN_AREA, _MAX_STARTS = 0.15, 0.002, 8
+_MIN_START_PEAK, _MIN_START_AREA, _MAX_SHAPE_STARTS = 0.15, 0.002, 8
 
 
 @dataclass(frozen=True)
@@ -238,11 +238,11 @@ def _iterative_image(
     options: MethodOptions,
     *,
     solver: AbstractSolver,
-    own_prior: AbstractPrior | None = None,
+    given_prior: AbstractPrior | None = None,
 ) -> Imaged:
     """Estimate conductivity iteratively from the model's reference voltages plus the measured difference.
 
-    Model errors that are the same in the frame and its reference cancel. `own_prior`: a prior of the method that
+    Model errors that are the same in the frame and its reference cancel. `given_prior`: a prior of the method that
     replaces the requested prior. Raises `ValueError` if the solver fails, and for complex voltages.
     """
     model, background = prepared.model, prepared.calibration.conductivity
@@ -255,9 +255,9 @@ def _iterative_image(
         model,
         host.add(model.voltages(background), prepared.difference),
         background,
-        prior=prior_for(options.prior, prepared.domain) if own_prior is None else own_prior,
+        prior=prior_for(options.prior, prepared.domain) if given_prior is None else given_prior,
         hyperparameter=_number_or_rule(prepared, options.hyperparameter),
-        noise=prepared.modelled_noise if own_prior is None else prepared.relative_noise,
+        noise=prepared.modelled_noise if given_prior is None else prepared.relative_noise,
         mask=prepared.mask,
         solver=solver,
     )
@@ -280,32 +280,34 @@ def shapes_in(
     model, background = prepared.model, prepared.calibration.conductivity
     is_solid = prepared.mesh.dimension == 3
     log_change = as_array(np.log(np.asarray(smooth_image.conductivity) / float(background)))
-    inclusions = find_inclusions(prepared.mesh, log_change, level=0.5, least_peak=_MIN_PEAK, least_area=_MIN_AREA)
+    inclusions = find_inclusions(
+        prepared.mesh, log_change, level=0.5, least_peak=_MIN_START_PEAK, least_area=_MIN_START_AREA
+    )
     return reconstruct_shapes(
         model,
         host.add(model.voltages(background), prepared.difference),
         background,
-        start=[(inclusion.sign, inclusion.centroid, inclusion.radius) for inclusion in inclusions[:_MAX_STARTS]],
+        start=[(inclusion.sign, inclusion.centroid, inclusion.radius) for inclusion in inclusions[:_MAX_SHAPE_STARTS]],
         noise=prepared.sharp_noise,
         mask=prepared.mask,
         prior=EllipsoidPrior(kinds=options.kinds) if is_solid else None,
         # In a solid, model errors are represented by a smooth field instead.
-        least_rise=1 if is_solid else 1 + (LEAST_RISE - 1) * prepared.modelled_share,
+        least_rise=1 if is_solid else 1 + (MIN_OBJECTIVE_RATIO - 1) * prepared.modelled_share,
         smooth=smooth_image if is_solid else None,
         accuracy=prepared.accuracy,
         progress=options.progress,
     )
 
 
-def _shapes(prepared: PreparedDifference, options: MethodOptions) -> Imaged:
+def _image_shapes(prepared: PreparedDifference, options: MethodOptions) -> Imaged:
     smooth_image, _ = _iterative_image(
         prepared, MethodOptions(MEASURED_DATA_PRIOR, GAUSS_NEWTON_HYPERPARAMETER), solver=_GAUSS_NEWTON
     )
     assert isinstance(smooth_image, Reconstruction)
-    return image_of_shapes(prepared, shapes_in(prepared, smooth_image, options))
+    return conductivity_change_of_shapes(prepared, shapes_in(prepared, smooth_image, options))
 
 
-def image_of_shapes(prepared: PreparedDifference, shapes: ShapeReconstruction) -> Imaged:
+def conductivity_change_of_shapes(prepared: PreparedDifference, shapes: ShapeReconstruction) -> Imaged:
     """Return the shapes and their change of conductivity per cell; for a solid, per cell of the refined mesh."""
     image = shapes if shapes.finer is None else shapes.finer
     return shapes, image.conductivity - prepared.calibration.conductivity
@@ -325,11 +327,11 @@ METHODS: dict[str, Method] = {
         hyperparameter=GAUSS_NEWTON_HYPERPARAMETER,
     ),
     "total-variation": Method(
-        partial(_iterative_image, solver=_GAUSS_NEWTON, own_prior=TotalVariation()),
+        partial(_iterative_image, solver=_GAUSS_NEWTON, given_prior=TotalVariation()),
         prior="total variation",
-        hyperparameter=EDGE_PRICE,
-        number=EDGE_PRICE,
+        hyperparameter=EDGE_HYPERPARAMETER_PENALTY,
+        number=EDGE_HYPERPARAMETER_PENALTY,
     ),
-    "shapes": Method(_shapes, prior="star shapes", takes_hyperparameter=False),
+    "shapes": Method(_image_shapes, prior="star shapes", takes_hyperparameter=False),
 }
 """Imaging methods by name, as used in Python and on the command line."""

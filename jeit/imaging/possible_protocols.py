@@ -16,7 +16,7 @@ from jeit.data import Measurement
 from jeit.data.description import Description, TableLayout, parse_description
 from jeit.data.formats.boards import OpenEit
 from jeit.data.formats.table import create_measurement_of_frames
-from jeit.data.formats.text import Frames, frames_in_table, frames_in_text, read_text
+from jeit.data.formats.text import TableFrames, frames_in_table, frames_in_text, read_text
 from jeit.data.quality import reciprocity_error
 from jeit.files import matlab, npy_array, npz_arrays, npz_shapes
 from jeit.imaging.wiring import Wiring
@@ -25,11 +25,11 @@ from jeit.protocol import Protocol
 # Minimum and maximum number of electrodes of the protocols that are tried.
 MIN_ELECTRODES, MAX_ELECTRODES = 4, 64
 # Minimum number of channels for each electrode.
-_MIN_CHANNELS = 2
+_MIN_CHANNELS_PER_ELECTRODE = 2
 # Maximum number of frames of a file with which protocols are compared; of more frames, some at regular intervals.
 _MAX_FRAMES = 32
 # The order of the channels matters if voltages in a different order would leave so many times as much unexplained.
-_MIN_ORDER_RATIO = 2.0
+_MIN_MISFIT_RATIO_OF_OTHER_ORDER = 2.0
 # Layout of a table of numbers about which nothing is known.
 _UNKNOWN_LAYOUT = TableLayout()
 
@@ -80,16 +80,16 @@ class Candidate:
         return float(np.hypot(self.misfit, self.least_unexplained))
 
     @property
-    def ordered(self) -> bool:
+    def depends_on_channel_order(self) -> bool:
         """Whether a uniform body would explain the voltages far worse if the channels were in a different order. On
         average, a share √(1 - r²) would then be unexplained, where r is the squared mean of the voltages divided by
         their mean square."""
         values = np.asarray(self.measurement.voltages)[np.asarray(self.measurement.mask)]
         mean_ratio = abs(values.mean()) ** 2 / np.mean(np.abs(values) ** 2)
-        return bool(_MIN_ORDER_RATIO * self.unexplained < np.sqrt(1 - mean_ratio**2))
+        return bool(_MIN_MISFIT_RATIO_OF_OTHER_ORDER * self.unexplained < np.sqrt(1 - mean_ratio**2))
 
     @property
-    def num_unread(self) -> int:
+    def num_unread_channels(self) -> int:
         """Number of channels that are zero in every frame or masked, apart from channels on driven electrodes."""
         is_on_driven_electrodes = np.asarray(self.measurement.protocol.channels_on_driven_electrodes())
         voltages, mask = np.asarray(self.measurement.voltages), np.asarray(self.measurement.mask)
@@ -101,7 +101,7 @@ class Candidate:
         not measure there, and fills in zeros."""
         is_on_driven_electrodes = np.asarray(self.measurement.protocol.channels_on_driven_electrodes())
         is_measured = np.asarray(self.measurement.mask)[..., is_on_driven_electrodes]
-        return bool(is_on_driven_electrodes.any()) and not is_measured.any() and self.num_unread == 0
+        return bool(is_on_driven_electrodes.any()) and not is_measured.any() and self.num_unread_channels == 0
 
     @property
     def name(self) -> str:
@@ -118,7 +118,7 @@ class FileNumbers:
     of a description's table `[data]` for this arrangement."""
 
     path: Path
-    frames: Callable[[Sequence[int]], Frames]
+    frames: Callable[[Sequence[int]], TableFrames]
     shape: str
     sizes: tuple[int, ...]
     data: dict[str, Any] = field(default_factory=dict)
@@ -144,18 +144,19 @@ class FileNumbers:
         length, lines = int(text.lengths[0]), len(text.lengths)
         total, shape = len(text.values), f"{counted(lines, 'line')} of {length}"
         # A frame that is wrapped over several lines ends with a line.
-        wrapped = {total // k for k in range(1, 1 + total // max(length, 1)) if length < total // k}
-        wrapped.intersection_update(np.cumsum(text.lengths).tolist())
+        part_lengths = {total // k for k in range(1, 1 + total // max(length, 1)) if length < total // k}
+        part_lengths.intersection_update(np.cumsum(text.lengths).tolist())
         table = text.values.reshape(lines, length) if total == lines * length else np.zeros((0, 0))
         if text.separators.examples:  # a separator begins a frame or a part of one
             try:
-                part_size = text.separators.complete(text.values, text.lengths, (), path.name).size
+                num_values_per_part = text.separators.complete(text.values, text.lengths, (), path.name).size
             except ValueError:
                 if text.separators.unreadable:
                     raise
-                wrapped, part_size = set(), 1  # parts of different sizes: lines are frames, or too many are missing
-            wrapped = {size for size in wrapped if size % part_size == 0}
-        sizes = tuple({length, length - 1, lines, *wrapped})
+                # Parts have different sizes: lines are frames, or too many are missing.
+                part_lengths, num_values_per_part = set(), 1
+            part_lengths = {size for size in part_lengths if size % num_values_per_part == 0}
+        sizes = tuple({length, length - 1, lines, *part_lengths})
         # Of one frame of reciprocal voltages, a symmetric matrix, rows and columns resemble each other alike.
         if lines == length == len(table) and 2 * relative_deviation(table.T) < relative_deviation(table):
             data = {"frames_in": "columns"}
@@ -166,8 +167,8 @@ class FileNumbers:
 def relative_deviation(rows: np.ndarray) -> float:
     """Norm of the deviations of rows from their mean, divided by the norm of the rows."""
     values = np.where(np.isfinite(rows), rows, 0)
-    norm = float(np.linalg.norm(values))
-    return float(np.linalg.norm(values - values.mean(axis=0))) / norm if norm else 0.0
+    values_norm = float(np.linalg.norm(values))
+    return float(np.linalg.norm(values - values.mean(axis=0))) / values_norm if values_norm else 0.0
 
 
 def _read_array(path: Path, key: str | None, excluded: str | None) -> tuple[np.ndarray, str]:
@@ -199,60 +200,72 @@ def _read_array(path: Path, key: str | None, excluded: str | None) -> tuple[np.n
 
 def _protocols(number: int) -> Iterator[dict[str, Any]]:
     """Yield the table `[protocol]` of every common protocol for `number` electrodes."""
-    common_options = {"driven_electrodes": (False, True), "order": ("rotating", "fixed")}
+    shared_options = {"driven_electrodes": (False, True), "order": ("rotating", "fixed")}
     for kind, options in (
-        ("adjacent", {**common_options, "reciprocal": ("all", "half")}),
+        ("adjacent", {**shared_options, "reciprocal": ("all", "half")}),
         ("two_terminal", {}),
-        ("opposite", {**common_options, "drives": ("distinct", "all")}),
-        *(("skip", {"skipped": (skipped,), **common_options}) for skipped in range(1, number // 2)),
+        ("opposite", {**shared_options, "drives": ("distinct", "all")}),
+        *(("skip", {"skipped": (skipped,), **shared_options}) for skipped in range(1, number // 2)),
     ):
         for values in product(*options.values()):
             defaults = {"driven_electrodes": False, "reciprocal": "all", "drives": "distinct"}
-            entries = {key: value for key, value in zip(options, values, strict=True) if defaults.get(key) != value}
-            yield {"kind": kind, "number": number, **entries}
+            table_entries = {
+                key: value for key, value in zip(options, values, strict=True) if defaults.get(key) != value
+            }
+            yield {"kind": kind, "number": number, **table_entries}
 
 
 def fitting_candidates(
-    numbers: FileNumbers, base_numbers: FileNumbers, geometry: dict, electrodes: dict, known: dict, current: float
+    numbers: FileNumbers,
+    reference_numbers: FileNumbers,
+    geometry: dict,
+    electrodes: dict,
+    known_options: dict,
+    current: float,
 ) -> Iterator[Candidate]:
     """Yield candidates whose number of channels fits the file and its reference; of equal protocols, only the first."""
-    counts, found_protocols = set(numbers.sizes), set()
-    for number in [known["number"]] if "number" in known else range(MIN_ELECTRODES, MAX_ELECTRODES + 1):
+    counts, yielded_protocols = set(numbers.sizes), set()
+    for number in [known_options["number"]] if "number" in known_options else range(MIN_ELECTRODES, MAX_ELECTRODES + 1):
         if not any(number * (number - 4) / 4 <= count <= number**2 for count in counts):
             continue
         description, unsuitable_counts = None, set()
         for table in _protocols(number):
-            if any(table.get(key, value) != value for key, value in known.items()):
+            if any(table.get(key, value) != value for key, value in known_options.items()):
                 continue
             options_of_count = tuple((key, value) for key, value in table.items() if key != "order")
             if options_of_count in unsuitable_counts:
                 continue
             protocol = _protocol({**table, "current": current}, numbers.path)
             count = 0 if protocol is None else protocol.num_measurements
-            if protocol is None or count not in counts or count < _MIN_CHANNELS * number:
+            if protocol is None or count not in counts or count < _MIN_CHANNELS_PER_ELECTRODE * number:
                 unsuitable_counts.add(options_of_count)
                 continue
             patterns = (np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement))
             protocol_key = number, *(pattern.tobytes() for pattern in patterns)
-            if protocol_key in found_protocols:
+            if protocol_key in yielded_protocols:
                 continue
-            found_protocols.add(protocol_key)
+            yielded_protocols.add(protocol_key)
             description = description or _describe_body(geometry, electrodes, table, current)
             num_frames, measurement = _create_measurement(numbers, description, protocol)
-            base = (
-                measurement if base_numbers is numbers else _create_measurement(base_numbers, description, protocol)[1]
+            reference_measurement = (
+                measurement
+                if reference_numbers is numbers
+                else _create_measurement(reference_numbers, description, protocol)[1]
             )
-            if measurement is not None and base is not None:
-                empty_frame = base.mean_frame()
-                deviation_of_rows = relative_deviation(np.asarray(base.filled()))
+            if measurement is not None and reference_measurement is not None:
+                empty_frame = reference_measurement.mean_frame()
+                deviation_of_rows = relative_deviation(np.asarray(reference_measurement.filled()))
                 yield Candidate(table, num_frames, deviation_of_rows, reciprocity_error(empty_frame), empty_frame)
 
 
-def channel_counts(known: dict) -> list[int]:
-    """Numbers of channels of protocols that have the `known` entries; empty without the number of electrodes."""
-    tables = _protocols(known["number"]) if "number" in known else ()
-    fitting = [table for table in tables if all(table.get(key, value) == value for key, value in known.items())]
-    protocols = [_protocol({**table, "current": 1.0}, Path("a")) for table in fitting]
+def channel_counts(known_options: dict) -> list[int]:
+    """Numbers of channels of protocols that have the `known_options` entries; empty without the number of
+    electrodes."""
+    tables = _protocols(known_options["number"]) if "number" in known_options else ()
+    fitting_tables = [
+        table for table in tables if all(table.get(key, value) == value for key, value in known_options.items())
+    ]
+    protocols = [_protocol({**table, "current": 1.0}, Path("a")) for table in fitting_tables]
     return sorted({protocol.num_measurements for protocol in protocols if protocol is not None})
 
 

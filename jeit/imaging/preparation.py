@@ -15,10 +15,10 @@ from jeit.arguments import check_kind
 from jeit.data import Measurement
 from jeit.data.frame_checks import FrameQuality, assess, check_same_setup, rounding_of_difference
 from jeit.data.screening import mask_spikes
-from jeit.data.transfer import as_driven
+from jeit.data.transfer import converted_to_protocol
 from jeit.electrodes import AbstractElectrodes
 from jeit.forward import ForwardModel
-from jeit.imaging.calibration import Clock, calibrated_model, described_model, estimated_positions, relative_misfit
+from jeit.imaging.calibration import StepTimer, calibrated_model, described_model, estimated_positions, relative_misfit
 from jeit.imaging.doubts import doubts_of_data
 from jeit.imaging.electrode_changes import ElectrodeChange, ElectrodeChanges
 from jeit.imaging.wiring import Wiring, check_wiring, exchanges_message, find_wiring
@@ -31,7 +31,7 @@ from jeit.mesh import Body, Mesh
 from jeit_solvers.engines import as_array
 
 
-def chosen_frame(measurement: Measurement, frame: int | str | None = None) -> int:
+def selected_frame_number(measurement: Measurement, frame: int | str | None = None) -> int:
     """Number, from 0, of the frame to image, which is specified by number or name; default: the first frame that is not
     named "reference". Raises `ValueError` for a frame that does not exist."""
     if frame is not None:
@@ -40,7 +40,7 @@ def chosen_frame(measurement: Measurement, frame: int | str | None = None) -> in
 
 
 @contextmanager
-def naming_frame(measurement: Measurement, number: int) -> Iterator[None]:
+def naming_frame_in_errors(measurement: Measurement, number: int) -> Iterator[None]:
     """Context manager that adds the frame number to a `ValueError` that names the measurement, if the measurement has
     several frames. A reference may have the same name."""
     try:
@@ -54,16 +54,16 @@ def naming_frame(measurement: Measurement, number: int) -> Iterator[None]:
 
 
 # Minimum share of a voltage difference that is assumed to remain unexplained by any model.
-_MIN_MISFIT = 0.03
+_MIN_UNEXPLAINED_SHARE = 0.03
 # Factor by which the share of the voltage difference that the model does not explain is larger for images with sharp
 # outlines.
-_SHARP_FACTOR = 3.0
+_SHARP_OUTLINE_NOISE_FACTOR = 3.0
 # Relative standard deviation, due to the discretisation, of the strengths of fitted bodies in a sheet and in a solid:
 # the cells of a solid are coarse relative to the bodies. Estimated on 23 bodies in simulated boxes and cylinders.
 _DISCRETISATION_DEVIATION = {2: 0.0, 3: 0.03}
 # Misfit of an electrode, relative to that of the other electrodes, above which the electrode counts as unlike the
 # others. In sound tanks the ratio was at most 2.6.
-_MIN_UNLIKE_MISFIT = 3.0
+_MIN_UNLIKE_ELECTRODE_MISFIT = 3.0
 
 
 @dataclass(frozen=True)
@@ -133,8 +133,8 @@ class PreparedDifference:
         channels that measure on `unlike_electrodes`, the noise is multiplied by the relative misfit of the
         electrode."""
         noise = relative_noise(np.asarray(self.reference.voltages)[0], self.mask)
-        is_reading = np.asarray(self.model.protocol.channel_measurement) != 0
-        return as_array(noise * np.max(np.where(is_reading, self._electrode_weights, 1), axis=1))
+        is_measuring_electrode = np.asarray(self.model.protocol.channel_measurement) != 0
+        return as_array(noise * np.max(np.where(is_measuring_electrode, self._electrode_weights, 1), axis=1))
 
     @property
     def unlike_electrodes(self) -> dict[int, float]:
@@ -151,10 +151,12 @@ class PreparedDifference:
     def _electrode_weights(self) -> Float[np.ndarray, " L"]:
         """Relative misfit (L,) of each unlike electrode, by which the noise of its channels is multiplied; 1 for all
         other electrodes."""
-        base = np.asarray(self.reference.voltages)[0]
-        residual = np.asarray(self.calibration.voltages) - base
-        misfits = electrode_misfits(self.model.protocol, residual, relative_noise(base, self.mask), self.mask)
-        return np.where(misfits > _MIN_UNLIKE_MISFIT, misfits, 1)
+        reference_voltages = np.asarray(self.reference.voltages)[0]
+        residual = np.asarray(self.calibration.voltages) - reference_voltages
+        misfits = electrode_misfits(
+            self.model.protocol, residual, relative_noise(reference_voltages, self.mask), self.mask
+        )
+        return np.where(misfits > _MIN_UNLIKE_ELECTRODE_MISFIT, misfits, 1)
 
     @property
     def noise(self) -> float | None:
@@ -173,13 +175,13 @@ class PreparedDifference:
 
         If the noise is not known, 0.1 of the difference is used as noise, at most 1 in units of `relative_noise`.
         """
-        return self._noise_with_error_share(max(self._misfit, _MIN_MISFIT))
+        return self._noise_with_error_share(max(self._misfit, _MIN_UNEXPLAINED_SHARE))
 
     @property
     def sharp_noise(self) -> Float[Array, " M"]:
         """`modelled_noise` for bodies with sharp outlines, volts. The model error in it is three times larger, since
         bodies with sharp outlines, unlike smooth images, cannot adapt to model errors."""
-        return self._noise_with_error_share(_SHARP_FACTOR * max(self._misfit, _MIN_MISFIT))
+        return self._noise_with_error_share(_SHARP_OUTLINE_NOISE_FACTOR * max(self._misfit, _MIN_UNEXPLAINED_SHARE))
 
     @property
     def common_change(self) -> Float[np.ndarray, " M"]:
@@ -192,10 +194,10 @@ class PreparedDifference:
         the noise is not known and the misfit exceeds 1. `noise_share`: see `FrameQuality`; default: from the misfit."""
         if self.noise is not None or misfit <= 1:
             return self
-        relative_noise, used = np.asarray(self.relative_noise), np.asarray(self.mask)
-        unexplained = misfit * np.sqrt(np.mean((np.asarray(self.modelled_noise) / relative_noise)[used] ** 2))
+        relative_noise, is_used = np.asarray(self.relative_noise), np.asarray(self.mask)
+        unexplained = misfit * np.sqrt(np.mean((np.asarray(self.modelled_noise) / relative_noise)[is_used] ** 2))
         change = np.asarray(self.difference) - self.common_change
-        size = float(np.sqrt(np.mean(np.abs(change / relative_noise)[used] ** 2)))
+        size = float(np.sqrt(np.mean(np.abs(change / relative_noise)[is_used] ** 2)))
         quality = replace(
             self.quality,
             trusted_noise=float(unexplained),
@@ -247,20 +249,22 @@ class PreparedDifference:
     def modelled_share(self) -> float:
         """Share of the variance of `sharp_noise` that is due to the model error, from 0 to 1; 1 if the noise is not
         known."""
-        relative_sharp_noise = np.asarray(self.sharp_noise)[self.mask] / np.asarray(self.relative_noise)[self.mask]
-        return 1 - (0 if self.noise is None else self.noise**2 / float(np.mean(relative_sharp_noise**2)))
+        sharp_to_smooth_noise_ratios = (
+            np.asarray(self.sharp_noise)[self.mask] / np.asarray(self.relative_noise)[self.mask]
+        )
+        return 1 - (0 if self.noise is None else self.noise**2 / float(np.mean(sharp_to_smooth_noise_ratios**2)))
 
     def _noise_with_error_share(self, share: float) -> Float[Array, " M"]:
         """Root of the sum of squares of noise, rounding, and an error that is a `share` of the measured difference,
         volts."""
-        relative_noise, used = np.asarray(self.relative_noise), np.asarray(self.mask)
+        relative_noise, is_used = np.asarray(self.relative_noise), np.asarray(self.mask)
         change = self.electrode_change
-        due_to_electrodes, relative_error = (
-            (np.zeros(len(used)), 0.0) if change is None else (change.voltages, change.relative_error)
+        change_due_to_electrodes, relative_error = (
+            (np.zeros(len(is_used)), 0.0) if change is None else (change.voltages, change.relative_error)
         )
         relative_size, electrode_size = (
-            np.sqrt(np.mean(np.abs(voltages[used] / relative_noise[used]) ** 2))
-            for voltages in (np.asarray(self.difference) + due_to_electrodes, due_to_electrodes)
+            np.sqrt(np.mean(np.abs(voltages[is_used] / relative_noise[is_used]) ** 2))
+            for voltages in (np.asarray(self.difference) + change_due_to_electrodes, change_due_to_electrodes)
         )
         noise = min(1.0, 0.1 * relative_size) if self.noise is None else self.quality.trusted_noise
         error = np.hypot(share * relative_size, relative_error * electrode_size)
@@ -276,8 +280,8 @@ class PreparedDifference:
     @property
     def _field_error(self) -> float:
         """Relative error of the model's fields: the part of the misfit of the reference that noise does not explain."""
-        measured, used = np.asarray(self.reference.voltages)[0], np.asarray(self.mask)
-        size = np.sqrt(np.mean(np.abs(measured[used] / np.asarray(self.relative_noise)[used]) ** 2))
+        measured, is_used = np.asarray(self.reference.voltages)[0], np.asarray(self.mask)
+        size = np.sqrt(np.mean(np.abs(measured[is_used] / np.asarray(self.relative_noise)[is_used]) ** 2))
         noise = 0.0 if self.noise is None else self.noise / np.sqrt(2) / size
         return float(np.sqrt(max(self._misfit**2 - noise**2, 0.0)))
 
@@ -295,7 +299,7 @@ def prepare_difference(
     contact: str | None = None,
     num_points: int | None = None,
     as_is: bool = False,
-    clock: Clock | None = None,
+    clock: StepTimer | None = None,
 ) -> PreparedDifference:
     """Check a frame and its reference, mask spikes, build a mesh, and calibrate a model of the body on the reference.
 
@@ -317,36 +321,44 @@ def prepare_difference(
     prepared = prepare_difference(pressed, rest, num_points=200)
     ```
     """
-    clock = Clock(None) if clock is None else clock
-    frame_data, base = select_frames(measurement, reference, frame)
-    number = chosen_frame(measurement, frame)
-    with clock("check"), naming_frame(measurement, number):
-        check_same_setup(frame_data, base)
+    clock = StepTimer(None) if clock is None else clock
+    frame_data, reference_frame = select_frames(measurement, reference, frame)
+    number = selected_frame_number(measurement, frame)
+    with clock("check"), naming_frame_in_errors(measurement, number):
+        check_same_setup(frame_data, reference_frame)
         if not as_is:
-            frame_data = mask_spikes(frame_data, base)
-            base = replace(base, mask=as_array(np.asarray(base.mask) & np.asarray(frame_data.mask)))
-        (quality,) = assess(frame_data, base)
-        domain, electrodes = body_of(frame_data, base)
-        base = base if frame_data.uncertainty is None else replace(base, uncertainty=frame_data.uncertainty)
-        usable = np.asarray(frame_data.mask)[0] & np.asarray(base.mask)[0]
-        difference = as_array(np.where(usable, np.asarray(frame_data.voltages)[0] - np.asarray(base.voltages)[0], 0))
-        if not as_is and (exchange_message := exchanges_message(frame_data, base)):
+            frame_data = mask_spikes(frame_data, reference_frame)
+            reference_frame = replace(
+                reference_frame, mask=as_array(np.asarray(reference_frame.mask) & np.asarray(frame_data.mask))
+            )
+        (quality,) = assess(frame_data, reference_frame)
+        domain, electrodes = body_of(frame_data, reference_frame)
+        reference_frame = (
+            reference_frame
+            if frame_data.uncertainty is None
+            else replace(reference_frame, uncertainty=frame_data.uncertainty)
+        )
+        usable = np.asarray(frame_data.mask)[0] & np.asarray(reference_frame.mask)[0]
+        difference = as_array(
+            np.where(usable, np.asarray(frame_data.voltages)[0] - np.asarray(reference_frame.voltages)[0], 0)
+        )
+        if not as_is and (exchange_message := exchanges_message(frame_data, reference_frame)):
             raise ValueError(f"'{frame_data.name}' does not fit its reference: {exchange_message}")
     with clock("mesh"):
-        model = described_model(domain, electrodes, base.protocol, num_points)
+        model = described_model(domain, electrodes, reference_frame.protocol, num_points)
     with clock("wiring"):
-        wiring = find_wiring(model, base)
+        wiring = find_wiring(model, reference_frame)
         # For data that cannot be imaged, a wiring error is reported only if a different wiring explains the data: pure
         # noise fits no wiring.
         if wiring.explanation or quality.imageable:
-            check_wiring(wiring, base, as_is)
+            check_wiring(wiring, reference_frame, as_is)
         if not quality.imageable:
-            with naming_frame(measurement, number):
+            with naming_frame_in_errors(measurement, number):
                 raise ValueError(f"'{frame_data.name}' cannot be imaged: {quality.reason}")
-    calibration, contact_method = calibrated_model(model, base, contact=contact, clock=clock)
+    calibration, contact_method = calibrated_model(model, reference_frame, contact=contact, clock=clock)
     prepared = PreparedDifference(
         frame_data,
-        base,
+        reference_frame,
         quality,
         domain,
         contact_method,
@@ -388,8 +400,8 @@ def select_frames(
         _, reference = measurement.split_reference()
     if "reference" in reference.frame_names and reference.num_frames > 1:
         _, reference = reference.split_reference()
-    frame_data = measurement.frame(chosen_frame(measurement, frame))
-    return frame_data, as_driven(reference.mean_frame(), frame_data)
+    frame_data = measurement.frame(selected_frame_number(measurement, frame))
+    return frame_data, converted_to_protocol(reference.mean_frame(), frame_data)
 
 
 def check_measurement(name: str, given: Measurement) -> None:

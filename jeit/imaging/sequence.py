@@ -22,7 +22,7 @@ from jeit.data.frame_checks import assess, check_same_setup
 from jeit.data.screening import mask_spikes
 from jeit.files import check_memory
 from jeit.image.image_series import ImageSeries
-from jeit.imaging.calibration import Clock
+from jeit.imaging.calibration import StepTimer
 from jeit.imaging.difference import ImagedDifference, image_difference
 from jeit.imaging.method import AUTO, METHODS, ImagingSettings, MethodOptions, as_settings
 from jeit.imaging.preparation import (
@@ -39,13 +39,13 @@ from jeit.mesh import Mesh
 from jeit_solvers.engines import as_array
 
 # Number of frames imaged at once, and number of bytes of a stored value.
-_BATCH, _VALUE_BYTES = 256, 4
+_FRAMES_PER_BATCH, _VALUE_BYTES = 256, 4
 # Minimum share of the frames with a valid value of a channel for the channel to be used.
 _MIN_FRAME_SHARE = 0.5
 # Number of frames, those that differ most from the reference, among which one that can be imaged is searched.
-_NUM_CANDIDATES = 10
+_NUM_CANDIDATE_FRAMES = 10
 # Number of frames, those that differ most from the reference, among which moved electrodes are searched for.
-_NUM_SEARCHED = 1000
+_NUM_SEARCHED_FRAMES = 1000
 
 
 @dataclass(frozen=True)
@@ -81,12 +81,12 @@ class ImagedSequence:
     def doubts(self) -> tuple[str, ...]:
         """Reasons to doubt the images, in sentences, from the frame for which λ was chosen: the one that differs most
         from the reference; and the number of frames with moved electrodes."""
-        warnings = replace(self.prepared, electrode_change=None).doubts
+        doubt_texts = replace(self.prepared, electrode_change=None).doubts
         if not self.moved.any():
-            return warnings
+            return doubt_texts
         num_moved, num_imaged = int(self.moved.sum()), int((~self.refused).sum())
         return (
-            *warnings,
+            *doubt_texts,
             f"in {num_moved} of {counted(num_imaged, 'frame')} the voltages have changed as if electrodes had moved "
             "since the reference. Their images show the rest of the difference (as_is=True, --as-is: all of it). "
             "Measure a new reference.",
@@ -137,7 +137,7 @@ def image_sequence(
     settings = as_settings(settings)
     if settings.method == AUTO:
         settings = replace(settings, method="one-step")
-    clock = Clock(progress)
+    clock = StepTimer(progress)
     if reference is None and "reference" not in measurement.frame_names:
         reference = measurement.mean_frame()
     _, base = select_frames(measurement, reference)
@@ -146,28 +146,30 @@ def image_sequence(
         measurement = mask_spikes(measurement, base, fill=True)
     voltages, mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
     expected_voltages = np.asarray(base.voltages)[0]
-    is_common = (mask.mean(axis=0) >= _MIN_FRAME_SHARE) & np.asarray(base.mask)[0]
-    is_refused = np.asarray(~mask[:, is_common].all(axis=1))
-    reasons = dict.fromkeys(map(int, np.flatnonzero(is_refused)), "It lacks channels that most frames have.")
-    if not is_common.any() or is_refused.all():
+    is_in_most_frames = (mask.mean(axis=0) >= _MIN_FRAME_SHARE) & np.asarray(base.mask)[0]
+    is_refused_frame = np.asarray(~mask[:, is_in_most_frames].all(axis=1))
+    reasons = dict.fromkeys(map(int, np.flatnonzero(is_refused_frame)), "It lacks channels that most frames have.")
+    if not is_in_most_frames.any() or is_refused_frame.all():
         raise ValueError(f"'{measurement.name}': no channel is usable in most frames, or none has all of them.")
     if not settings.as_is:
-        noisy = _noisy_frames(voltages - expected_voltages, is_common & mask, base)
-        if len(reasons | noisy) < measurement.num_frames:  # otherwise the error of the strongest frame is raised
-            reasons |= noisy
-            is_refused[list(reasons)] = True
-    total_change = np.abs(np.where(is_common, voltages - expected_voltages, 0)).sum(axis=1)
-    if not is_common.all():
-        measurement = measurement.masked(is_common, "they are missing in most frames, or in the reference.")
-    frames_by_change = np.argsort(np.where(is_refused, 1.0, -total_change), kind="stable")[: (~is_refused).sum()]
-    noisy = {}
-    for number, frame_index in enumerate(map(int, frames_by_change[:_NUM_CANDIDATES])):
+        noisy_frames = _noisy_frames(voltages - expected_voltages, is_in_most_frames & mask, base)
+        if len(reasons | noisy_frames) < measurement.num_frames:  # otherwise the error of the strongest frame is raised
+            reasons |= noisy_frames
+            is_refused_frame[list(reasons)] = True
+    total_change = np.abs(np.where(is_in_most_frames, voltages - expected_voltages, 0)).sum(axis=1)
+    if not is_in_most_frames.all():
+        measurement = measurement.masked(is_in_most_frames, "they are missing in most frames, or in the reference.")
+    frames_by_change = np.argsort(np.where(is_refused_frame, 1.0, -total_change), kind="stable")[
+        : (~is_refused_frame).sum()
+    ]
+    noisy_frames = {}
+    for number, frame_index in enumerate(map(int, frames_by_change[:_NUM_CANDIDATE_FRAMES])):
         if not (reason := assess(measurement.frame(frame_index), base)[0].reason):
-            is_refused[list(noisy)] = True
-            reasons |= noisy
+            is_refused_frame[list(noisy_frames)] = True
+            reasons |= noisy_frames
             frames_by_change = frames_by_change[number:]
             break
-        noisy[frame_index] = f"{reason[0].upper()}{reason[1:]}"
+        noisy_frames[frame_index] = f"{reason[0].upper()}{reason[1:]}"
     largest_change_frame = int(frames_by_change[0])
     prepared = prepare_difference(
         measurement,
@@ -193,20 +195,24 @@ def image_sequence(
             )
         changes, has_moved_electrodes = np.full((num_frames, num_cells), np.nan, np.float32), np.zeros(num_frames, bool)
         changes_of_electrodes = None if settings.as_is else prepared.electrode_changes
-        raw_differences = np.where(is_common, voltages[frames_by_change[:_NUM_SEARCHED]] - expected_voltages, 0)
+        raw_differences = np.where(
+            is_in_most_frames, voltages[frames_by_change[:_NUM_SEARCHED_FRAMES]] - expected_voltages, 0
+        )
         estimator = changes_of_electrodes and changes_of_electrodes.estimator_for(raw_differences)
-        imaged_frames = np.flatnonzero(~is_refused)
-        for start in range(0, len(imaged_frames), _BATCH):
-            batch = imaged_frames[start : start + _BATCH]
-            difference = np.where(is_common, voltages[batch] - expected_voltages, 0)
+        imaged_frames = np.flatnonzero(~is_refused_frame)
+        for start in range(0, len(imaged_frames), _FRAMES_PER_BATCH):
+            batch = imaged_frames[start : start + _FRAMES_PER_BATCH]
+            difference = np.where(is_in_most_frames, voltages[batch] - expected_voltages, 0)
             if changes_of_electrodes is not None and estimator is not None:
-                due_to_electrodes = changes_of_electrodes.voltages(difference, estimator)
-                has_moved_electrodes[batch] = due_to_electrodes.any(axis=1)
-                difference = difference - due_to_electrodes
+                change_due_to_electrodes = changes_of_electrodes.voltages(difference, estimator)
+                has_moved_electrodes[batch] = change_due_to_electrodes.any(axis=1)
+                difference = difference - change_due_to_electrodes
             changes[batch] = np.asarray(reconstruction.image(as_array(difference)))
     background = float(np.real(prepared.calibration.conductivity))
     series = ImageSeries(prepared.mesh, changes, times, background, timed=measurement.times is not None)
-    return ImagedSequence(series, prepared, reconstruction, is_refused, region_masks, has_moved_electrodes, reasons)
+    return ImagedSequence(
+        series, prepared, reconstruction, is_refused_frame, region_masks, has_moved_electrodes, reasons
+    )
 
 
 def _noisy_frames(
@@ -220,15 +226,15 @@ def _noisy_frames(
     is_used = usable.any(axis=0)
     noise = np.asarray(relative_noise(expected_voltages, as_array(is_used)))
     check = FrameCheck(is_used, expected_voltages, touching, (pairs.reshape(-1, 2), ratios), noise)
-    judgements = (
-        check.judge_noise(np.where(is_used, change, 0), is_used)
+    noise_judgements = (
+        check.check_reciprocal_noise(np.where(is_used, change, 0), is_used)
         for change, is_used in zip(changes, usable, strict=True)
     )
-    faulty = FrameStatus.REFUSED, FrameStatus.PARTIAL
+    faulty_statuses = FrameStatus.REFUSED, FrameStatus.PARTIAL
     return {
         number: reason.removesuffix(" Its channels are left out.")
-        for number, (_, status, reason) in enumerate(judgements)
-        if status in faulty
+        for number, (_, status, reason) in enumerate(noise_judgements)
+        if status in faulty_statuses
     }
 
 

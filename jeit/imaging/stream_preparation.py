@@ -14,7 +14,7 @@ from jeit.arguments import check_kind
 from jeit.data import Measurement, screen
 from jeit.data.description import Description
 from jeit.forward import ForwardModel
-from jeit.imaging.calibration import Clock, calibrated_model, imaging_mesh
+from jeit.imaging.calibration import StepTimer, calibrated_model, imaging_mesh
 from jeit.imaging.electrode_changes import ElectrodeChange, ElectrodeChanges
 from jeit.imaging.method import NamedPrior, check_body, check_hyperparameter, check_prior, prior_for
 from jeit.imaging.preparation import (
@@ -33,7 +33,7 @@ from jeit.inverse.streaming.imager import check_memory
 from jeit.inverse.streaming.stream import FrameImage, FrameStatus, StreamState
 
 # Default number of mesh nodes for bodies without a mesh of their own.
-STREAM_POINTS = 1200
+DEFAULT_STREAM_NUM_POINTS = 1200
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,9 @@ def prepare_imager(
     check_real(measured)
     check_real(base)
     domain, electrodes = body_of(measured, base)
-    clock = Clock(progress)
+    clock = StepTimer(progress)
     with clock("mesh"):
-        mesh = imaging_mesh(domain, electrodes, settings.num_points, usual=STREAM_POINTS)
+        mesh = imaging_mesh(domain, electrodes, settings.num_points, usual=DEFAULT_STREAM_NUM_POINTS)
         model = ForwardModel(mesh, electrodes, base.protocol)
     with clock("wiring"):
         check_wiring(find_wiring(model, base), base, settings.as_is)
@@ -158,18 +158,18 @@ class ElectrodeChangeFilter:
         changes, difference = self._changes, None if self._changes is None else _ordinary_change(state, frame)
         if changes is None or difference is None:
             return frame, None
-        due_to_electrodes, change = np.zeros(len(difference)), None
+        change_due_to_electrodes, change = np.zeros(len(difference)), None
         if self._estimator is not None:
-            due_to_electrodes = changes.voltages(difference[None], self._estimator)[0]
-        if not due_to_electrodes.any() and changes.are_suspicious(difference[None])[0]:
+            change_due_to_electrodes = changes.voltages(difference[None], self._estimator)[0]
+        if not change_due_to_electrodes.any() and changes.are_suspicious(difference[None])[0]:
             self._num_suspicious += 1
             is_power_of_two = self._num_suspicious.bit_count() == 1
             new_estimator = changes.estimator(difference) if is_power_of_two else None
             change = None if new_estimator is None else changes.find(difference, new_estimator)
             if new_estimator is not None and change is not None:
                 self._estimator = new_estimator
-                due_to_electrodes = changes.voltages(difference[None], new_estimator)[0]
-        return np.asarray(frame) - due_to_electrodes, change
+                change_due_to_electrodes = changes.voltages(difference[None], new_estimator)[0]
+        return np.asarray(frame) - change_due_to_electrodes, change
 
 
 def image_stream(
@@ -198,8 +198,8 @@ def image_stream(
 def _ordinary_change(state: StreamState, frame: object) -> Float[np.ndarray, " M"] | None:
     """Change (M,) of a frame since the reference, volts, 0 in masked channels; None if the frame has a fault."""
     values, usable, status, _ = state.check(frame)
-    is_ordinary = status == FrameStatus.IMAGED and usable is state.mask
-    return np.where(state.mask, values - state.expected, 0.0) if is_ordinary else None
+    is_fault_free = status == FrameStatus.IMAGED and usable is state.mask
+    return np.where(state.mask, values - state.expected, 0.0) if is_fault_free else None
 
 
 def described_reference(

@@ -28,7 +28,7 @@ from jeit_solvers.engines import on_host
 
 # Maximum ratio of the difference between frame and reference after an exchange to the difference before, for each
 # exchange and for all reported exchanges together; and maximum number of exchanges.
-_MAX_EXCHANGE_RATIO, _MAX_TOTAL_RATIO, _MAX_EXCHANGES = 0.9, 0.5, 4
+_MAX_EXCHANGE_RATIO, _MAX_TOTAL_EXCHANGE_RATIO, _MAX_EXCHANGES = 0.9, 0.5, 4
 
 
 def exchanges_message(frame: Measurement, reference: Measurement) -> str:
@@ -47,15 +47,15 @@ def exchanges_message(frame: Measurement, reference: Measurement) -> str:
         (*_exchanges(frame_values, reference_values), "drives"),
         (*_exchanges(frame_values.T, reference_values.T), "measurements of every drive"),
     ]
-    remaining_norm, pairs, exchanged_kind = min(candidates, key=lambda candidate: candidate[0])
-    if not pairs or remaining_norm > _MAX_TOTAL_RATIO * described_norm:
+    remaining_norm, pairs, kind_of_exchange = min(candidates, key=lambda candidate: candidate[0])
+    if not pairs or remaining_norm > _MAX_TOTAL_EXCHANGE_RATIO * described_norm:
         return ""
     reference_norm = float(np.linalg.norm(reference_values))
     pair_text = ", ".join(
         f"{first_electrode + 1} and {second_electrode + 1}" for first_electrode, second_electrode in pairs
     )
     return (
-        f"{exchanged_kind} {pair_text} look exchanged in it, and not in its reference: so taken it differs from that "
+        f"{kind_of_exchange} {pair_text} look exchanged in it, and not in its reference: so taken it differs from that "
         f"by {percent(remaining_norm / reference_norm)}, as it is by {percent(described_norm / reference_norm)}. Mend "
         "its order; or go on as it is (as_is=True, --as-is)."
     )
@@ -92,17 +92,17 @@ def _exchanges(
     return float(np.sqrt(total)), pairs
 
 
-MOST_MISFIT = 0.15
+MAX_WIRING_MISFIT = 0.15
 """Relative misfit of a uniform body to a frame of the empty body above which a wiring error is suspected."""
 # Maximum ratio of the misfit with a changed wiring to the misfit before the change: for each exchange, and for the
 # reported wiring relative to the described wiring.
-_MAX_STEP_RATIO, _MAX_WIRING_RATIO = 0.85, 0.6
+_MAX_MISFIT_RATIO_PER_EXCHANGE, _MAX_WIRING_RATIO = 0.85, 0.6
 _MAX_ELECTRODE_EXCHANGES = 4
 # Relative misfit of the empty body above which imaging is refused even if no other wiring explains the frame.
-_MAX_MISFIT = 0.5
+_MAX_EMPTY_BODY_MISFIT = 0.5
 # Trial contact impedances, multiplied by the conductivity and divided by the size of the body: from negligible to
 # dominant.
-_RELATIVE_CONTACTS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+_RELATIVE_CONTACT_IMPEDANCES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 
 
 @dataclass(frozen=True)
@@ -126,14 +126,14 @@ class Wiring:
     described: float = field(default=np.inf, compare=False)
 
     @property
-    def as_described(self) -> bool:
+    def is_described_wiring(self) -> bool:
         """Whether the wiring is the described one."""
         return not (self.order or self.reversed_signs or self.magnitudes or self._exchange_cycles())
 
     @property
     def fault(self) -> str:
         """The fault of the wiring, in a sentence; empty if the wiring has no fault that prevents imaging."""
-        if self.explanation or self.described < _MAX_MISFIT:
+        if self.explanation or self.described < _MAX_EMPTY_BODY_MISFIT:
             return self.explanation
         return (
             f"the model misses {percent(self.described)} of it, and no order of channels, sign, or exchange of a few "
@@ -191,16 +191,16 @@ def find_wiring(
     impedances = uniform_impedances(model) if impedances is None else impedances
     protocol = on_host(model.protocol)
     compute_misfit = _create_comparison(protocol, impedances, measurement, orders)
-    compared = compute_misfit(described_wiring)
-    described_misfit = 1.0 if compared.reversed_signs else compared.misfit
-    if compared.misfit < MOST_MISFIT:  # as described, except possibly for the sign
-        return replace(compared, described=described_misfit)
-    best_wiring = _better_wiring(compute_misfit, described_wiring, compared, orders)
+    compared_wiring = compute_misfit(described_wiring)
+    described_misfit = 1.0 if compared_wiring.reversed_signs else compared_wiring.misfit
+    if compared_wiring.misfit < MAX_WIRING_MISFIT:  # as described, except possibly for the sign
+        return replace(compared_wiring, described=described_misfit)
+    best_wiring = _better_wiring(compute_misfit, described_wiring, compared_wiring, orders)
     expected_voltages = np.asarray(select_channels(protocol, impedances[0]))
     if (has_one_sign := _has_one_sign(expected_voltages, measurement)) is not None:
-        compute_misfit = _create_comparison(protocol, impedances, measurement, orders, signs=False)
+        compute_misfit = _create_comparison(protocol, impedances, measurement, orders, compares_signs=False)
         unsigned_wiring = _better_wiring(compute_misfit, described_wiring, compute_misfit(described_wiring), orders)
-        if unsigned_wiring.misfit < _MAX_STEP_RATIO * best_wiring.misfit:
+        if unsigned_wiring.misfit < _MAX_MISFIT_RATIO_PER_EXCHANGE * best_wiring.misfit:
             best_wiring = replace(unsigned_wiring, magnitudes=has_one_sign)
     best_wiring = (
         replace(described_wiring, misfit=described_misfit)
@@ -211,36 +211,45 @@ def find_wiring(
 
 
 def _better_wiring(
-    compute_misfit: Callable[[Wiring], Wiring], described_wiring: Wiring, best_wiring: Wiring, orders: Iterable[str]
+    compute_misfit: Callable[[Wiring], Wiring],
+    described_wiring: Wiring,
+    best_wiring: Wiring,
+    orders_of_channels: Iterable[str],
 ) -> Wiring:
     """Return the wiring that explains a frame far better than `best_wiring`, the described wiring with its misfit, or
     `best_wiring` if no wiring does."""
     num_electrodes = len(described_wiring.places)
 
-    def choose_best(wirings: Iterable[Wiring], last_best: Wiring) -> Wiring:
+    def choose_best(wirings: Iterable[Wiring], previous_wiring: Wiring) -> Wiring:
         # Misfits are rounded so that the first of equivalent wirings is chosen, for example of orders that are
         # equivalent by reciprocity.
         best_wiring = min((compute_misfit(wiring) for wiring in wirings), key=lambda wiring: round(wiring.misfit, 9))
-        return best_wiring if best_wiring.misfit < _MAX_STEP_RATIO * last_best.misfit else last_best
+        return (
+            best_wiring
+            if best_wiring.misfit < _MAX_MISFIT_RATIO_PER_EXCHANGE * previous_wiring.misfit
+            else previous_wiring
+        )
 
     def improve_by_exchanges(best_wiring: Wiring) -> Wiring:
         for _ in range(_MAX_ELECTRODE_EXCHANGES):
             pairs = combinations(range(num_electrodes), 2)
-            last_best = best_wiring
+            previous_wiring = best_wiring
             best_wiring = choose_best(
                 [replace(best_wiring, places=_exchange_places(best_wiring.places, *pair)) for pair in pairs],
                 best_wiring,
             )
-            if best_wiring is last_best:
+            if best_wiring is previous_wiring:
                 break
         return best_wiring
 
     best_wiring = improve_by_exchanges(
-        choose_best([replace(described_wiring, order=order) for order in orders], best_wiring)
+        choose_best([replace(described_wiring, order=order) for order in orders_of_channels], best_wiring)
     )
-    turned_wirings = [Wiring(places, order) for places in _rotated_places(num_electrodes) for order in orders]
+    rotated_wirings = [
+        Wiring(places, order) for places in _rotated_places(num_electrodes) for order in orders_of_channels
+    ]
     return choose_best(
-        [improve_by_exchanges(choose_best(turned_wirings, compute_misfit(described_wiring)))], best_wiring
+        [improve_by_exchanges(choose_best(rotated_wirings, compute_misfit(described_wiring)))], best_wiring
     )
 
 
@@ -262,15 +271,17 @@ def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
     drive, measurement = np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)
     channels = np.arange(len(drive))
     positive_electrodes = np.asarray(protocol.measurement).argmax(axis=1)[measurement]
-    source, sink = (choose(np.asarray(protocol.drive), axis=1)[drive] for choose in (np.argmax, np.argmin))
+    source_electrode, sink_electrode = (
+        choose(np.asarray(protocol.drive), axis=1)[drive] for choose in (np.argmax, np.argmin)
+    )
     sort_keys = {
         'from electrode 1 on in every drive (order = "fixed")': (positive_electrodes, drive),
         'from the driven electrodes on in every drive (order = "rotating")': (
-            (positive_electrodes - source) % protocol.num_electrodes,
+            (positive_electrodes - source_electrode) % protocol.num_electrodes,
             drive,
         ),
         "from the second driven electrode on in every drive (rotating)": (
-            (positive_electrodes - sink) % protocol.num_electrodes,
+            (positive_electrodes - sink_electrode) % protocol.num_electrodes,
             drive,
         ),
         "measurement by measurement, not drive by drive": (drive, positive_electrodes),
@@ -279,7 +290,7 @@ def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
     for name, keys in sort_keys.items():
         channel_order = np.empty_like(channels)
         channel_order[np.lexsort(keys)] = channels
-        if not any(np.array_equal(channel_order, found_order) for found_order in orders.values()):
+        if not any(np.array_equal(channel_order, estimated_order) for estimated_order in orders.values()):
             orders[name] = channel_order
     return orders
 
@@ -290,35 +301,35 @@ def _create_comparison(
     measurement: Measurement,
     orders,
     *,
-    signs: bool = True,
+    compares_signs: bool = True,
 ) -> Callable[[Wiring], Wiring]:
     """Return a function that computes the misfit of a wiring to the first frame of `measurement`, and the sign of the
-    voltages. Without `signs`, only magnitudes of voltages are compared."""
+    voltages. Without `compares_signs`, only magnitudes of voltages are compared."""
     voltages, mask = np.real(np.asarray(measurement.filled())[0]), np.asarray(measurement.mask)[0]
-    voltages = voltages if signs else np.abs(voltages)
+    voltages = voltages if compares_signs else np.abs(voltages)
 
-    stacked = np.stack([np.asarray(impedance) for impedance in impedances])
+    stacked_impedances = np.stack([np.asarray(impedance) for impedance in impedances])
 
     def compute_misfit(wiring: Wiring) -> Wiring:
         electrode_places, channel_order = np.array(wiring.places), orders[wiring.order]
         measured, is_used = voltages[channel_order], mask[channel_order]
-        exchanged_impedances = stacked[:, electrode_places[:, None], electrode_places]
+        exchanged_impedances = stacked_impedances[:, electrode_places[:, None], electrode_places]
         expected_voltages = np.where(
             is_used, [select_channels(protocol, impedance) for impedance in exchanged_impedances], 0
         )
-        expected_voltages = expected_voltages if signs else np.abs(expected_voltages)
-        scales = expected_voltages @ measured / np.sum(expected_voltages**2, axis=1)
-        residual_norms = np.linalg.norm(measured - scales[:, None] * expected_voltages, axis=1)
+        expected_voltages = expected_voltages if compares_signs else np.abs(expected_voltages)
+        scale_factors = expected_voltages @ measured / np.sum(expected_voltages**2, axis=1)
+        residual_norms = np.linalg.norm(measured - scale_factors[:, None] * expected_voltages, axis=1)
         best = int(np.argmin(residual_norms))
         misfit = float(residual_norms[best] / np.linalg.norm(measured))
-        return replace(wiring, misfit=misfit, reversed_signs=bool(scales[best] < 0))
+        return replace(wiring, misfit=misfit, reversed_signs=bool(scale_factors[best] < 0))
 
     return compute_misfit
 
 
 def uniform_impedances(model: ForwardModel) -> list[Float[np.ndarray, "L L"]]:
     """Transfer impedances of the uniform body of unit conductivity, for each contact impedance of
-    `_RELATIVE_CONTACTS`."""
+    `_RELATIVE_CONTACT_IMPEDANCES`."""
     electrodes = model.electrodes
     if electrodes.is_point:
         return [np.asarray(model.transfer_impedance(1.0))]
@@ -326,7 +337,7 @@ def uniform_impedances(model: ForwardModel) -> list[Float[np.ndarray, "L L"]]:
     relative = np.asarray(electrodes.contact_impedance) / np.mean(electrodes.contact_impedance)
     models = (
         model.with_electrodes(electrodes.with_contact_impedance(contact * size * relative))
-        for contact in _RELATIVE_CONTACTS
+        for contact in _RELATIVE_CONTACT_IMPEDANCES
     )
     return [np.asarray(model.transfer_impedance(1.0)) for model in models]
 
@@ -349,20 +360,21 @@ def _exchange_places(places: tuple[int, ...], first_electrode: int, second_elect
     return tuple(new_places)
 
 
-def _exchange_text(places: tuple[int, ...], cycles: list[list[int]]) -> str:
+def _exchange_text(places: tuple[int, ...], exchange_cycles: list[list[int]]) -> str:
     """Description of exchanged electrodes, in words."""
-    if cycles and places in _rotated_places(len(places)):
+    if exchange_cycles and places in _rotated_places(len(places)):
         direction = "from another one" if (places[1] - places[0]) % len(places) == 1 else "the other way round"
         first_text = f", electrode 1 standing where {places[0] + 1} should" if places[0] else ""
         return f"the electrodes look counted {direction}{first_text}"
     pairs = [
-        f"{first_text + 1} and {second + 1}" for first_text, second in (cycle for cycle in cycles if len(cycle) == 2)
+        f"{first_text + 1} and {second + 1}"
+        for first_text, second in (cycle for cycle in exchange_cycles if len(cycle) == 2)
     ]
     descriptions = [f"electrodes {', '.join(pairs)} look exchanged"] if pairs else []
     descriptions += [
         f"electrodes {' → '.join(str(k + 1) for k in [*cycle, cycle[0]])} each look as if they stood where the next "
         "one should"
-        for cycle in cycles
+        for cycle in exchange_cycles
         if len(cycle) > 2
     ]
     return ", and ".join(descriptions)

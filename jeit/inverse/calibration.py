@@ -25,7 +25,7 @@ from jeit_solvers.module import Module
 
 # Logarithm of the ratio of a contact impedance to the model's, beyond which the impedance no longer changes the
 # voltages.
-MAX_LOG_RATIO = 50.0
+MAX_LOG_CONTACT_RATIO = 50.0
 # Tolerance of the parameters and the misfit in a fit inside jax.jit, jax.grad or jax.vmap: as small as double precision
 # allows.
 _TRACED_TOLERANCE = 1e-12
@@ -78,7 +78,7 @@ def _fitted_model(contact: str, parameters, model: ForwardModel) -> tuple[Forwar
     conductivity = jnp.exp(parameters[0])
     if contact == "fixed":
         return model, conductivity
-    factor = jnp.exp(jnp.clip(parameters[1:] - parameters[0], -MAX_LOG_RATIO, MAX_LOG_RATIO))
+    factor = jnp.exp(jnp.clip(parameters[1:] - parameters[0], -MAX_LOG_CONTACT_RATIO, MAX_LOG_CONTACT_RATIO))
     impedance = model.electrodes.contact_impedance * factor
     return model.with_electrodes(model.electrodes.with_contact_impedance(impedance)), conductivity
 
@@ -110,7 +110,7 @@ def _normal_equations_solver(contact: str, parameters, problem):
     return lambda vector: inverse @ vector
 
 
-_REASONS = {
+_REASON_BY_STATUS = {
     Status.STEP_LIMIT: "Stopped after {} steps.",
     Status.FAILED: "The fit became NaN.",
 }
@@ -275,10 +275,10 @@ def calibrate(
     if not _MIN_VOLTAGE < max_voltage < 1 / _MIN_VOLTAGE:
         raise ValueError(f"voltages: the largest of the reference frame is {max_voltage:.3g} V; are they in volts?")
     with np.errstate(all="ignore"):
-        return _fit(model, measured, is_used, contact, max_steps)
+        return _fit_parameters(model, measured, is_used, contact, max_steps)
 
 
-def _fit(model: ForwardModel, measured, is_used, contact: str, max_steps: int) -> Calibration:
+def _fit_parameters(model: ForwardModel, measured, is_used, contact: str, max_steps: int) -> Calibration:
     if model.electrodes.is_point:
         contact = "fixed"
     data_norm = np.linalg.norm(measured)
@@ -319,7 +319,7 @@ def _fit(model: ForwardModel, measured, is_used, contact: str, max_steps: int) -
     misfit = as_array(np.linalg.norm(residual(solution.x)))
     status = Status.CONVERGED if solution.status > 0 else Status.STEP_LIMIT
     status = status if np.isfinite(misfit) else Status.FAILED
-    reason = "" if status == Status.CONVERGED else _REASONS[status].format(max_steps)
+    reason = "" if status == Status.CONVERGED else _REASON_BY_STATUS[status].format(max_steps)
     contact_deviation: Any = _standard_deviations(solution)[problem.first_contact :]
     return Calibration(
         fitted_model,
@@ -377,17 +377,19 @@ class _CalibrationProblem:
         if self.contact == "fixed":
             return self.initial_model, conductivity
         electrodes = self.initial_model.electrodes
-        factor = np.exp(np.clip(parameters[self.first_contact :] - parameters[0], -MAX_LOG_RATIO, MAX_LOG_RATIO))
+        factor = np.exp(
+            np.clip(parameters[self.first_contact :] - parameters[0], -MAX_LOG_CONTACT_RATIO, MAX_LOG_CONTACT_RATIO)
+        )
         impedance = np.asarray(electrodes.contact_impedance) * factor
         return self.initial_model.with_electrodes(electrodes.with_contact_impedance(impedance)), conductivity
 
     def voltages(self, parameters):
         """Voltages (M,) in volts for these parameters."""
-        return self.select(self._fields(parameters)[2])
+        return self.select(self._model_fields_and_impedance(parameters)[2])
 
     def jacobian(self, parameters):
         """Derivatives of the voltages with respect to the parameters, (M, p) volts."""
-        model, fields, impedance = self._fields(parameters)
+        model, fields, impedance = self._model_fields_and_impedance(parameters)
         conductivity_derivative = -self.select(impedance)[:, None]
         if self.sensitivity is None:
             return self._add_phase_derivative(conductivity_derivative, conductivity_derivative)
@@ -415,7 +417,7 @@ class _CalibrationProblem:
             else magnitude_derivative
         )
 
-    def _fields(self, parameters):
+    def _model_fields_and_impedance(self, parameters):
         """Model, fields and transfer impedance for these parameters; the last result is cached."""
         parameter_bytes = parameters.tobytes()
         if self.cached_fields is None or self.cached_fields[0] != parameter_bytes:

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jeit.protocol import Protocol
 from jeit_solvers import lower_cholesky, symmetric_inverse
-from jeit_solvers.engines import as_array, either_engine, has_values, namespace
+from jeit_solvers.engines import as_array, has_values, namespace, numpy_or_compiled
 from jeit_solvers.module import Module
 
 _RANK_TOLERANCE = 1e-9
@@ -63,27 +63,27 @@ class IndependentChannels(Module):
             num_channels = protocol.num_measurements
             return cls(as_array(np.arange(num_channels)), as_array(np.eye(num_channels)))
         drive, measurement = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
-        forms = drive[:, :, None] * measurement[:, None, :]
+        bilinear_forms = drive[:, :, None] * measurement[:, None, :]
         rows, columns = np.triu_indices(protocol.num_electrodes)
-        forms = (forms + np.swapaxes(forms, 1, 2))[:, rows, columns]
-        form_norms = np.linalg.norm(forms, axis=1)
-        factorisation: Any = scipy.linalg.qr((forms / form_norms[:, None]).T, mode="r", pivoting=True)
+        bilinear_forms = (bilinear_forms + np.swapaxes(bilinear_forms, 1, 2))[:, rows, columns]
+        form_norms = np.linalg.norm(bilinear_forms, axis=1)
+        factorisation: Any = scipy.linalg.qr((bilinear_forms / form_norms[:, None]).T, mode="r", pivoting=True)
         triangle, order = factorisation[-2:]
         rank = int(np.sum(np.abs(np.diag(triangle)) > _RANK_TOLERANCE))
         dependent_coefficients = scipy.linalg.solve_triangular(triangle[:rank, :rank], triangle[:rank, rank:])
-        combination = np.empty((len(forms), rank))
-        combination[order] = np.concatenate([np.eye(rank), dependent_coefficients.T]) / form_norms[order[:rank]]
-        combination *= form_norms[:, None]
-        combination[np.abs(combination) < _RANK_TOLERANCE * np.abs(combination).max()] = 0
+        combination_matrix = np.empty((len(bilinear_forms), rank))
+        combination_matrix[order] = np.concatenate([np.eye(rank), dependent_coefficients.T]) / form_norms[order[:rank]]
+        combination_matrix *= form_norms[:, None]
+        combination_matrix[np.abs(combination_matrix) < _RANK_TOLERANCE * np.abs(combination_matrix).max()] = 0
         ascending_order = np.argsort(order[:rank])
-        return cls(as_array(order[:rank][ascending_order]), as_array(combination[:, ascending_order]))
+        return cls(as_array(order[:rank][ascending_order]), as_array(combination_matrix[:, ascending_order]))
 
-    def weigh(self, noise: Float[Array, " M"]) -> "Weighing":
+    def weigh(self, noise: Float[Array, " M"]) -> "ChannelWeighting":
         """Compute the map from voltages to `Data`; `noise` (M,): standard deviation of the voltages, volts."""
         return _compute_weighing(self.combination, noise)
 
 
-class Weighing(Module):
+class ChannelWeighting(Module):
     """Map from voltages (M,) to `Data`, which is the same for all frames of equal noise.
 
     **Fields**: `noise` (M,): standard deviations, volts; `estimator` (r, M): matrix with ŷ = estimator · y; `weight`,
@@ -101,8 +101,8 @@ class Weighing(Module):
         return _combine_voltages(self, voltages)
 
 
-@either_engine
-def _combine_voltages(weighing: Weighing, voltages) -> Data:
+@numpy_or_compiled
+def _combine_voltages(weighing: ChannelWeighting, voltages) -> Data:
     estimate = weighing.estimator @ voltages
     weighted_estimate = weighing.weight * estimate
     unexplained_sum = (
@@ -112,18 +112,18 @@ def _combine_voltages(weighing: Weighing, voltages) -> Data:
     return Data(estimate, *weights_and_covariances, namespace(weighing, voltages).maximum(unexplained_sum, 0))
 
 
-@either_engine
-def _compute_weighing(combination, noise) -> Weighing:
+@numpy_or_compiled
+def _compute_weighing(combination, noise) -> ChannelWeighting:
     weighted = combination / noise[:, None]
     precision = weighted.T @ weighted
     weight = namespace(precision).sqrt(precision.diagonal())
     precision = precision / (weight * weight[:, None])
     covariance = symmetric_inverse(precision)
     estimator = (covariance / weight[:, None]) @ (weighted / weight / noise[:, None]).T
-    return Weighing(noise, estimator, weight, covariance, precision)
+    return ChannelWeighting(noise, estimator, weight, covariance, precision)
 
 
-@either_engine
+@numpy_or_compiled
 def relative_noise(
     voltages: Float[Array, " M"], mask: Bool[Array, " M"] | None = None, *, relative: float = 0.01, floor: float = 0.3
 ) -> Float[Array, " M"]:

@@ -52,13 +52,13 @@ class DirectProblem(Module):
     def reconstruction(self, hyperparameter) -> Float[Array, "m M"]:
         """Reconstruction matrix R_λ (m, M) for whitened data."""
         data_covariance = self.jacobian @ self.product
-        damped_covariance = (data_covariance + adjoint(data_covariance)) / 2 + hyperparameter**2 * jnp.eye(
+        regularised_covariance = (data_covariance + adjoint(data_covariance)) / 2 + hyperparameter**2 * jnp.eye(
             len(data_covariance)
         )
         inverse = (
-            jnp.linalg.inv(damped_covariance)
-            if jnp.iscomplexobj(damped_covariance)
-            else symmetric_inverse(damped_covariance)
+            jnp.linalg.inv(regularised_covariance)
+            if jnp.iscomplexobj(regularised_covariance)
+            else symmetric_inverse(regularised_covariance)
         )
         matrix = self.product @ inverse
         if self.null_space.shape[1]:
@@ -120,9 +120,11 @@ class Linearisation(Module):
                 model, conductivity, channels, (root_weight[:, None] * directions).T
             )
             product = prior.covariance_product(model.mesh, reduced_jacobian.conj())
-            num_redundant = model.protocol.repeated_facts(channels)
+            num_redundant_channels = model.protocol.repeated_facts(channels)
             null_space = prior.null_space(model.mesh)
-            spectrum = Spectrum.create(reduced_jacobian, product, null_space, as_array(directions), num_redundant)
+            spectrum = Spectrum.create(
+                reduced_jacobian, product, null_space, as_array(directions), num_redundant_channels
+            )
         else:
             jacobian = model.jacobian(conductivity)
             directions = _traced_directions(model.protocol, channels, root_weight)

@@ -35,18 +35,18 @@ from jeit.inverse.channels import IndependentChannels, relative_noise
 from jeit.inverse.nonlinear.problem import check_frame
 from jeit.mesh import Mesh
 from jeit_solvers import Descent, QuadraticModel, ridge_model
-from jeit_solvers.engines import Recent, as_array, on_host
+from jeit_solvers.engines import RecentResultsCache, as_array, on_host
 
 # Prior standard deviations: of the logarithm of each contact impedance, of the common part of these logarithms, and of
 # the logarithm of the conductivity about the value that best fits the described model.
-_OWN_CONTACT_DEVIATION, _COMMON_CONTACT_DEVIATION, _CONDUCTIVITY_DEVIATION = 1.0, 4.0, 2.0
+_INDIVIDUAL_CONTACT_DEVIATION, _COMMON_CONTACT_DEVIATION, _CONDUCTIVITY_DEVIATION = 1.0, 4.0, 2.0
 # Maximum numbers of steps of the two fits, before and after κ is estimated, and the tolerance of their cost, by
 # dimension of the mesh. A step in a solid takes a second.
 _MAX_STEPS, _RTOL = {2: (40, 40), 3: (5, 3)}, {2: 1e-4, 3: 3e-3}
 # Default standard deviation of electrode positions, as a share of the width of the body: 2° of a disk.
-_DEFAULT_POSITION = 0.0175
+_RELATIVE_POSITION_DEVIATION = 0.0175
 # Minimum of κ, the noise in units of `relative_noise`: 0.1 means 0.1 % of a voltage.
-_MIN_NOISE = 0.1
+_MIN_RELATIVE_NOISE = 0.1
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Uncertainty:
         """`position`, or its default on a mesh, metres."""
         if self.position is not None:
             return float(self.position)
-        return _DEFAULT_POSITION * float(np.ptp(np.asarray(mesh.points), axis=0).max())
+        return _RELATIVE_POSITION_DEVIATION * float(np.ptp(np.asarray(mesh.points), axis=0).max())
 
 
 class Placement(NamedTuple):
@@ -224,7 +224,7 @@ class _PlacementProblem:
     def __init__(self, model: ForwardModel, measured: np.ndarray, used: np.ndarray, deviation: float):
         self.described_model, self.mesh, self.protocol = model, on_host(model.mesh), on_host(model.protocol)
         # A fit ends at a point that it has already computed.
-        self.at, self.jacobian = Recent(self._model_at), Recent(self._jacobian)
+        self.at, self.jacobian = RecentResultsCache(self._model_at), RecentResultsCache(self._jacobian)
         self.used = used
         self.measured = measured
         self.num_independent = len(IndependentChannels.create(self.protocol).index)
@@ -236,7 +236,7 @@ class _PlacementProblem:
         if not unit_voltages @ measured[self.used] > 0:
             raise ValueError("voltages: they have the opposite sign of the model's.")
         self.log_conductivity = float(np.log(unit_voltages @ unit_voltages / (unit_voltages @ measured[self.used])))
-        contact_covariance = _OWN_CONTACT_DEVIATION**2 * np.eye(num_electrodes) + _COMMON_CONTACT_DEVIATION**2
+        contact_covariance = _INDIVIDUAL_CONTACT_DEVIATION**2 * np.eye(num_electrodes) + _COMMON_CONTACT_DEVIATION**2
         self.spread = np.zeros((1 + num_electrodes * (num_directions + 1),) * 2)
         self.spread[0, 0] = _CONDUCTIVITY_DEVIATION
         shift_indices = np.arange(1, 1 + num_electrodes * num_directions)
@@ -292,14 +292,16 @@ class _PlacementProblem:
         """
         residual, rows = self._residual(point), self.jacobian(point)
         num_independent = min(self.num_independent, len(residual))
-        independent_share = num_independent / len(residual)
+        independent_data_share = num_independent / len(residual)
         # Computed from eigenvalues, the covariance stays positive definite where rounding makes the Hessian's inverse
         # indefinite.
         eigenvalues, eigenvectors = np.linalg.eigh(rows.T @ rows)
         eigenvalues = np.maximum(eigenvalues, 0)
         num_fitted = np.sum(eigenvalues / (eigenvalues + scale**2))
         degrees_of_freedom = max(num_independent - num_fitted, 0.3 * num_independent)
-        scale = max(_MIN_NOISE, float(np.sqrt(independent_share * (residual @ residual) / degrees_of_freedom)))
+        scale = max(
+            _MIN_RELATIVE_NOISE, float(np.sqrt(independent_data_share * (residual @ residual) / degrees_of_freedom))
+        )
         return scale, (eigenvectors / (1 + eigenvalues / scale**2)) @ eigenvectors.T
 
     def factor(self, covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "q q"]:

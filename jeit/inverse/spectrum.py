@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jeit_solvers import symmetric_eigen
-from jeit_solvers.engines import adjoint, either_engine, evaluate_in_numpy, has_values, host, namespace
+from jeit_solvers.engines import adjoint, evaluate_in_numpy, has_values, host, namespace, numpy_or_compiled
 from jeit_solvers.module import Module
 
 # Approximate number of cells over which an image is averaged.
@@ -36,8 +36,8 @@ class Spectrum(Module):
     """Eigendecomposition of the data-space system, in the notation of `jeit.inverse.spectrum`.
 
     **Fields**: `basis` (M, k): QU; `eigenvalues` (k,): Λ; `directions` (M, r): D; `reduced` (r, m): G; `images` (m, r):
-    ΓGᵀ; `null_space` (m, p): N; `seen` (M, p): B = JN; `outer` (M, M): JΓJᵀ; `repeated`: number of data components
-    without information because readings are repeated, see `Protocol.repeated_facts`.
+    ΓGᵀ; `null_space` (m, p): N; `observed_null_space` (M, p): B = JN; `outer` (M, M): JΓJᵀ; `repeated`: number of data
+    components without information because readings are repeated, see `Protocol.repeated_facts`.
     """
 
     basis: Float[Array, "M k"]
@@ -46,7 +46,7 @@ class Spectrum(Module):
     reduced: Float[Array, "r m"]
     images: Float[Array, "m r"]
     null_space: Float[Array, "m p"]
-    seen: Float[Array, "M p"]
+    observed_null_space: Float[Array, "M p"]
     outer: Float[Array, "M M"]
     repeated: int = eqx.field(static=True, default=0)
 
@@ -128,7 +128,7 @@ class Spectrum(Module):
         return candidates**2 * np.sqrt(damped.sum(axis=1)), np.sqrt(damped @ eigenvalues)
 
 
-@either_engine
+@numpy_or_compiled
 def _decompose(jacobian, product, null_space, directions):
     xp = namespace(jacobian, product, null_space)
     data_covariance = directions @ (jacobian @ product) @ directions.T
@@ -142,7 +142,7 @@ def _decompose(jacobian, product, null_space, directions):
     return complement @ vectors, xp.maximum(eigenvalues, 0), null_space_data, data_covariance
 
 
-@either_engine
+@numpy_or_compiled
 def _reconstruction_factors(spectrum: Spectrum, hyperparameter):
     basis, xp = spectrum.basis, namespace(spectrum)
     inverse = (basis / (spectrum.eigenvalues + hyperparameter**2)) @ adjoint(basis)
@@ -150,23 +150,23 @@ def _reconstruction_factors(spectrum: Spectrum, hyperparameter):
     if spectrum.null_space.shape[1] == 0:
         return spectrum.images, weights
     # Coefficients of the null space, fitted by least squares to the data that the penalised part does not explain.
-    coefficients = xp.linalg.pinv(spectrum.seen)
+    coefficients = xp.linalg.pinv(spectrum.observed_null_space)
     unexplained = np.eye(basis.shape[0]) - spectrum.outer @ inverse
     images = xp.concatenate([spectrum.images, spectrum.null_space], axis=1)
     return images, xp.concatenate([weights, coefficients @ unexplained])
 
 
-@either_engine
+@numpy_or_compiled
 def _spectrum_image(spectrum: Spectrum, data, hyperparameter):
     dual_image = spectrum.basis @ ((adjoint(spectrum.basis) @ data) / (spectrum.eigenvalues + hyperparameter**2))
     image = spectrum.images @ (spectrum.directions.T @ dual_image)
     if spectrum.null_space.shape[1] == 0:
         return image
-    null_space_weights = namespace(spectrum).linalg.pinv(spectrum.seen)
+    null_space_weights = namespace(spectrum).linalg.pinv(spectrum.observed_null_space)
     return image + spectrum.null_space @ (null_space_weights @ (data - spectrum.outer @ dual_image))
 
 
-@either_engine
+@numpy_or_compiled
 def _modes(spectrum: Spectrum):
     images, weights = _mode_factors(spectrum)
     return images @ weights
@@ -176,7 +176,7 @@ def _mode_factors(spectrum: Spectrum):
     weights, xp = spectrum.directions.T @ spectrum.basis, namespace(spectrum)
     if spectrum.null_space.shape[1] == 0:
         return spectrum.images, weights
-    null_space_weights = xp.linalg.pinv(spectrum.seen) @ (spectrum.outer @ spectrum.basis)
+    null_space_weights = xp.linalg.pinv(spectrum.observed_null_space) @ (spectrum.outer @ spectrum.basis)
     return xp.concatenate([spectrum.images, -spectrum.null_space], axis=1), xp.concatenate(
         [weights, null_space_weights]
     )

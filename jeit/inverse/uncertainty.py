@@ -35,7 +35,7 @@ from jeit.inverse.prior.bases import expand_rows
 from jeit.inverse.prior.penalties import AbstractNormal
 from jeit.mesh import measures
 from jeit_solvers import Status
-from jeit_solvers.engines import as_array, either_engine, has_values, namespace, on_host
+from jeit_solvers.engines import as_array, has_values, namespace, numpy_or_compiled, on_host
 from jeit_solvers.module import Module
 
 # Number of rows, each of the size of an image, that are computed at a time.
@@ -188,7 +188,7 @@ def _data_space_matrices(inversion: Inversion, coefficients):
     return jacobian, cross_covariance, cross_covariance @ jacobian.T + inversion.data.covariance, normal
 
 
-@either_engine
+@numpy_or_compiled
 def _sample_estimates(posterior: Posterior):
     """Posterior mean of the image x, including unknowns that change the image, and its standard deviation, per cell, on
     the link's scale.
@@ -215,7 +215,7 @@ def _sample_estimates(posterior: Posterior):
     return estimate, xp.sqrt(xp.maximum(variance, 0))
 
 
-@either_engine
+@numpy_or_compiled
 def _weighted_mean(posterior: Posterior, weight):
     """Sum of the cells' conductivities weighted with `weight` (m,), and the posterior standard deviation of the sum."""
     inversion, coefficients, xp = posterior.inversion, posterior.coefficients, namespace(posterior, weight)
@@ -233,12 +233,12 @@ def _weighted_mean(posterior: Posterior, weight):
     return weight @ inversion.link.conductivity(estimate), xp.sqrt(xp.maximum(variance, 0))
 
 
-@either_engine
+@numpy_or_compiled
 def _draw_samples(posterior: Posterior, prior_draws, noise_draws):
     """Sample conductivities from the posterior: c = ĉ + z - Q⁻¹Jᵀ(JQ⁻¹Jᵀ + C)⁻¹(Jz + e), where z is drawn from the
     prior and e from the noise."""
     inversion, inverse_root, xp = posterior.inversion, posterior.root, namespace(posterior, prior_draws)
-    prior_samples = posterior.prior.drawn(prior_draws.T).T
+    prior_samples = posterior.prior.draw_samples(prior_draws.T).T
     data_samples = prior_samples @ posterior.jacobian.T + noise_draws @ xp.linalg.cholesky(inversion.data.covariance).T
     samples = prior_samples - (data_samples @ inverse_root.T @ inverse_root) @ posterior.cross
     return xp.stack([inversion.conductivity(sample) for sample in posterior.coefficients + samples])

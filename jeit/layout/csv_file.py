@@ -25,7 +25,7 @@ _LENGTH_COLUMNS = ("x", "y", "z", "diameter")
 # Title of a column of lengths with its unit: "x_mm", "x [mm]", "x (mm)" or "xmm".
 _LENGTH_TITLE = re.compile(rf"({'|'.join(_LENGTH_COLUMNS)})[ _]*[\[(]?({'|'.join(_UNITS)})[\])]?")
 _LABEL_COLUMN, _IMPEDANCE_COLUMN = "label", "contact_impedance_ohm_m2"
-MOST_BYTES = 2**24
+MAX_FILE_BYTES = 2**24
 """Maximum size of a layout file in bytes: reading a larger file would take more than a minute."""
 
 
@@ -143,7 +143,7 @@ def _check_unit(centres: np.ndarray, diameters: np.ndarray, titles: list[str]) -
 def _read_lines(path: Path, length_columns: Sequence[str]) -> list[tuple[int, str]]:
     """Read the lines that are neither empty nor comments, with their numbers from 1."""
     try:
-        text = read_text(path, encoding="utf-8-sig", max_bytes=MOST_BYTES)
+        text = read_text(path, encoding="utf-8-sig", max_bytes=MAX_FILE_BYTES)
     except UnicodeError:
         raise ValueError("this is not a text file in UTF-8; in the spreadsheet, save it as 'CSV UTF-8'.") from None
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)]

@@ -10,9 +10,9 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from jeit.arguments import names_text
-from jeit.arguments.extras import optional
+from jeit.arguments.extras import import_optional
 from jeit.files import check_electrodes, check_size, read_as
-from jeit.layout.csv_file import MOST_BYTES
+from jeit.layout.csv_file import MAX_FILE_BYTES
 from jeit.layout.layout import Layout
 from jeit.mesh import Disk, Domain, Polygon
 
@@ -29,7 +29,7 @@ def write_dxf(layout: Layout, file: BinaryIO) -> None:
 
     Raises `ImportError` if the extra `cad` is not installed.
     """
-    ezdxf = optional("ezdxf", *_EXTRA_TEXTS)
+    ezdxf = import_optional("ezdxf", *_EXTRA_TEXTS)
     drawing = ezdxf.new("R2007")
     drawing.units = ezdxf.units.MM
     for name, colour in _LAYER_COLOURS.items():
@@ -77,12 +77,14 @@ class _Entity(NamedTuple):
 def read_dxf(path: Path, outline: Domain | None) -> Layout:
     """Read an electrode layout from a DXF drawing with the layers that `write_dxf` writes. Raises `ValueError` for an
     invalid drawing, and `ImportError` if the extra `cad` is not installed."""
-    ezdxf = optional("ezdxf", *_EXTRA_TEXTS)
-    check_size(path, MOST_BYTES)
+    ezdxf = import_optional("ezdxf", *_EXTRA_TEXTS)
+    check_size(path, MAX_FILE_BYTES)
     with read_as("this is not a DXF drawing that is read"):
         drawing = ezdxf.readfile(path)
-        units = ezdxf.units
-        unit = units.conversion_factor(units.InsertUnits(drawing.units or units.MM), units.InsertUnits.Meters)
+        ezdxf_units = ezdxf.units
+        unit = ezdxf_units.conversion_factor(
+            ezdxf_units.InsertUnits(drawing.units or ezdxf_units.MM), ezdxf_units.InsertUnits.Meters
+        )
         model_space = [(entity.dxf.layer, entity) for entity in drawing.modelspace()]
         layer_entities = {
             name: [entity for layer, entity in model_space if layer.upper() == name] for name in _LAYER_COLOURS
@@ -162,7 +164,7 @@ def _polyline_vertices(entity: _Entity) -> np.ndarray:
     if entity.has_arcs:
         raise ValueError(f"there is a polyline with arcs {remedy}")
     loop = entity.loop
-    is_closing = len(loop) > 3 and np.allclose(loop[0], loop[-1], rtol=0, atol=1e-9 * np.ptp(loop))
-    if not (entity.closed or is_closing):
+    repeats_first_vertex = len(loop) > 3 and np.allclose(loop[0], loop[-1], rtol=0, atol=1e-9 * np.ptp(loop))
+    if not (entity.closed or repeats_first_vertex):
         raise ValueError(f"there is an open polyline {remedy}")
-    return loop[:-1] if is_closing else loop
+    return loop[:-1] if repeats_first_vertex else loop

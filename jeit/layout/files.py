@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jeit.files import written_whole
+from jeit.files import atomically_written_file
 from jeit.layout.csv_file import read_csv, write_csv
 from jeit.layout.dxf_file import read_dxf, write_dxf
 from jeit.layout.layout import Layout
@@ -99,7 +99,7 @@ def write_layout(layout: Layout | SurfaceLayout, path: str | Path) -> None:
     if not isinstance(layout, Layout | SurfaceLayout):
         raise ValueError(f"layout must be a Layout, not {type(layout).__name__}; see jeit.layout.Layout.")
     try:
-        with written_whole(path) as file:
+        with atomically_written_file(path) as file:
             writer(layout, file)
     except OSError as error:
         raise ValueError(f"path: {path} cannot be written: {error.strerror}. Is there such a folder?") from None

@@ -41,7 +41,7 @@ def check_labels(labels: Sequence[str] | None, num_electrodes: int) -> tuple[str
 MIN_SKIN_SIZE, MAX_SKIN_SIZE = 1e-3, 5.0  # m
 # Tolerance for discs that overlap or extend beyond the outline, since lengths are rounded to decimal millimetres in
 # files.
-_ROUNDING = 1e-9  # m
+_ROUNDING_TOLERANCE = 1e-9  # m
 
 
 class Layout(Module):
@@ -166,9 +166,9 @@ def check_discs_fit(
     check_size(size)
     gaps = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
     np.fill_diagonal(gaps, np.inf)
-    if gaps.min() < -_ROUNDING:
+    if gaps.min() < -_ROUNDING_TOLERANCE:
         first_electrode, second_electrode = map(int, np.unravel_index(gaps.argmin(), gaps.shape))
-        is_same_place = np.linalg.norm(centres[first_electrode] - centres[second_electrode]) < _ROUNDING
+        is_same_place = np.linalg.norm(centres[first_electrode] - centres[second_electrode]) < _ROUNDING_TOLERANCE
         fault = "are at the same place" if is_same_place else f"overlap by {-1e3 * gaps.min():.3g} mm"
         raise ValueError(
             f"centres: {disc_names[first_electrode]} and {disc_names[second_electrode]} {fault}; remove one or "
@@ -178,7 +178,7 @@ def check_discs_fit(
         return
     clearances = np.asarray(outline.signed_distance(centres)) - diameters / 2
     electrode_index = int(clearances.argmin())
-    if clearances[electrode_index] < -_ROUNDING:
+    if clearances[electrode_index] < -_ROUNDING_TOLERANCE:
         unit_hint = ""
         if (np.abs(centres) > MAX_SKIN_SIZE).any() and bool((outline.signed_distance(centres / 1000) > 0).all()):
             unit_hint = " Are they in millimetres? Divide by 1000."
@@ -194,7 +194,7 @@ def check_discs_fit(
 
 def check_size(size: float) -> None:
     """Raise `ValueError` for an implausible `size` of a skin, metres."""
-    if not MIN_SKIN_SIZE - _ROUNDING <= size <= MAX_SKIN_SIZE + _ROUNDING:
+    if not MIN_SKIN_SIZE - _ROUNDING_TOLERANCE <= size <= MAX_SKIN_SIZE + _ROUNDING_TOLERANCE:
         raise ValueError(
             f"centres: the skin would be {_length_text(size)} across; are millimetres taken for metres, or metres for "
             "millimetres? Lengths differ by a factor of 1000."

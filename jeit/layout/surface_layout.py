@@ -24,7 +24,7 @@ from jeit_solvers.module import Module
 # Minimum number of nodes of a surface per electrode position: a coarser surface is refined by dividing its triangles.
 _MIN_NODES_PER_POSITION = 30
 # Number of nodes from which the surface is not refined any further.
-_MAX_NODES = 60_000
+_MAX_REFINED_NODES = 60_000
 # Number of electrode positions above which paths between neighbouring positions are nearly straight: the nearest
 # position is then found by the distance in space and the direction of the normal.
 _MAX_GEODESIC_POSITIONS = 128
@@ -63,7 +63,7 @@ def spread(
     """
     check_count(number, 1)
     triangles = surface if isinstance(surface, Triangles) else Triangles.of(surface, face)
-    while len(triangles.points) < min(_MIN_NODES_PER_POSITION * number, _MAX_NODES):
+    while len(triangles.points) < min(_MIN_NODES_PER_POSITION * number, _MAX_REFINED_NODES):
         triangles = triangles.finer()
     weight = triangles.node_areas * (triangles.distance_to_border(triangles.points) >= margin)
     usable = np.flatnonzero(weight > 0)
@@ -120,7 +120,7 @@ def _initial_nodes(geodesics: Geodesics, usable: np.ndarray, weight: np.ndarray,
 
 
 # Overlap of two discs that is tolerated.
-_ROUNDING = 1e-9  # m
+_OVERLAP_TOLERANCE = 1e-9  # m
 
 
 class SurfaceLayout(Module):
@@ -249,7 +249,7 @@ def _check_no_overlap(centres: np.ndarray, diameters: np.ndarray, labels: Sequen
     hardly differ from distances along the surface."""
     gaps = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
     np.fill_diagonal(gaps, np.inf)
-    if gaps.min() < -_ROUNDING:
+    if gaps.min() < -_OVERLAP_TOLERANCE:
         first_electrode, second_electrode = map(int, np.unravel_index(gaps.argmin(), gaps.shape))
         raise ValueError(
             f"centres: electrode {first_electrode + 1} ('{labels[first_electrode]}') and electrode "

@@ -13,16 +13,16 @@ import numpy as np
 
 from jeit.arguments import describe
 from jeit.files import check_electrodes, check_size, read_as
-from jeit.layout.csv_file import MOST_BYTES, millimetres
+from jeit.layout.csv_file import MAX_FILE_BYTES, millimetres
 from jeit.layout.layout import Layout
 from jeit.mesh import Disk, Domain, Polygon
 
 # Pattern of a number. Its quantifiers are possessive, so that a text that is not a number is rejected in one pass,
 # however long it is.
-NUMBER = r"[-+]?+(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?+\d++)?+"
+NUMBER_PATTERN = r"[-+]?+(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?+\d++)?+"
 # Maximum number in a drawing, so that its square can still be computed after transforms.
 MAX_NUMBER = 1e30
-ROUND_TAGS = ("circle", "ellipse")
+CIRCLE_AND_ELLIPSE_TAGS = ("circle", "ellipse")
 
 
 def read_transform(element: ElementTree.Element) -> np.ndarray:
@@ -84,7 +84,7 @@ def describe_element(element: ElementTree.Element) -> str:
 
 def parse_number(element: ElementTree.Element, name: str, text: str | None) -> float:
     """Convert `text`, the value of the attribute `name`, to a number. Raises `ValueError` if `text` is not a number."""
-    if text is None or re.fullmatch(NUMBER, text.strip()) is None:
+    if text is None or re.fullmatch(NUMBER_PATTERN, text.strip()) is None:
         raise ValueError(f"{name} of {describe_element(element)} is {describe(text)}, not a number.")
     value = float(text)
     if not abs(value) < MAX_NUMBER:
@@ -95,7 +95,7 @@ def parse_number(element: ElementTree.Element, name: str, text: str | None) -> f
 def read_disc(element: ElementTree.Element, matrix: np.ndarray) -> tuple[float, float, float]:
     """Centre and radius of a circle in metres, with y up. `matrix`: matrix (2, 3) to metres. Raises `ValueError` if the
     element is not a circle."""
-    if local_tag(element) not in ROUND_TAGS:
+    if local_tag(element) not in CIRCLE_AND_ELLIPSE_TAGS:
         raise ValueError(f"{describe_element(element)} stands where a circle should: electrodes are circles.")
     x, y = (parse_number(element, name, element.get(name, "0")) for name in ("cx", "cy"))
     names = ("r", "r") if local_tag(element) == "circle" else ("rx", "ry")
@@ -136,20 +136,22 @@ def read_loops(element: ElementTree.Element) -> list[np.ndarray]:
 
 def _path_loops(element: ElementTree.Element) -> list[np.ndarray]:
     text = element.get("d", "")
-    if re.fullmatch(rf"(?:[MmLlHhVvZz]|{NUMBER}|[\s,])*+", text) is None or not text.strip():
+    if re.fullmatch(rf"(?:[MmLlHhVvZz]|{NUMBER_PATTERN}|[\s,])*+", text) is None or not text.strip():
         raise ValueError(f"{describe_element(element)} has curves, or is no path; draw the skin with straight sides.")
     loops: list[tuple[list[np.ndarray], bool]] = []
     position = np.zeros(2)
-    for letter, argument_text in re.findall(r"([MmLlHhVvZz])([^MmLlHhVvZz]*)", text):
-        numbers = [parse_number(element, "d", number) for number in re.findall(NUMBER, argument_text)]
-        kind, relative = letter.upper(), letter.islower()
+    for command_letter, argument_text in re.findall(r"([MmLlHhVvZz])([^MmLlHhVvZz]*)", text):
+        numbers = [parse_number(element, "d", number) for number in re.findall(NUMBER_PATTERN, argument_text)]
+        kind, relative = command_letter.upper(), command_letter.islower()
         size = {"H": 1, "V": 1}.get(kind, 2)
         if kind == "Z" and loops:
             loops[-1] = (loops[-1][0], True)
             position = loops[-1][0][0]
             continue
         if kind == "Z" or not numbers or len(numbers) % size or (kind != "M" and not loops):
-            raise ValueError(f"d of {describe_element(element)} is not a path: {letter}{argument_text.strip()[:40]}.")
+            raise ValueError(
+                f"d of {describe_element(element)} is not a path: {command_letter}{argument_text.strip()[:40]}."
+            )
         for number_index in range(0, len(numbers), size):
             origin = (
                 position if relative else np.array({"H": [0, position[1]], "V": [position[0], 0]}.get(kind, [0, 0]))
@@ -169,10 +171,10 @@ def _path_loops(element: ElementTree.Element) -> list[np.ndarray]:
 
 def _closed_loop(element: ElementTree.Element, loop: np.ndarray, closed: bool) -> np.ndarray:
     """Vertices of a loop without a repetition of the first vertex. Raises `ValueError` if the loop is not closed."""
-    is_repeated = len(loop) > 3 and np.allclose(loop[0], loop[-1], rtol=0, atol=1e-6 * np.ptp(loop))
-    if not (closed or is_repeated):
+    repeats_first_vertex = len(loop) > 3 and np.allclose(loop[0], loop[-1], rtol=0, atol=1e-6 * np.ptp(loop))
+    if not (closed or repeats_first_vertex):
         raise ValueError(f"{describe_element(element)} is not closed; close the skin's outline.")
-    return loop[:-1] if is_repeated else loop
+    return loop[:-1] if repeats_first_vertex else loop
 
 
 _SVG_NAMESPACE = "http://www.w3.org/2000/svg"
@@ -190,9 +192,9 @@ def write_svg(layout: Layout, file: BinaryIO) -> None:
     """Write an electrode layout as an SVG drawing. Layout and drawing have the same origin; the y axis of the drawing
     points down, so y coordinates in the drawing are the negatives of the y coordinates in the layout."""
     x_min, x_max, y_min, y_max = layout.extent
-    view_left, view_top = millimetres(x_min - _MARGIN), millimetres(-y_max - _MARGIN)
+    view_box_left, view_top = millimetres(x_min - _MARGIN), millimetres(-y_max - _MARGIN)
     width, height = millimetres(x_max - x_min + 2 * _MARGIN), millimetres(y_max - y_min + 2 * _MARGIN)
-    size = {"width": f"{width}mm", "height": f"{height}mm", "viewBox": f"{view_left} {view_top} {width} {height}"}
+    size = {"width": f"{width}mm", "height": f"{height}mm", "viewBox": f"{view_box_left} {view_top} {width} {height}"}
     root_element = ElementTree.Element("svg", {"xmlns": _SVG_NAMESPACE, **size})
     _add_element(root_element, "title").text = layout.name
     line_style = {"fill": "none", "stroke-width": "0.1"}
@@ -215,23 +217,23 @@ def write_svg(layout: Layout, file: BinaryIO) -> None:
 def read_svg(path: Path, outline: Domain | None) -> Layout:
     """Read an electrode layout from an SVG drawing, written by `write_svg` or by hand. Raises `ValueError` for an
     invalid or ambiguous drawing."""
-    check_size(path, MOST_BYTES)
+    check_size(path, MAX_FILE_BYTES)
     with read_as("this is not an SVG drawing that is read"):
         root = ElementTree.parse(path, ElementTree.XMLParser(target=_Builder())).getroot()
     if root.tag != f"{{{_SVG_NAMESPACE}}}svg":
         raise ValueError(f"this is not an SVG drawing: it begins with <{str(root.tag)[:40]}>.")
     shapes = list(_drawn_shapes(root))
-    roles = {role for _, role, _ in shapes}
+    shape_roles = {role for _, role, _ in shapes}
     labels = [
         "".join(element.itertext()).strip()
         for element, role, _ in shapes
         if role == "LABELS" and local_tag(element) == "text"
     ]
-    electrode_role = "ELECTRODES" if "ELECTRODES" in roles else None
+    electrode_role = "ELECTRODES" if "ELECTRODES" in shape_roles else None
     electrodes = [
         (element, matrix)
         for element, role, matrix in shapes
-        if role == electrode_role and (electrode_role or local_tag(element) in ROUND_TAGS)
+        if role == electrode_role and (electrode_role or local_tag(element) in CIRCLE_AND_ELLIPSE_TAGS)
     ]
     if not electrodes:
         raise ValueError("there is no circle in the drawing; electrodes are circles, in a group ELECTRODES or all.")
@@ -239,10 +241,10 @@ def read_svg(path: Path, outline: Domain | None) -> Layout:
     circles = np.array([read_disc(element, matrix) for element, matrix in electrodes])
     drawn_outline = (
         _create_outline([(element, matrix) for element, role, matrix in shapes if role == "OUTLINE"])
-        if "OUTLINE" in roles
+        if "OUTLINE" in shape_roles
         else None
     )
-    if "OUTLINE" not in roles:
+    if "OUTLINE" not in shape_roles:
         drawn_outline = _single_closed_outline([(element, matrix) for element, role, matrix in shapes if role is None])
     return Layout(
         circles[:, :2], 2 * circles[:, 2], outline=drawn_outline or outline, labels=labels or None, name=path.stem
@@ -320,7 +322,7 @@ def _matrix_to_metres(root_element: ElementTree.Element) -> np.ndarray:
     ]
     scales = []
     for name, view_box_sizes in (("width", box[2:3]), ("height", box[3:4])):
-        size = re.fullmatch(rf"({NUMBER})\s*({'|'.join(_UNITS)})", root_element.get(name, "").strip())
+        size = re.fullmatch(rf"({NUMBER_PATTERN})\s*({'|'.join(_UNITS)})", root_element.get(name, "").strip())
         if size is None:
             raise ValueError(
                 f"{name} is {describe(root_element.get(name))}, which says no length; set the document's size in mm "
@@ -346,7 +348,7 @@ def _style(element: ElementTree.Element) -> str:
 def _create_outline(drawn_shapes: list[tuple[ElementTree.Element, np.ndarray]]) -> Domain:
     """Outline from the content of the group OUTLINE: a single circle, or shapes with straight sides, of which the
     largest is the skin and others are holes."""
-    if len(drawn_shapes) == 1 and local_tag(drawn_shapes[0][0]) in ROUND_TAGS:
+    if len(drawn_shapes) == 1 and local_tag(drawn_shapes[0][0]) in CIRCLE_AND_ELLIPSE_TAGS:
         x, y, radius = read_disc(*drawn_shapes[0])
         return Disk(radius, (x, y))
     loops = [transform_points(loop, matrix) for element, matrix in drawn_shapes for loop in read_loops(element)]

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
-from jeit.arguments.extras import optional
+from jeit.arguments.extras import import_optional
 from jeit.data.formats.lines import LineBuffer, LineParser
 from jeit.live.pictures import LiveFrame
 from jeit.live.sources import CONNECTED, ENDED, AbstractSource
@@ -91,7 +91,7 @@ class SerialPort(AbstractConnection):
 
     def __init__(self, port: str, baud: int = _DEFAULT_BAUD):
         self.port, self.baud = port, baud
-        self.serial = optional("serial", "a serial device")
+        self.serial = import_optional("serial", "a serial device")
         self.device: Any = None
 
     def open(self) -> None:
@@ -165,10 +165,10 @@ def open_connection(text: str) -> AbstractConnection:
 
     Raises `ValueError` for other texts, and `ImportError` for a serial device without pyserial.
     """
-    kind, _, address = text.partition(":")
+    connection_kind, _, address = text.partition(":")
     if text == "-":
         return StandardInput()
-    if kind == "serial":
+    if connection_kind == "serial":
         port, _, baud = (address if "@" in address else f"{address}@{_DEFAULT_BAUD}").rpartition("@")
         if not port or not (baud.isascii() and baud.isdigit() and 0 < len(baud) < 9 and 0 < int(baud) <= _MAX_BAUD):
             raise ValueError(
@@ -232,23 +232,23 @@ class LineSource(AbstractSource):
 
     def _read_until_lost(self) -> Iterator[LiveFrame]:
         """Yield frames until the connection is lost, the source has ended, or the source is closed."""
-        buffer, last_arrival, is_first_line = LineBuffer(), time.monotonic(), self.device.reconnects
+        buffer, time_of_last_bytes, is_first_line = LineBuffer(), time.monotonic(), self.device.reconnects
         while not self.closing.is_set():
             try:
                 received_bytes = self.device.read(_READ_TIMEOUT)
             except OSError as error:
-                loss_reason = str(error)
+                disconnection_reason = str(error)
                 break
             arrival_time = time.monotonic()
             if received_bytes is None:
-                loss_reason = "the other side has closed the connection"
+                disconnection_reason = "the other side has closed the connection"
                 break
             if received_bytes:
-                last_arrival, self.connection = arrival_time, CONNECTED
+                time_of_last_bytes, self.connection = arrival_time, CONNECTED
                 for line in buffer.add_bytes(received_bytes):
                     yield from self._parse_line(line, arrival_time, is_first_line=is_first_line)
                     is_first_line = False
-            elif arrival_time - last_arrival > _SILENCE_TIMEOUT and self.connection == CONNECTED:
+            elif arrival_time - time_of_last_bytes > _SILENCE_TIMEOUT and self.connection == CONNECTED:
                 self.connection = "waiting: the device sends nothing"
                 self.say("The device is connected and sends nothing.")
         else:
@@ -256,8 +256,8 @@ class LineSource(AbstractSource):
         self.device.close()
         last_line = buffer.take_incomplete_line()
         if self.device.reconnects:
-            self.connection = f"waiting: {loss_reason}"[:300]
-            self.say(f"Connection lost: {loss_reason}.")
+            self.connection = f"waiting: {disconnection_reason}"[:300]
+            self.say(f"Connection lost: {disconnection_reason}.")
             if last_line.strip():
                 yield self.frame(f"cut off: {last_line[:200].decode('utf-8', 'replace')}")
         elif last_line.strip():  # the last line of a file may have no line end
@@ -277,11 +277,11 @@ class LineSource(AbstractSource):
             self.say(parser_note if values is not None else f"The device sends: {parser_note}")
         if values is None:
             return
-        if is_first_line and not isinstance(values, str) and not self.reading.begins_whole(values):
+        if is_first_line and not isinstance(values, str) and not self.reading.starts_with_complete_number(values):
             values = f"begun before connecting: {line[:200].decode('utf-8', 'replace')}"
         if self.rate is not None:
-            due_time = self.begun + self._num_frames / self.rate
-            if self.closing.wait(max(0.0, due_time - time.monotonic())):
+            scheduled_time = self.begun + self._num_frames / self.rate
+            if self.closing.wait(max(0.0, scheduled_time - time.monotonic())):
                 return
             arrival_time = time.monotonic()
         yield self.frame(values, arrival_time)

@@ -29,7 +29,7 @@ _MIN_FRAMES, _MAX_FRAMES = 3, 10_000
 _POLL_PERIOD = 0.3
 # Time in seconds, from the arrival of the first frame, in which frames are attributed to lines that were sent before
 # the program could read them.
-_BURST_TIME = 0.05
+_INITIAL_BURST_DURATION = 0.05
 
 
 class Prepared(NamedTuple):
@@ -162,24 +162,24 @@ def first_frames(
 
 
 @contextmanager
-def _report_connection(source: AbstractSource, task: str, report: Callable[[str], None]) -> Iterator[None]:
-    """Context that reports the name of a `task`, and each change of the state of the source's connection."""
-    done_event = threading.Event()
+def _report_connection(source: AbstractSource, task_name: str, report: Callable[[str], None]) -> Iterator[None]:
+    """Context that reports the name of a `task_name`, and each change of the state of the source's connection."""
+    end_event = threading.Event()
 
     def report_changes() -> None:
         last_state = CONNECTED
-        while not done_event.wait(_POLL_PERIOD):
+        while not end_event.wait(_POLL_PERIOD):
             if source.connection != last_state:
                 last_state = source.connection
-                report(task if last_state == CONNECTED else last_state)
+                report(task_name if last_state == CONNECTED else last_state)
 
-    report(task)
+    report(task_name)
     thread = threading.Thread(target=report_changes, daemon=True)
     thread.start()
     try:
         yield
     finally:
-        done_event.set()
+        end_event.set()
         thread.join()
 
 
@@ -213,8 +213,8 @@ def _read_first_frames(
 def _arrival_rate(frames: list[LiveFrame]) -> float | None:
     """Rate of arrival in frames/s, without the first frames, which arrived all at once; None if all frames arrived at
     once."""
-    arrivals = np.array([frame.arrived for frame in frames])
-    later_arrivals = arrivals[arrivals > (arrivals[:1] + _BURST_TIME)]
+    arrival_times = np.array([frame.arrived for frame in frames])
+    later_arrivals = arrival_times[arrival_times > (arrival_times[:1] + _INITIAL_BURST_DURATION)]
     return (
         (len(later_arrivals) - 1) / (later_arrivals[-1] - later_arrivals[0])
         if len(later_arrivals) > 2 and later_arrivals[-1] > later_arrivals[0]

@@ -18,18 +18,19 @@ from jeit.live.pictures import LiveFrame
 _NUM_FRAMES, _MIN_FRAMES = 32, 8
 # Number of successive medians over the latest frames that are stored to detect drift.
 _NUM_MEDIANS = 40
-# A reading is lost if it is missing, or if its relative difference from the reference exceeds `_LOST_DIFFERENCE`. An
-# electrode is dead if at least the fraction `_DEAD_SHARE` of its readings is lost, not counting readings on other dead
-# electrodes. An electrode drifts if the median relative difference of its readings exceeds `_DRIFT_DIFFERENCE`, and
-# also `_DRIFT_RATIO` times the median difference of all other readings.
-_LOST_DIFFERENCE, _DEAD_SHARE, _DRIFT_DIFFERENCE, _DRIFT_RATIO = 0.5, 0.7, 0.05, 3.0
+# A reading is lost if it is missing, or if its relative difference from the reference exceeds
+# `_LOST_READING_DIFFERENCE`. An electrode is dead if at least the fraction `_DEAD_ELECTRODE_LOST_SHARE` of its readings
+# is lost, not counting readings on other dead electrodes. An electrode drifts if the median relative difference of its
+# readings exceeds `_MIN_DRIFT_DIFFERENCE`, and also `_MIN_DRIFT_RATIO` times the median difference of all other
+# readings.
+_LOST_READING_DIFFERENCE, _DEAD_ELECTRODE_LOST_SHARE, _MIN_DRIFT_DIFFERENCE, _MIN_DRIFT_RATIO = 0.5, 0.7, 0.05, 3.0
 # The frames of a reference are divided into parts, whose means are compared. Number of parts; minimum number of frames
 # of a part; ratio of the deviation of the means to the deviation expected from noise, above which the sensor is
 # considered disturbed.
-_NUM_PARTS, _MIN_PART_FRAMES, _DISTURBANCE_RATIO = 4, 2, 4.0
+_NUM_PARTS, _MIN_PART_FRAMES, _MIN_DISTURBANCE_RATIO = 4, 2, 4.0
 # Factor by which the frame rate must change for a report, and number of successive calls for which the change must
 # last.
-_MIN_RATE_RATIO, _NUM_RATE_CALLS = 1.4, 3
+_MIN_RATE_CHANGE_FACTOR, _NUM_CALLS_WITH_CHANGED_RATE = 1.4, 3
 
 
 @dataclass(frozen=True)
@@ -53,14 +54,16 @@ def change_during(frames: Float[np.ndarray, "N M"]) -> float | None:
     frames = np.asarray(frames, float)[:, np.isfinite(frames).all(axis=0)]
     if len(frames) < _NUM_PARTS * _MIN_PART_FRAMES:
         return None
-    part_deviations = np.array([part.mean(axis=0) for part in np.array_split(frames, _NUM_PARTS)]) - frames.mean(axis=0)
+    deviations_of_parts = np.array([part.mean(axis=0) for part in np.array_split(frames, _NUM_PARTS)]) - frames.mean(
+        axis=0
+    )
     noise = (np.diff(frames, axis=0) ** 2).mean(axis=0).sum() / 2
     # A change smaller than the noise of a frame, such as a slow drift over thousands of frames, is harmless.
-    if not (part_deviations**2).sum() > (_NUM_PARTS - 1) * noise * max(
-        _DISTURBANCE_RATIO**2 * _NUM_PARTS / len(frames), 1.0
+    if not (deviations_of_parts**2).sum() > (_NUM_PARTS - 1) * noise * max(
+        _MIN_DISTURBANCE_RATIO**2 * _NUM_PARTS / len(frames), 1.0
     ):
         return None
-    return float(np.sqrt((part_deviations**2).sum(axis=1).max()) / np.linalg.norm(frames.mean(axis=0)))
+    return float(np.sqrt((deviations_of_parts**2).sum(axis=1).max()) / np.linalg.norm(frames.mean(axis=0)))
 
 
 class QualityWatch:
@@ -127,7 +130,9 @@ class QualityWatch:
             past_medians = np.array(self._medians)
         is_readable = np.isfinite(reference_voltages) & (reference_voltages != 0)
         change = np.abs(medians - reference_voltages) / np.abs(np.where(is_readable, reference_voltages, 1.0))
-        dead_electrodes = _find_dead_electrodes(~is_known | (change > _LOST_DIFFERENCE), is_readable, self.touching)
+        dead_electrodes = _find_dead_electrodes(
+            ~is_known | (change > _LOST_READING_DIFFERENCE), is_readable, self.touching
+        )
         if len(past_medians) < _NUM_MEDIANS // 2:
             return Quality(noise, reciprocity, dead_electrodes)
         has_drift_data = (
@@ -153,11 +158,14 @@ class RateWatch:
         """Return a sentence if the `rate` in frames/s has changed, otherwise an empty string."""
         if rate <= 0:
             return ""
-        if self.usual_rate is not None and max(rate / self.usual_rate, self.usual_rate / rate) < _MIN_RATE_RATIO:
+        if (
+            self.usual_rate is not None
+            and max(rate / self.usual_rate, self.usual_rate / rate) < _MIN_RATE_CHANGE_FACTOR
+        ):
             self._num_changed = 0
             return ""
         self._num_changed += 1
-        if self._num_changed < _NUM_RATE_CALLS:
+        if self._num_changed < _NUM_CALLS_WITH_CHANGED_RATE:
             return ""
         previous_rate, self.usual_rate, self._num_changed = self.usual_rate, rate, 0
         return (
@@ -183,18 +191,18 @@ def _find_dead_electrodes(
     """Find the electrodes most of whose readings are lost. The electrode with the largest fraction of lost readings is
     detected first; its channels are left out in the search for the next dead electrode."""
     dead_electrodes: list[int] = []
-    is_remaining = is_readable.copy()
-    while is_remaining.any():
-        own_channels = touching & is_remaining
+    is_remaining_channel = is_readable.copy()
+    while is_remaining_channel.any():
+        own_channels = touching & is_remaining_channel
         num_channels = own_channels.sum(axis=1)
-        lost_shares = np.where(
+        remaining_change_shares = np.where(
             num_channels > 0, (own_channels & is_lost).sum(axis=1) / np.maximum(num_channels, 1), 0.0
         )
-        worst_electrode = int(lost_shares.argmax())
-        if lost_shares[worst_electrode] < _DEAD_SHARE:
+        worst_electrode = int(remaining_change_shares.argmax())
+        if remaining_change_shares[worst_electrode] < _DEAD_ELECTRODE_LOST_SHARE:
             break
         dead_electrodes.append(worst_electrode)
-        is_remaining &= ~touching[worst_electrode]
+        is_remaining_channel &= ~touching[worst_electrode]
     return sorted(dead_electrodes)
 
 
@@ -204,17 +212,17 @@ def _find_drifting_electrodes(
     """Find the electrodes whose readings have a large `drift`, much larger than that of the readings of other
     electrodes."""
     drifting_electrodes: list[int] = []
-    is_remaining = has_drift_data.copy()
+    is_remaining_channel = has_drift_data.copy()
     while True:
-        own_channels = [touching[mask] & is_remaining for mask in range(len(touching))]
+        own_channels = [touching[mask] & is_remaining_channel for mask in range(len(touching))]
         median_drifts = np.array([np.median(drift[mask]) if mask.any() else 0.0 for mask in own_channels])
         worst_electrode = int(median_drifts.argmax())
-        channels_of_others = is_remaining & ~touching[worst_electrode]
+        channels_of_others = is_remaining_channel & ~touching[worst_electrode]
         if (
-            median_drifts[worst_electrode] < _DRIFT_DIFFERENCE
+            median_drifts[worst_electrode] < _MIN_DRIFT_DIFFERENCE
             or not channels_of_others.any()
-            or median_drifts[worst_electrode] < _DRIFT_RATIO * np.median(drift[channels_of_others])
+            or median_drifts[worst_electrode] < _MIN_DRIFT_RATIO * np.median(drift[channels_of_others])
         ):
             return sorted(drifting_electrodes)
         drifting_electrodes.append(worst_electrode)
-        is_remaining = channels_of_others
+        is_remaining_channel = channels_of_others

@@ -38,7 +38,7 @@ _MAX_FILE_SIZE = 100_000_000
 _FRAMES_PREFIX = "frames"
 # Number of successive frames with a different number of channels after which a new file is begun.
 _NUM_OTHER_LENGTHS = 3
-_BINARY = getattr(os, "O_BINARY", 0)  # prevents Windows from changing line ends
+_BINARY_FILE_FLAG = getattr(os, "O_BINARY", 0)  # prevents Windows from changing line ends
 
 
 class Recorder:
@@ -259,7 +259,7 @@ class _RecordingFiles:
             heading = (
                 "second," + ",".join(f"v{channel_index + 1}" for channel_index in range(line.count(b","))) + "\n"
             ).encode()
-        descriptor = os.open(self.folder / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _BINARY, 0o644)
+        descriptor = os.open(self.folder / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _BINARY_FILE_FLAG, 0o644)
         try:
             self._append_line(descriptor, 0, heading)
         except OSError:

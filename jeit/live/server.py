@@ -11,8 +11,8 @@ from collections.abc import Callable
 from ipaddress import ip_address
 from urllib.parse import quote
 
-from jeit.arguments.extras import need_extra
-from jeit.live.page.hub import Hub
+from jeit.arguments.extras import require_extra
+from jeit.live.page.hub import PageHub
 from jeit.live.session import Session
 
 
@@ -46,7 +46,7 @@ def serve(
         serve(session, opened=print)  # with uvicorn
     ```
     """
-    need_extra("live", "a page in the browser")
+    require_extra("live", "a page in the browser")
     import uvicorn
 
     from jeit.live.page.application import is_loopback, make_application
@@ -54,7 +54,7 @@ def serve(
 
     if token is None and not is_loopback(host):
         token = secrets.token_urlsafe(24)
-    hub = Hub(session)
+    hub = PageHub(session)
     server_socket = _open_socket(host, port)
     with server_socket:
         config = uvicorn.Config(
@@ -84,7 +84,7 @@ def check_port(host: str, port: int) -> None:
     _open_socket(host, port).close()
 
 
-def _stop_at_end(hub: Hub, server: object) -> None:
+def _stop_at_end(hub: PageHub, server: object) -> None:
     hub.ended.wait()
     server.should_exit = True  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -113,23 +113,23 @@ def _open_socket(host: str, port: int) -> socket.socket:
 def _page_address(host: str, port: int, token: str | None) -> str:
     """URL of the page. For the unspecified host 0.0.0.0, the URL contains the address under which other machines reach
     this machine."""
-    displayed_host = host
+    host_in_address = host
     try:
         if ip_address(host).is_unspecified:
-            displayed_host = _own_address()
-        if ip_address(displayed_host).version == 6:
-            displayed_host = f"[{displayed_host}]"
+            host_in_address = _own_address()
+        if ip_address(host_in_address).version == 6:
+            host_in_address = f"[{host_in_address}]"
     except ValueError:
         pass
-    query = f"?token={quote(token, safe='')}" if token else ""
-    return f"http://{displayed_host}:{port}/{query}"
+    query_string = f"?token={quote(token, safe='')}" if token else ""
+    return f"http://{host_in_address}:{port}/{query_string}"
 
 
 def _own_address() -> str:
     """IP address of this machine in its network. The function sends no data."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe_socket:
         try:
-            probe.connect(("192.0.2.1", 9))
-            return str(probe.getsockname()[0])
+            probe_socket.connect(("192.0.2.1", 9))
+            return str(probe_socket.getsockname()[0])
         except OSError:
             return "127.0.0.1"

@@ -25,14 +25,14 @@ _MAX_WAIT = 0.05
 # Maximum memory in bytes of the stored results.
 _MAX_BYTES = 128_000_000
 # Maximum number of waiting frames.
-_MAX_WAITING = 256
+_MAX_WAITING_IN_QUEUE = 256
 # Maximum number of different reasons for refusing frames that are counted separately.
 _MAX_REASONS = 30
 _NUMBER_PATTERN = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
 # Number of frames over which the latency is computed.
 _NUM_LATENCIES = 600
 # Time in seconds over which the frame rate is measured.
-_RATE_SPAN = 2.0
+_RATE_TIME_SPAN = 2.0
 # Period in seconds with which the quality of the frames is computed.
 _QUALITY_PERIOD = 0.5
 # Number of successive frames with a different number of channels after which the change is reported.
@@ -42,7 +42,7 @@ _MAX_REFERENCE_FRAMES = 10_000
 # Maximum length of the name of an event.
 _MAX_LABEL_LENGTH = 200
 # Time in seconds for which the events of skipped frames are stored for a busy program.
-_EVENT_HISTORY = 30.0
+_EVENT_STORAGE_TIME = 30.0
 
 
 @dataclass(frozen=True)
@@ -260,7 +260,7 @@ class Session:
             "drifting": self._electrode_names(quality.drifting),
             "connection": ENDED if has_ended else self.source.connection,
             "recording": None if self.recorder is None else self.recorder.state(),
-            "messages": [{"second": second, "text": text} for second, text in messages],
+            "messages": [{"second": elapsed_seconds, "text": text} for elapsed_seconds, text in messages],
         }
 
     @property
@@ -270,9 +270,9 @@ class Session:
 
     def _frame_rate(self) -> float:
         """Frames/s in the last two seconds."""
-        now = time.monotonic()
+        current_time = time.monotonic()
         with self._condition:
-            recent_arrivals = [arrival for arrival in self._arrivals if arrival > now - _RATE_SPAN]
+            recent_arrivals = [arrival for arrival in self._arrivals if arrival > current_time - _RATE_TIME_SPAN]
         time_span = recent_arrivals[-1] - recent_arrivals[0] if len(recent_arrivals) > 1 else 0.0
         return (len(recent_arrivals) - 1) / time_span if time_span > 0 else 0.0
 
@@ -289,7 +289,7 @@ class Session:
                     self._num_read += 1
                     self._arrivals.append(frame.arrived)
                     self._waiting_frames.append(frame)
-                    if len(self._waiting_frames) > _MAX_WAITING:
+                    if len(self._waiting_frames) > _MAX_WAITING_IN_QUEUE:
                         self._waiting_frames.popleft()
                         self._num_dropped += 1
                     self._quality_watch.add(frame)
@@ -437,7 +437,7 @@ def frames(source: AbstractSource, view: AbstractView, *, recorder: Recorder | N
         print(result.frame.second, result.picture.markers)
     ```
     """
-    session, last_number = Session(source, view, recorder=recorder, history=_EVENT_HISTORY), -1
+    session, last_number = Session(source, view, recorder=recorder, history=_EVENT_STORAGE_TIME), -1
     if recorder is not None:
         session.record(True)
     with session:

@@ -25,14 +25,20 @@ _RELATIVE_NOISE = 1e-4
 _NUM_NODES = 1800
 # Tank: radius of the rod and of its path in metres; conductivity of the rod, relative to that of the water; time of a
 # revolution in seconds; number of simulated positions between adjacent electrodes.
-_ROD_RADIUS, _ORBIT_RADIUS, _ROD_CONDUCTIVITY, _REVOLUTION_TIME, _STEPS_PER_ELECTRODE = 0.012, 0.05, 0.05, 8.0, 20
+_ROD_RADIUS, _ROD_PATH_RADIUS, _ROD_CONDUCTIVITY, _ROD_REVOLUTION_TIME, _STEPS_PER_ELECTRODE = (
+    0.012,
+    0.05,
+    0.05,
+    8.0,
+    20,
+)
 # Skin: radius of the finger's contact, half the length of a stroke, and distance of the stroke from the centre, in
 # metres; relative change of conductivity; numbers of simulated states of a stroke and of the pause after the stroke;
 # duration of stroke and pause together in seconds; and number of electrodes by which each stroke is rotated relative to
 # the previous stroke.
 (
     _FINGER_RADIUS,
-    _HALF_STROKE,
+    _HALF_STROKE_LENGTH,
     _STROKE_OFFSET,
     _RELATIVE_CHANGE,
     _NUM_STROKE_STATES,
@@ -132,7 +138,7 @@ def simulated_tank(rate: float = 60.0, *, limit: int | None = None, seed: int = 
     reference_voltages = np.asarray(model.voltages(np.full(len(cells), tank.conductivity)))
     pitch = 2 * np.pi / tank.num_electrodes
     angles = pitch * np.arange(_STEPS_PER_ELECTRODE * tank.num_electrodes) / _STEPS_PER_ELECTRODE
-    positions = _ORBIT_RADIUS * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    positions = _ROD_PATH_RADIUS * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     inside_masks = np.sum((cells - positions[:_STEPS_PER_ELECTRODE, None]) ** 2, axis=2) < _ROD_RADIUS**2
     first_changes = [
         np.asarray(model.voltages(tank.conductivity * np.where(is_inside, _ROD_CONDUCTIVITY, 1.0)))
@@ -147,7 +153,7 @@ def simulated_tank(rate: float = 60.0, *, limit: int | None = None, seed: int = 
         reference_voltages,
         changes,
         positions,
-        period=_REVOLUTION_TIME,
+        period=_ROD_REVOLUTION_TIME,
         rate=rate,
         limit=limit,
         seed=seed,
@@ -176,7 +182,10 @@ def simulated_skin(rate: float = 60.0, *, limit: int | None = None, seed: int = 
     cells = centroids(model.mesh)
     reference_voltages = np.asarray(model.voltages(np.full(model.mesh.num_cells, skin.conductivity)))
     path = np.stack(
-        [np.linspace(-_HALF_STROKE, _HALF_STROKE, _NUM_STROKE_STATES), np.full(_NUM_STROKE_STATES, _STROKE_OFFSET)],
+        [
+            np.linspace(-_HALF_STROKE_LENGTH, _HALF_STROKE_LENGTH, _NUM_STROKE_STATES),
+            np.full(_NUM_STROKE_STATES, _STROKE_OFFSET),
+        ],
         axis=1,
     )
     # The finger is lowered and lifted at the ends of a stroke.
@@ -187,16 +196,25 @@ def simulated_skin(rate: float = 60.0, *, limit: int | None = None, seed: int = 
         pressed_conductivity(cells, skin.conductivity, position, _FINGER_RADIUS, strength)
         for position, strength in zip(path, strengths, strict=True)
     ]
-    stroke = (
+    stroke_positions = (
         np.stack([np.asarray(model.voltages(np.asarray(conductivity))) for conductivity in conductivities])
         - reference_voltages
     )
     pitches = [_STROKE_PITCHES * k for k in range(skin.num_electrodes)]
-    pause_states = np.zeros((_NUM_PAUSE_STATES, len(reference_voltages))), np.full((_NUM_PAUSE_STATES, 2), np.nan)
-    changes = np.concatenate([block for k in pitches for block in (_rotate_changes(stroke, k), pause_states[0])])
+    states_during_pause = (
+        np.zeros((_NUM_PAUSE_STATES, len(reference_voltages))),
+        np.full((_NUM_PAUSE_STATES, 2), np.nan),
+    )
+    changes = np.concatenate(
+        [block for k in pitches for block in (_rotate_changes(stroke_positions, k), states_during_pause[0])]
+    )
     angles = 2 * np.pi / skin.num_electrodes * np.array(pitches)
-    rotations = np.stack([np.cos(angles), np.sin(angles), -np.sin(angles), np.cos(angles)], axis=1).reshape(-1, 2, 2)
-    positions = np.concatenate([block for rotation in rotations for block in (path @ rotation, pause_states[1])])
+    rotation_matrices = np.stack([np.cos(angles), np.sin(angles), -np.sin(angles), np.cos(angles)], axis=1).reshape(
+        -1, 2, 2
+    )
+    positions = np.concatenate(
+        [block for rotation in rotation_matrices for block in (path @ rotation, states_during_pause[1])]
+    )
     reference = _simulate_reference(skin, model, reference_voltages, seed, "simulated skin")
     name, period = "demo: a skin that is stroked", _STROKE_TIME * skin.num_electrodes
     return SimulatedSensor(
@@ -210,9 +228,9 @@ _SIMULATED_SENSORS = {"tank": simulated_tank, "skin": simulated_skin}
 def open_simulated(text: str, rate: float | None = None) -> SimulatedSensor:
     """Create the simulated source with the name "demo", "demo:tank" or "demo:skin". Raises `ValueError` for other
     names."""
-    kind = text.partition(":")[2] or "tank"
-    check_name("demo", kind, _SIMULATED_SENSORS)
-    return _SIMULATED_SENSORS[kind](60.0 if rate is None else rate)
+    sensor_kind = text.partition(":")[2] or "tank"
+    check_name("demo", sensor_kind, _SIMULATED_SENSORS)
+    return _SIMULATED_SENSORS[sensor_kind](60.0 if rate is None else rate)
 
 
 def _rotate_changes(changes: Float[np.ndarray, "n M"], pitches: int) -> Float[np.ndarray, "n M"]:

@@ -142,8 +142,8 @@ class WatchedFolder(AbstractSource):
 
     def __iter__(self) -> Iterator[LiveFrame]:
         self.begun = time.monotonic()
-        pause = _MIN_PAUSE
-        while not self.closing.wait(pause):
+        pause_duration = _MIN_PAUSE
+        while not self.closing.wait(pause_duration):
             start = time.monotonic()
             try:
                 sizes = self._list_sizes()
@@ -152,7 +152,7 @@ class WatchedFolder(AbstractSource):
                     self.connection = f"waiting: {error}"[:300]
                     self.say(f"The folder cannot be read: {error}.")
                 continue
-            pause = max(_MIN_PAUSE, _PAUSE_FACTOR * (time.monotonic() - start))
+            pause_duration = max(_MIN_PAUSE, _PAUSE_FACTOR * (time.monotonic() - start))
             if self.connection != CONNECTED:
                 self.connection = CONNECTED
                 self.say("The folder can be read again.")
@@ -182,10 +182,10 @@ class WatchedFolder(AbstractSource):
 
     def _read_file(self, name: str, size: int) -> Iterator[LiveFrame]:
         """Yield the frames of a file if the file is complete."""
-        previous_size, size_time = self._pending_files.get(name, (-1, time.monotonic()))
+        previous_size, time_of_size = self._pending_files.get(name, (-1, time.monotonic()))
         if size != previous_size:
-            size_time = time.monotonic()
-        self._pending_files[name] = size, size_time
+            time_of_size = time.monotonic()
+        self._pending_files[name] = size, time_of_size
         if size != previous_size or not size:
             return
         try:
@@ -194,7 +194,7 @@ class WatchedFolder(AbstractSource):
             if frames.dtype.kind == "c":
                 raise ValueError(f"{name}: the voltages are complex; choose a part with [data] component.")
         except (ValueError, OSError) as error:
-            if time.monotonic() - size_time < _READ_TIMEOUT:
+            if time.monotonic() - time_of_size < _READ_TIMEOUT:
                 return
             self._mark_as_read(name)
             yield self.frame(f"{error}"[:400])
@@ -202,8 +202,8 @@ class WatchedFolder(AbstractSource):
         self._mark_as_read(name)
         for values in frames:
             if self.rate is not None:
-                due_time = self.begun + self._num_frames / self.rate
-                if self.closing.wait(max(0.0, due_time - time.monotonic())):
+                scheduled_time = self.begun + self._num_frames / self.rate
+                if self.closing.wait(max(0.0, scheduled_time - time.monotonic())):
                     return
             yield self.frame(values)
 
@@ -249,8 +249,8 @@ def open_source(
         from jeit.live.simulated import open_simulated
 
         return open_simulated(text, rate)
-    scheme = text.partition(":")[0]
-    if text == "-" or scheme in ("serial", "tcp"):
+    address_scheme = text.partition(":")[0]
+    if text == "-" or address_scheme in ("serial", "tcp"):
         from jeit.data.formats.lines import LineParser
         from jeit.live.frame_connection import LineSource, ReadAhead, open_connection
 

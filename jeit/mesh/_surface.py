@@ -27,8 +27,8 @@ def first_crossing(points: np.ndarray, cells: np.ndarray) -> tuple[int, int] | N
     for pairs in _near_pairs(points[cells], tolerance):
         num_shared = (cells[pairs[:, 0], :, None] == cells[pairs[:, 1], None, :]).sum(axis=(1, 2))
         is_crossing = np.zeros(len(pairs), bool)
-        is_disjoint, shares_node, shares_edge = num_shared == 0, num_shared == 1, num_shared == 2
-        is_crossing[is_disjoint] = _intersect(points, cells, pairs[is_disjoint], tolerance)
+        shares_no_node, shares_node, shares_edge = num_shared == 0, num_shared == 1, num_shared == 2
+        is_crossing[shares_no_node] = _intersect(points, cells, pairs[shares_no_node], tolerance)
         is_crossing[shares_node] = _cross_opposite(points, cells, pairs[shares_node], tolerance)
         is_crossing[shares_edge] = _overlap_at_edge(points, cells, pairs[shares_edge])
         if is_crossing.any():
@@ -47,16 +47,18 @@ def _near_pairs(corners: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
     radii = np.linalg.norm(corners - centroids[:, None], axis=2).max(axis=1)
     lower_corners, upper_corners = corners.min(axis=1) - tolerance, corners.max(axis=1) + tolerance
     size_class = np.floor(np.log2(radii)).astype(int)
-    classes = [np.flatnonzero(size_class == value) for value in np.unique(size_class)]
-    for k, members in enumerate(classes):
+    size_classes = [np.flatnonzero(size_class == value) for value in np.unique(size_class)]
+    for k, members in enumerate(size_classes):
         tree = KDTree(centroids[members])
-        same_or_larger = np.concatenate(classes[k:])
+        same_size_or_larger_triangles = np.concatenate(size_classes[k:])
         batch_size = max(1, _PAIRS_PER_BATCH // 64)
-        for start in range(0, len(same_or_larger), batch_size):
-            queried = same_or_larger[start : start + batch_size]
-            neighbours = tree.query_ball_point(centroids[queried], radii[queried] + radii[members].max() + tolerance)
+        for start in range(0, len(same_size_or_larger_triangles), batch_size):
+            queried_triangles = same_size_or_larger_triangles[start : start + batch_size]
+            neighbours = tree.query_ball_point(
+                centroids[queried_triangles], radii[queried_triangles] + radii[members].max() + tolerance
+            )
             num_neighbours = np.fromiter(map(len, neighbours), int, len(neighbours))
-            first_cells = np.repeat(queried, num_neighbours)
+            first_cells = np.repeat(queried_triangles, num_neighbours)
             second_cells = members[np.concatenate([np.asarray(indices, int) for indices in neighbours])]
             # A pair of triangles of the same size class occurs twice; return it once.
             is_first_occurrence = np.where(
@@ -74,7 +76,7 @@ def _intersect(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray, toleran
     is_crossing = _overlap_in_plane(first_corners, second_corners, tolerance)
     for segment_triangles, face_triangles in ((first_corners, second_corners), (second_corners, first_corners)):
         for k in range(3):
-            is_crossing |= _pierces(
+            is_crossing |= _segments_intersect_triangles(
                 segment_triangles[:, k], segment_triangles[:, _NEXT_CORNER[k]], face_triangles, tolerance
             )
     return is_crossing
@@ -90,27 +92,30 @@ def _cross_opposite(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray, to
         start, end = (
             points[segment_cells[np.arange(len(segment_cells)), (common_corner + step) % 3]] for step in (1, 2)
         )
-        is_crossing |= _pierces(start, end, points[cells[face_triangles]], tolerance)
+        is_crossing |= _segments_intersect_triangles(start, end, points[cells[face_triangles]], tolerance)
     return is_crossing
 
 
 def _overlap_at_edge(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Whether the two triangles of each pair overlap (p,); the triangles share an edge."""
     first_cells, second_cells = cells[pairs[:, 0]], cells[pairs[:, 1]]
-    is_tip = ~(first_cells[:, :, None] == second_cells[:, None, :]).any(axis=2)
+    is_opposite_corner = ~(first_cells[:, :, None] == second_cells[:, None, :]).any(axis=2)
     is_other_tip = ~(second_cells[:, :, None] == first_cells[:, None, :]).any(axis=2)
-    tip_points = points[first_cells[is_tip]], points[second_cells[is_other_tip]]
-    edge = first_cells[~is_tip].reshape(-1, 2)
+    tip_points = points[first_cells[is_opposite_corner]], points[second_cells[is_other_tip]]
+    edge = first_cells[~is_opposite_corner].reshape(-1, 2)
     start, direction = points[edge[:, 0]], points[edge[:, 1]] - points[edge[:, 0]]
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     perpendiculars = [
-        tip - start - ((tip - start) * direction).sum(axis=1, keepdims=True) * direction for tip in tip_points
+        opposite_corner - start - ((opposite_corner - start) * direction).sum(axis=1, keepdims=True) * direction
+        for opposite_corner in tip_points
     ]
     lengths = [np.linalg.norm(perpendicular, axis=1) for perpendicular in perpendiculars]
     return (perpendiculars[0] * perpendiculars[1]).sum(axis=1) > (1 - 1e-12) * lengths[0] * lengths[1]
 
 
-def _pierces(start: np.ndarray, end: np.ndarray, corners: np.ndarray, tolerance: float) -> np.ndarray:
+def _segments_intersect_triangles(
+    start: np.ndarray, end: np.ndarray, corners: np.ndarray, tolerance: float
+) -> np.ndarray:
     """Whether the segments from `start` to `end` (p, 3) intersect the triangles (p, 3, 3), as booleans (p,). A segment
     that lies in the plane of its triangle does not count."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -123,9 +128,9 @@ def _pierces(start: np.ndarray, end: np.ndarray, corners: np.ndarray, tolerance:
     )
     is_crossing &= np.maximum(np.abs(start_height), np.abs(end_height)) > tolerance
     fraction = np.clip(start_height / np.where(is_crossing, start_height - end_height, 1.0), 0, 1)
-    hit = start + fraction[:, None] * (end - start) - corners[:, 0]
-    u = (np.cross(hit, b) * unit).sum(axis=1) / doubled_areas
-    v = (np.cross(a, hit) * unit).sum(axis=1) / doubled_areas
+    intersection_points = start + fraction[:, None] * (end - start) - corners[:, 0]
+    u = (np.cross(intersection_points, b) * unit).sum(axis=1) / doubled_areas
+    v = (np.cross(a, intersection_points) * unit).sum(axis=1) / doubled_areas
     return is_crossing & (np.minimum(np.minimum(u, v), 1 - u - v) >= -_TOUCH_TOLERANCE)
 
 
@@ -169,34 +174,34 @@ def orient_surface(cells: np.ndarray, points: np.ndarray | None) -> np.ndarray:
     """
     first_edges, second_edges = _pair_edges(cells)
     first_triangle, second_triangle = first_edges // 3, second_edges // 3
-    is_odd = topology.odd_permutation(topology.cell_facets(cells))
+    is_odd_permutation = topology.odd_permutation(topology.cell_facets(cells))
     # Two triangles have the same orientation if they traverse their common edge in opposite directions; otherwise one
     # of the two must be turned.
-    needs_turn = is_odd[first_edges] == is_odd[second_edges]
-    is_turned = _find_triangles_to_flip(first_triangle, second_triangle, needs_turn, cells)
+    needs_flip = is_odd_permutation[first_edges] == is_odd_permutation[second_edges]
+    is_flipped = _find_triangles_to_flip(first_triangle, second_triangle, needs_flip, cells)
     _check_node_contacts(cells, first_edges, second_edges)
-    if np.count_nonzero(is_turned) * 2 > len(cells):
-        is_turned = ~is_turned
+    if np.count_nonzero(is_flipped) * 2 > len(cells):
+        is_flipped = ~is_flipped
     is_closed = 2 * len(first_edges) == 3 * len(cells)
-    oriented = np.where(is_turned[:, None], cells[:, [0, 2, 1]], cells)
+    oriented_cells = np.where(is_flipped[:, None], cells[:, [0, 2, 1]], cells)
     if points is None:
-        return oriented
+        return oriented_cells
     if (pair := first_crossing(points, cells)) is not None:
         crossing_centre = points[cells[pair[0]]].mean(axis=0).round(6).tolist()
         raise ValueError(
             f"cells: the surface crosses or touches itself: triangles {pair[0]} and {pair[1]} meet, at "
             f"{crossing_centre} m. Move the nodes apart, or unite what overlaps where the surface was made."
         )
-    if is_closed and enclosed_volume(points, oriented) < 0:
-        if not is_turned.any():
+    if is_closed and enclosed_volume(points, oriented_cells) < 0:
+        if not is_flipped.any():
             warnings.warn(
                 "cells: the surface is closed and inside out, every triangle faces inwards; they have been turned. "
                 "Give the corners counter-clockwise, seen from outside.",
                 UserWarning,
                 stacklevel=3,
             )
-        oriented = oriented[:, [0, 2, 1]]
-    return oriented
+        oriented_cells = oriented_cells[:, [0, 2, 1]]
+    return oriented_cells
 
 
 def enclosed_volume(points: np.ndarray, cells: np.ndarray) -> float:

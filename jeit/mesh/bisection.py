@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jeit.arguments import check_kind, describe
-from jeit.mesh.checks import MOST_POINTS, size_checked
+from jeit.mesh.checks import MAX_POINTS, size_checked
 from jeit.mesh.mesh import Mesh
 
 # An end of an edge is moved onto a surface that crosses the edge if its distance from the crossing, divided by the
 # edge's length, is below this value.
-_MAX_MOVE = 0.25
+_MAX_RELATIVE_NODE_MOVE = 0.25
 # Minimum volume of a cell after its nodes have moved, divided by its volume before the move.
 _MIN_VOLUME_RATIO = 0.1
 # Number of bisection steps to locate the point where a surface crosses an edge.
@@ -49,9 +49,9 @@ def bisect(mesh: Mesh, size: Callable[[Float[np.ndarray, "m k s"]], Float[np.nda
     bisect(mesh, near).num_cells
     ```
     """
-    refined = bisect_with_parents(mesh, size, MOST_POINTS)
+    refined = bisect_with_parents(mesh, size, MAX_POINTS)
     if refined is None:
-        raise ValueError(f"size asks for more than {MOST_POINTS:,} nodes; give longer edges. Are they in metres?")
+        raise ValueError(f"size asks for more than {MAX_POINTS:,} nodes; give longer edges. Are they in metres?")
     return refined[0]
 
 
@@ -61,23 +61,23 @@ def bisect_with_parents(
     """Refine a mesh as `bisect` does. Also returns, for each cell of the new mesh, the index of the cell of the
     original mesh that contains it. Returns None if `size` requires more than `max_points` nodes. Raises `ValueError` as
     `bisect` does."""
-    split_mesh = _SplitMesh.from_mesh(mesh)
-    parent, everywhere = np.arange(len(split_mesh.cells)), slice(None)
-    longest_edge, longest_length = _longest_edges(split_mesh, everywhere)
-    exceeds_size = _exceeds_size(split_mesh, everywhere, longest_length, size)
+    mesh_in_progress = _SplitMesh.from_mesh(mesh)
+    parent_cells, all_cells = np.arange(len(mesh_in_progress.cells)), slice(None)
+    longest_edge, longest_length = _longest_edges(mesh_in_progress, all_cells)
+    exceeds_size = _exceeds_size(mesh_in_progress, all_cells, longest_length, size)
     while exceeds_size.any():
-        points = split_mesh.points
+        points = mesh_in_progress.points
         split_edges = _find_edges_to_split(
-            split_mesh.cells, longest_edge, np.unique(longest_edge[exceeds_size]), len(points)
+            mesh_in_progress.cells, longest_edge, np.unique(longest_edge[exceeds_size]), len(points)
         )
         if len(points) + len(split_edges) > max_points:
             return None
-        split_mesh, origin = split_mesh.split(split_edges, points[split_edges].mean(axis=1))
-        parent, longest_edge, exceeds_size = parent[origin], longest_edge[origin], exceeds_size[origin]
+        mesh_in_progress, origin = mesh_in_progress.split(split_edges, points[split_edges].mean(axis=1))
+        parent_cells, longest_edge, exceeds_size = parent_cells[origin], longest_edge[origin], exceeds_size[origin]
         is_new = np.bincount(origin)[origin] > 1
-        longest_edge[is_new], longest_length = _longest_edges(split_mesh, is_new)
-        exceeds_size[is_new] = _exceeds_size(split_mesh, is_new, longest_length, size)
-    return split_mesh.mesh(mesh.tags), parent
+        longest_edge[is_new], longest_length = _longest_edges(mesh_in_progress, is_new)
+        exceeds_size[is_new] = _exceeds_size(mesh_in_progress, is_new, longest_length, size)
+    return mesh_in_progress.mesh(mesh.tags), parent_cells
 
 
 def _find_edges_to_split(cells, longest_edge, marked_edges, num_points: int) -> Int[np.ndarray, "e 2"]:
@@ -88,10 +88,10 @@ def _find_edges_to_split(cells, longest_edge, marked_edges, num_points: int) -> 
     """
     edges_to_split, new_edges = [], marked_edges
     while len(new_edges):
-        around, edge = _find_cells_of_edges(cells, new_edges, num_points)
-        is_longest = longest_edge[around] == edge
+        cells_at_edges, edge = _find_cells_of_edges(cells, new_edges, num_points)
+        is_longest = longest_edge[cells_at_edges] == edge
         edges_to_split.append(np.setdiff1d(new_edges, edge[~is_longest], assume_unique=True))
-        new_edges = np.setdiff1d(longest_edge[around[~is_longest]], marked_edges)
+        new_edges = np.setdiff1d(longest_edge[cells_at_edges[~is_longest]], marked_edges)
         marked_edges = np.union1d(marked_edges, new_edges)
     return _edges_of_numbers(np.sort(np.concatenate(edges_to_split)))
 
@@ -130,8 +130,8 @@ def cut(mesh: Mesh, level: Callable[[Float[np.ndarray, "n s"]], Float[np.ndarray
     split_mesh, levels = _move_nodes_onto(_SplitMesh.from_mesh(mesh), level)
     while True:
         points, cells = split_mesh.points, split_mesh.cells
-        side = np.sign(levels)[cells]
-        crossed_cells = np.flatnonzero(side.min(axis=1) * side.max(axis=1) < 0)
+        sign_of_level = np.sign(levels)[cells]
+        crossed_cells = np.flatnonzero(sign_of_level.min(axis=1) * sign_of_level.max(axis=1) < 0)
         if not len(crossed_cells):
             return split_mesh.mesh(mesh.tags)
         crossed_cells = np.flatnonzero(_mark_nodes(cells[crossed_cells], len(points))[cells].any(axis=1))
@@ -215,8 +215,8 @@ def _move_nodes_onto(split_mesh: _SplitMesh, level) -> tuple[_SplitMesh, Float[n
         raise ValueError(
             f"level must give one finite number per point; of {len(points)} points it gave {describe(levels)}."
         )
-    side = np.sign(levels)[cells]
-    edges, _, _ = _edges(points, cells[side.min(axis=1) * side.max(axis=1) < 0])
+    sign_of_level = np.sign(levels)[cells]
+    edges, _, _ = _edges(points, cells[sign_of_level.min(axis=1) * sign_of_level.max(axis=1) < 0])
     edges = edges[np.prod(np.sign(levels)[edges], axis=1) < 0]
     crossing_points = _find_zeros_on_edges(points[edges], levels[edges[:, 0]], level)
     distance = np.linalg.norm(points[edges] - crossing_points[:, None], axis=2) / _edge_lengths(points[edges])[:, None]
@@ -226,14 +226,14 @@ def _move_nodes_onto(split_mesh: _SplitMesh, level) -> tuple[_SplitMesh, Float[n
         distance.ravel()[sort_order],
         np.repeat(crossing_points, 2, axis=0)[sort_order],
     )
-    is_moved = (nearest_distance < _MAX_MOVE) & ~_mark_nodes(split_mesh.facets, len(points))
+    is_moved_node = (nearest_distance < _MAX_RELATIVE_NODE_MOVE) & ~_mark_nodes(split_mesh.facets, len(points))
     volumes_before = _volumes(points, cells)
     while True:
-        moved_points = np.where(is_moved[:, None], target, points)
-        is_crushed = _volumes(moved_points, cells) < _MIN_VOLUME_RATIO * volumes_before
-        if not is_crushed.any():
-            return replace(split_mesh, points=moved_points), np.where(is_moved, 0, levels)
-        is_moved &= ~_mark_nodes(cells[is_crushed], len(points))
+        moved_points = np.where(is_moved_node[:, None], target, points)
+        is_too_small = _volumes(moved_points, cells) < _MIN_VOLUME_RATIO * volumes_before
+        if not is_too_small.any():
+            return replace(split_mesh, points=moved_points), np.where(is_moved_node, 0, levels)
+        is_moved_node &= ~_mark_nodes(cells[is_too_small], len(points))
 
 
 def _find_zeros_on_edges(

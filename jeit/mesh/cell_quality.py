@@ -136,9 +136,9 @@ _VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 # Distance, relative to the largest coordinate, below which nodes are merged: .stl and .obj files store six digits.
 _MERGE_TOLERANCE = 2e-6
 # Maximum number of characters of an error message about the content of a file.
-_MAX_MESSAGE = 120
+_MAX_MESSAGE_LENGTH = 120
 # Maximum memory needed to read a file, divided by the file's size; an .obj file describes a face in few characters.
-_MEMORY_FACTORS = {".stl": 8, ".obj": 16}
+_MEMORY_PER_FILE_BYTE_BY_FORMAT = {".stl": 8, ".obj": 16}
 
 
 def read_leniently(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -148,13 +148,13 @@ def read_leniently(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
     `ValueError` with the file's `name` if the file contains no valid triangles.
     """
     suffix = path.suffix.lower()
-    check_memory(name, _MEMORY_FACTORS[suffix] * path.stat().st_size)
+    check_memory(name, _MEMORY_PER_FILE_BYTE_BY_FORMAT[suffix] * path.stat().st_size)
     data = path.read_bytes()
     try:
         points, cells = _parse_stl(data) if suffix == ".stl" else _parse_obj(data)
     except (ValueError, IndexError, OverflowError) as error:
         message = " ".join(str(error).split())
-        message = message if len(message) <= _MAX_MESSAGE else f"{message[:_MAX_MESSAGE]} …"
+        message = message if len(message) <= _MAX_MESSAGE_LENGTH else f"{message[:_MAX_MESSAGE_LENGTH]} …"
         raise ValueError(f"path: {name} does not work as a mesh file: {message}.") from None
     if not len(cells):
         raise ValueError(f"path: {name} does not work as a mesh file: there are no triangles in it.")

@@ -17,11 +17,11 @@ from jeit.mesh import topology
 
 # Minimum area of a cell divided by the square of its longest edge, or minimum volume divided by the cube of its longest
 # edge. Gradients on flatter cells are inaccurate in double precision.
-_MIN_MEASURE = 1e-10
+_MIN_RELATIVE_MEASURE = 1e-10
 # Maximum distance between two nodes, relative to the extent of the mesh, at which they are treated as coincident.
 _COINCIDENT_DISTANCE = 1e-10
 # Maximum number of nodes: the three node numbers of a facet are packed into one 64-bit integer.
-MOST_POINTS = 2_000_000
+MAX_POINTS = 2_000_000
 
 
 def check_points(points: ArrayLike) -> np.ndarray:
@@ -56,8 +56,8 @@ def check_cells(cells: ArrayLike, num_points: int, dimension: int) -> np.ndarray
     if not np.issubdtype(array.dtype, np.integer):
         raise ValueError(f"cells: node indices must be integers, got {array.dtype}. Convert with .astype(int).")
     array = array.astype(np.int64)
-    if num_points > MOST_POINTS:
-        raise ValueError(f"points: {num_points} nodes are more than the {MOST_POINTS} that jeit can index.")
+    if num_points > MAX_POINTS:
+        raise ValueError(f"points: {num_points} nodes are more than the {MAX_POINTS} that jeit can index.")
     lowest_index, highest_index = int(array.min()), int(array.max())
     if lowest_index < 0 or highest_index >= num_points:
         index_hint = " They look one-based: subtract 1." if lowest_index >= 1 and highest_index == num_points else ""
@@ -73,12 +73,12 @@ def check_cells(cells: ArrayLike, num_points: int, dimension: int) -> np.ndarray
             "cells."
         )
     sort_order = np.lexsort(sorted_cells.T[::-1])
-    duplicates = np.flatnonzero((sorted_cells[sort_order][1:] == sorted_cells[sort_order][:-1]).all(axis=1))
-    if duplicates.size:
-        pair = np.sort(sort_order[duplicates[0] : duplicates[0] + 2]).tolist()
+    duplicate_positions = np.flatnonzero((sorted_cells[sort_order][1:] == sorted_cells[sort_order][:-1]).all(axis=1))
+    if duplicate_positions.size:
+        pair = np.sort(sort_order[duplicate_positions[0] : duplicate_positions[0] + 2]).tolist()
         raise ValueError(
-            f"cells: {duplicates.size} cell(s) are duplicated, first cells {pair[0]} and {pair[1]} with nodes "
-            f"{sorted_cells[sort_order[duplicates[0]]].tolist()}. Keep one of each."
+            f"cells: {duplicate_positions.size} cell(s) are duplicated, first cells {pair[0]} and {pair[1]} with nodes "
+            f"{sorted_cells[sort_order[duplicate_positions[0]]].tolist()}. Keep one of each."
         )
     unused_nodes = np.setdiff1d(np.arange(num_points), array)
     if unused_nodes.size:
@@ -121,7 +121,7 @@ def orient(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
     dimension = cells.shape[1] - 1
     corners = points[cells]
     size = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    flat_cells = np.flatnonzero(np.abs(measure) <= _MIN_MEASURE * size**dimension)
+    flat_cells = np.flatnonzero(np.abs(measure) <= _MIN_RELATIVE_MEASURE * size**dimension)
     if flat_cells.size:
         name = "area" if dimension == 2 else "volume"
         raise ValueError(
@@ -149,7 +149,7 @@ def check_connected(first_cells: np.ndarray, second_cells: np.ndarray, num_cells
 def locate_tags(tags: Mapping[str, ArrayLike], facets: np.ndarray) -> dict[str, np.ndarray]:
     """Convert the facets of each tag to indices (t,) into `facets`. Raises `ValueError` for a tag with a facet that is
     not in `facets`."""
-    located = {}
+    located_tags = {}
     for name, value in tags.items():
         if not isinstance(name, str) or not name:
             raise ValueError(f"tags: names must be non-empty strings, got {name!r}.")
@@ -169,8 +169,8 @@ def locate_tags(tags: Mapping[str, ArrayLike], facets: np.ndarray) -> dict[str, 
                 f"tags: {name!r} holds facet indices from {array.min()} to {array.max()}, but the mesh has boundary "
                 f"facets 0 to {len(facets) - 1}."
             )
-        located[name] = np.unique(array)
-    return located
+        located_tags[name] = np.unique(array)
+    return located_tags
 
 
 def _match_facets(name: str, nodes: np.ndarray, facets: np.ndarray) -> np.ndarray:
@@ -190,18 +190,18 @@ def _match_facets(name: str, nodes: np.ndarray, facets: np.ndarray) -> np.ndarra
 
 MAX_PLAUSIBLE_SIZE = 10.0
 """Size in metres above which a warning is issued: no tank or skin is larger."""
-_SIZE_CHECKED: ContextVar[bool] = ContextVar("size_checked", default=False)
+_IS_SIZE_CHECKED: ContextVar[bool] = ContextVar("size_checked", default=False)
 
 
 @contextmanager
 def size_checked() -> Iterator[None]:
     """Context manager or decorator that suppresses warnings about large sizes, for meshes created from a body or mesh
     whose size has already been checked."""
-    token = _SIZE_CHECKED.set(True)
+    token = _IS_SIZE_CHECKED.set(True)
     try:
         yield
     finally:
-        _SIZE_CHECKED.reset(token)
+        _IS_SIZE_CHECKED.reset(token)
 
 
 def warn_large(largest_side: float, name: str, size_factor: float = 1.0, *, is_from_file: bool = False) -> None:
@@ -211,7 +211,7 @@ def warn_large(largest_side: float, name: str, size_factor: float = 1.0, *, is_f
     `size_factor`: size of the object divided by `largest_side`; `is_from_file`: whether the length may come from a
     file; if so, the message suggests a scale. No warning is issued inside `size_checked`.
     """
-    if not size_factor * largest_side > MAX_PLAUSIBLE_SIZE or _SIZE_CHECKED.get():
+    if not size_factor * largest_side > MAX_PLAUSIBLE_SIZE or _IS_SIZE_CHECKED.get():
         return
     scale_hints = [
         f" (a file is read with scale={unit_scale})" if is_from_file else ""

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jeit.files import check_memory
-from jeit.files.limits import most_bytes
+from jeit.files.limits import max_file_memory
 from jeit.mesh import topology
 from jeit.mesh.cell_quality import read_leniently
 from jeit.mesh.mesh import Mesh
@@ -47,7 +47,7 @@ FORMATS = {
     ".xmf": "xdmf",
 }
 # Memory needed to read a mesh, divided by the size of its file.
-_MEMORY_FACTOR = 4
+_MEMORY_PER_FILE_BYTE = 4
 _INCLUDE = re.compile(rb"^[ \t]*\*[ \t]*include", re.IGNORECASE | re.MULTILINE)
 # First pattern: sets in an Abaqus file that are specified by their first and last number. Second pattern: counts in a
 # VTK file, including the numbers of grid points along each axis.
@@ -74,7 +74,7 @@ def check_meshio_format(path: Path) -> str:
             f"path: {path.name[:80]} does not work as a mesh file: the ending of the name gives the format, "
             f"{', '.join(FORMATS)}. Others that meshio knows are read with trusted=True, where a file comes from you."
         )
-    check_memory(path.name[:80], _MEMORY_FACTOR * path.stat().st_size)
+    check_memory(path.name[:80], _MEMORY_PER_FILE_BYTE * path.stat().st_size)
     if kind in ("vtu", "xdmf"):
         _check_prologue(path)
     if kind == "xdmf":
@@ -135,7 +135,7 @@ class _ElementReachedError(Exception):
 
 def _check_prologue(path: Path) -> None:
     """Raise `ValueError` for an XML file with a document type, which can declare entities."""
-    parser = expat.ParserCreate()
+    xml_parser = expat.ParserCreate()
 
     def reject_doctype(*_: Any) -> None:
         raise ValueError(f"path: {path.name[:80]} has a document type (<!DOCTYPE), which mesh files have no use for.")
@@ -143,10 +143,10 @@ def _check_prologue(path: Path) -> None:
     def stop_parsing(*_: Any) -> None:
         raise _ElementReachedError
 
-    parser.StartDoctypeDeclHandler, parser.StartElementHandler = reject_doctype, stop_parsing
+    xml_parser.StartDoctypeDeclHandler, xml_parser.StartElementHandler = reject_doctype, stop_parsing
     try:
         with path.open("rb") as file:
-            parser.ParseFile(file)
+            xml_parser.ParseFile(file)
     except _ElementReachedError:
         return
     except expat.ExpatError:
@@ -174,7 +174,7 @@ def bounded_inflation(path: Path) -> Iterator[None]:
     """Context in which meshio raises `ValueError` if the decompressed data of a VTU file exceed the memory limit."""
     from meshio.vtu import _vtu  # takes a tenth of a second
 
-    vtu_names, num_bytes_left = _vtu.__dict__, most_bytes()
+    vtu_names, num_bytes_left = _vtu.__dict__, max_file_memory()
     decompressors: dict[str, Callable[[], Any]] = {"zlib": zlib.decompressobj, "lzma": lzma.LZMADecompressor}
     modules = {name: vtu_names[name] for name in decompressors if name in vtu_names}
 
@@ -184,7 +184,7 @@ def bounded_inflation(path: Path) -> Iterator[None]:
             decompressed = create_decompressor().decompress(data, int(num_bytes_left) + 1)
             num_bytes_left -= len(decompressed)
             if num_bytes_left < 0:
-                check_memory(f"{path.name[:80]}, unpacked,", most_bytes() + 1)
+                check_memory(f"{path.name[:80]}, unpacked,", max_file_memory() + 1)
             return decompressed
 
         return decompress
@@ -203,10 +203,10 @@ def bounded_inflation(path: Path) -> Iterator[None]:
 _CELL_TYPES = {2: "triangle", 3: "tetra"}
 _FACET_TYPES = {2: "line", 3: "triangle"}
 # Formats that list triangles without connectivity, so that coincident nodes must be merged.
-_UNCONNECTED = (".stl", ".obj")
+_FORMATS_WITHOUT_CONNECTIVITY = (".stl", ".obj")
 # Exceptions that meshio raises for invalid content, and maximum number of characters of their messages.
 _READ_ERRORS = (LookupError, TypeError, AttributeError, ArithmeticError, MemoryError)
-_MAX_MESSAGE = 80
+_MAX_MESSAGE_LENGTH = 80
 
 
 def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh:
@@ -243,7 +243,7 @@ def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh
     if not path.stat().st_size:
         raise ValueError(f"path: {path.name[:80]} does not work as a mesh file: it is empty.")
     kind = None if trusted else check_meshio_format(path)
-    if path.suffix.lower() in _UNCONNECTED:
+    if path.suffix.lower() in _FORMATS_WITHOUT_CONNECTIVITY:
         points, cells = read_leniently(path, path.name[:80])
         return _create_mesh(points * float(scale), cells, {})
     with bounded_inflation(path) if kind == "vtu" else nullcontext():
@@ -301,15 +301,15 @@ def write(
                 "cell_data: .msh files keep the mesh, its tags and point_data; write values per cell to a .vtu file."
             )
         options = {"file_format": "gmsh22"}
-        physical = [np.full(mesh.num_cells, 1)]
+        physical_groups = [np.full(mesh.num_cells, 1)]
         field_data["domain"] = np.array([1, mesh.dimension])
         for group_number, (tag, facet_indices) in enumerate(sorted(mesh.tags.items()), start=2):
             facets = np.asarray(mesh.facets)[np.asarray(facet_indices)]
             blocks.append((_FACET_TYPES[mesh.dimension], facets))
-            physical.append(np.full(len(facets), group_number))
+            physical_groups.append(np.full(len(facets), group_number))
             field_data[tag] = np.array([group_number, mesh.dimension - 1])
-        data["gmsh:physical"] = physical
-        data["gmsh:geometrical"] = physical
+        data["gmsh:physical"] = physical_groups
+        data["gmsh:geometrical"] = physical_groups
     try:
         content = {"point_data": dict(nodes), "cell_data": data, "field_data": field_data}
         _call_meshio(path, lambda meshio: meshio.Mesh(points, blocks, **content).write(path, **options), writing=True)
@@ -329,15 +329,15 @@ def _check_data(argument: str, name: str, value: ArrayLike, length: int) -> np.n
     return array
 
 
-def _call_meshio(path: Path, action: Any, *, writing: bool = False) -> Any:
-    """Call `action` with the module meshio as its argument. Exceptions other than `OSError`, and exits of the
+def _call_meshio(path: Path, meshio_function: Any, *, writing: bool = False) -> Any:
+    """Call `meshio_function` with the module meshio as its argument. Exceptions other than `OSError`, and exits of the
     interpreter, are converted to `ValueError`; what meshio prints is captured for the message."""
     import meshio  # takes a tenth of a second
 
     output = io.StringIO()
     try:
         with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
-            return action(meshio)
+            return meshio_function(meshio)
     except OSError:
         raise
     except (Exception, SystemExit) as error:
@@ -360,7 +360,7 @@ def _call_meshio(path: Path, action: Any, *, writing: bool = False) -> Any:
 def _shorten_message(error: BaseException | str) -> str:
     """Shorten an error message of meshio to one line."""
     message = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-    return message if len(message) <= _MAX_MESSAGE else f"{message[: _MAX_MESSAGE - 1]}…"
+    return message if len(message) <= _MAX_MESSAGE_LENGTH else f"{message[: _MAX_MESSAGE_LENGTH - 1]}…"
 
 
 def _convert_from_meshio(meshio_mesh: meshio.Mesh, scale: float, source: str) -> Mesh:
@@ -385,10 +385,10 @@ def _convert_from_meshio(meshio_mesh: meshio.Mesh, scale: float, source: str) ->
     new_index = np.full(len(meshio_mesh.points), -1)
     new_index[used_points] = np.arange(len(used_points))
     # The cells are not yet oriented, so boundary facets are identified as the facets that occur once.
-    keys, occurrences = np.unique(
+    keys, num_occurrences = np.unique(
         topology.facet_keys(topology.cell_facets(cells), len(used_points)), return_counts=True
     )
-    boundary = keys[occurrences == 1]
+    boundary = keys[num_occurrences == 1]
     tags = {}
     for name, facets in _facet_groups(meshio_mesh, _FACET_TYPES[dimension]).items():
         nodes = new_index[facets]
@@ -411,8 +411,8 @@ def _facet_groups(meshio_mesh: meshio.Mesh, facet_type: str) -> dict[str, np.nda
     groups: dict[str, list[np.ndarray]] = {}
     facet_dimension = 2 if facet_type == "triangle" else 1
     names = {int(value[0]): name for name, value in meshio_mesh.field_data.items() if int(value[1]) == facet_dimension}
-    physical = meshio_mesh.cell_data.get("gmsh:physical", [])
-    for block, group_numbers in zip(meshio_mesh.cells, physical, strict=False):
+    physical_groups = meshio_mesh.cell_data.get("gmsh:physical", [])
+    for block, group_numbers in zip(meshio_mesh.cells, physical_groups, strict=False):
         if block.type != facet_type:
             continue
         for value in np.unique(group_numbers):

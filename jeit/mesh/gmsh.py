@@ -9,7 +9,7 @@ from types import ModuleType
 
 import numpy as np
 
-from jeit.arguments.extras import optional
+from jeit.arguments.extras import import_optional
 from jeit.mesh.files import read
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Domain
@@ -54,7 +54,7 @@ def from_gmsh(
             f"source: {Path(source).name[:80]} may be a script of Gmsh's, which can run any command. Give a file of "
             f"{', '.join(_GEOMETRY_FORMATS)}; or scripts=True, where it is your own."
         )
-    gmsh = optional(
+    gmsh = import_optional(
         "gmsh",
         "from_gmsh",
         "On Linux it needs libraries of the system too, such as libGLU. Discs, rectangles, polygons, layers, boxes and "
@@ -151,7 +151,7 @@ class _GmshDrawing:
 def _draw_outline(gmsh: ModuleType, domain: Domain) -> None:
     if not isinstance(domain, Domain):
         raise ValueError(f"source: expected a file, an outline or None, got {type(domain).__name__}")
-    kernel = _GmshDrawing(gmsh)
-    domain.draw(kernel)
-    kernel.shape.addPlaneSurface(kernel.loops)
-    kernel.shape.synchronize()
+    gmsh_kernel = _GmshDrawing(gmsh)
+    domain.draw(gmsh_kernel)
+    gmsh_kernel.shape.addPlaneSurface(gmsh_kernel.loops)
+    gmsh_kernel.shape.synchronize()

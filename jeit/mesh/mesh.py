@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import object_html, object_text, picture
 from jeit.mesh import checks, topology
-from jeit_solvers.engines import as_array, either_engine, has_values, namespace
+from jeit_solvers.engines import as_array, has_values, namespace, numpy_or_compiled
 from jeit_solvers.module import Module
 
 
@@ -126,17 +126,17 @@ class Mesh(Module):
             from jeit.mesh import _surface
 
             indices = _surface.orient_surface(indices, coordinates)
-        first_facets, second_facets, single_facets = topology.pair_facets(indices)
+        first_facets, second_facets, facets_of_one_cell = topology.pair_facets(indices)
         checks.check_connected(first_facets // (dimension + 1), second_facets // (dimension + 1), len(indices))
-        facets = topology.cell_facets(indices)[single_facets]
+        facets = topology.cell_facets(indices)[facets_of_one_cell]
         if dimension == 2:
             facets = topology.order_loops(facets, coordinates) if len(facets) else facets
-        located = checks.locate_tags(tags or {}, facets)
+        located_tags = checks.locate_tags(tags or {}, facets)
         return Mesh(
             points=as_array(points if coordinates is None else coordinates),
             cells=as_array(indices.astype(np.int32)),
             facets=as_array(facets.astype(np.int32)),
-            tags={name: as_array(facet_indices.astype(np.int32)) for name, facet_indices in located.items()},
+            tags={name: as_array(facet_indices.astype(np.int32)) for name, facet_indices in located_tags.items()},
         )
 
 
@@ -162,7 +162,7 @@ def check_flat(mesh: Mesh, what: str) -> None:
         )
 
 
-@either_engine
+@numpy_or_compiled
 def measures(mesh: Mesh) -> Float[Array, " m"]:
     """Area in m² (2-D) or volume in m³ (3-D) of every cell (m,); positive for a valid mesh.
 
@@ -186,7 +186,7 @@ def measures(mesh: Mesh) -> Float[Array, " m"]:
     return xp.sum(xp.cross(edges[:, 0], edges[:, 1]) * edges[:, 2], axis=-1) / 6.0
 
 
-@either_engine
+@numpy_or_compiled
 def gradients(mesh: Mesh) -> Float[Array, "m k s"]:
     """Gradients (m, d + 1, s), in 1/m, of the d + 1 linear basis functions on every cell, where d is the dimension of
     the cells and s the dimension of the space.
@@ -214,23 +214,23 @@ def gradients(mesh: Mesh) -> Float[Array, "m k s"]:
         a, b = edges[:, 0], edges[:, 1]
         normal = xp.cross(a, b)
         determinant = xp.sum(normal**2, axis=-1)[:, None]
-        later_gradients = xp.stack([xp.cross(b, normal), xp.cross(normal, a)], axis=1)
+        other_gradients = xp.stack([xp.cross(b, normal), xp.cross(normal, a)], axis=1)
     elif mesh.dimension == 2:
         a, b = edges[:, 0], edges[:, 1]
         determinant = _cross_product(a, b)[:, None]
-        later_gradients = xp.stack([xp.stack([b[:, 1], -b[:, 0]], -1), xp.stack([-a[:, 1], a[:, 0]], -1)], axis=1)
+        other_gradients = xp.stack([xp.stack([b[:, 1], -b[:, 0]], -1), xp.stack([-a[:, 1], a[:, 0]], -1)], axis=1)
     else:
         a, b, c = edges[:, 0], edges[:, 1], edges[:, 2]
         normal = xp.cross(b, c)
         determinant = xp.sum(a * normal, axis=-1)[:, None]
-        later_gradients = xp.stack([normal, xp.cross(c, a), xp.cross(a, b)], axis=1)
-    later_gradients = later_gradients / determinant[:, :, None]
+        other_gradients = xp.stack([normal, xp.cross(c, a), xp.cross(a, b)], axis=1)
+    other_gradients = other_gradients / determinant[:, :, None]
     # Explicit sum, because XLA converts a sum over such a short axis into a slow matrix product.
-    first_gradient = -functools.reduce(operator.add, [later_gradients[:, k] for k in range(mesh.dimension)])
-    return xp.concatenate([first_gradient[:, None], later_gradients], axis=1)
+    first_gradient = -functools.reduce(operator.add, [other_gradients[:, k] for k in range(mesh.dimension)])
+    return xp.concatenate([first_gradient[:, None], other_gradients], axis=1)
 
 
-@either_engine
+@numpy_or_compiled
 def centroids(mesh: Mesh) -> Float[Array, "m s"]:
     """Centroid (m, s) of every cell, in metres.
 
@@ -268,7 +268,7 @@ def normals(mesh: Mesh) -> Float[Array, "m 3"]:
     return _normals(mesh)
 
 
-@either_engine
+@numpy_or_compiled
 def _normals(mesh: Mesh):
     xp = namespace(mesh.points)
     if not mesh.is_surface:
@@ -278,7 +278,7 @@ def _normals(mesh: Mesh):
     return normal / _length(normal)[:, None]
 
 
-@either_engine
+@numpy_or_compiled
 def facet_measures(mesh: Mesh) -> Float[Array, " b"]:
     """Length in m (2-D) or area in m² (3-D) of every boundary facet (b,)."""
     corners = mesh.points[mesh.facets]

@@ -1,9 +1,9 @@
 """Meshes of solids whose cells are smallest at the planes that contain edges of electrodes, because the current density
 is unbounded at the edges of electrodes.
 
-Along each axis, the cell size at the planes is a twentieth of the largest cell size (`_SMALLEST_CELL`) and increases
-away from the planes, up to a maximum size that follows from the number of nodes. A box is graded along x, y and z; a
-solid above any other outline is graded along z, and its plane mesh is refined separately.
+Along each axis, the cell size at the planes is a twentieth of the largest cell size (`_RELATIVE_SMALLEST_CELL_SIZE`)
+and increases away from the planes, up to a maximum size that follows from the number of nodes. A box is graded along x,
+y and z; a solid above any other outline is graded along z, and its plane mesh is refined separately.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from jeit.mesh.solids import layer
 
 # Size of the cells at the planes divided by the size of the largest cells, and increase of the cell size per unit of
 # distance from a plane.
-_SMALLEST_CELL, _CELL_GROWTH = 0.05, 0.8
+_RELATIVE_SMALLEST_CELL_SIZE, _CELL_SIZE_GROWTH = 0.05, 0.8
 # Distance between two planes, relative to the size of the body, below which they are merged.
-_MERGE_DISTANCE = 1e-4
+_RELATIVE_MERGE_DISTANCE = 1e-4
 
 
 def graded_box(outline: Rectangle, height: float, planes: Sequence[Float[np.ndarray, " k"]], num_points: int) -> Mesh:
@@ -42,39 +42,49 @@ def graded_box(outline: Rectangle, height: float, planes: Sequence[Float[np.ndar
     ]
     max_extent = max(upper_end - lower_end for lower_end, upper_end in axis_limits)
     size = _largest_cell_size(
-        lambda size: float(np.prod([len(_divide_axis(axis_stops, size)) for axis_stops in axis_positions])),
+        lambda size: float(np.prod([len(_divide_axis(axis_boundaries, size)) for axis_boundaries in axis_positions])),
         num_points,
         max_extent,
     )
-    node_positions = [_divide_axis(axis_stops, size) for axis_stops in axis_positions]
+    node_positions = [_divide_axis(axis_boundaries, size) for axis_boundaries in axis_positions]
     points = np.stack(np.meshgrid(*node_positions[:2], indexing="ij"), axis=-1).reshape(-1, 2)
     plane = Mesh.create(points, _grid_triangles(len(node_positions[0]), len(node_positions[1])))
     return layer(outline.tagged(plane), height, heights=node_positions[2])
 
 
 def graded_layers(
-    outline: Domain, height: float, planes: Float[np.ndarray, " k"], rims: Float[np.ndarray, "p 2"], num_points: int
+    outline: Domain,
+    height: float,
+    planes: Float[np.ndarray, " k"],
+    rim_points: Float[np.ndarray, "p 2"],
+    num_points: int,
 ) -> Mesh:
-    """Mesh of a solid above any outline, with thin layers at the heights `planes` and small cells at `rims`, points (p,
-    2) on the rims of electrodes, seen from above. Points of `rims` on the edge of a disk become nodes. The mesh has the
-    tags of `jeit.mesh.layer`."""
-    stops = _distinct_positions(planes, 0.0, height)
+    """Mesh of a solid above any outline, with thin layers at the heights `planes` and small cells at `rim_points`,
+    points (p, 2) on the rims of electrodes, seen from above. Points of `rim_points` on the edge of a disk become nodes.
+    The mesh has the tags of `jeit.mesh.layer`."""
+    layer_boundaries = _distinct_positions(planes, 0.0, height)
     area = float(outline.area)
 
     def count_nodes(size: float) -> float:
         # Because of the refinement at the rims, the mean cell is about a third smaller than the largest.
-        return len(_divide_axis(stops, size)) * (1 + 1.1 * area / (0.65 * size) ** 2)
+        return len(_divide_axis(layer_boundaries, size)) * (1 + 1.1 * area / (0.65 * size) ** 2)
 
     def layer_heights(num_nodes: int) -> Float[np.ndarray, " n"]:
-        return _divide_axis(stops, _largest_cell_size(count_nodes, num_nodes, max(height, np.sqrt(area))))
+        return _divide_axis(layer_boundaries, _largest_cell_size(count_nodes, num_nodes, max(height, np.sqrt(area))))
 
     heights = layer_heights(num_points)
-    refine = Refine(rims, factor=1 / _SMALLEST_CELL, growth=_CELL_GROWTH) if len(rims) else None
+    refine = (
+        Refine(rim_points, factor=1 / _RELATIVE_SMALLEST_CELL_SIZE, growth=_CELL_SIZE_GROWTH)
+        if len(rim_points)
+        else None
+    )
     num_nodes = max(4, round(num_points / len(heights)))
     with nodes_of_solid(num_points, lambda num_requested: round(num_requested / len(layer_heights(num_requested)))):
-        if isinstance(outline, Disk) and len(rims):
-            offset = rims - np.asarray(outline.centre)
-            is_on_edge = np.abs(np.hypot(*offset.T) - float(outline.radius)) < _MERGE_DISTANCE * float(outline.radius)
+        if isinstance(outline, Disk) and len(rim_points):
+            offset = rim_points - np.asarray(outline.centre)
+            is_on_edge = np.abs(np.hypot(*offset.T) - float(outline.radius)) < _RELATIVE_MERGE_DISTANCE * float(
+                outline.radius
+            )
             angles = np.arctan2(offset[is_on_edge, 1], offset[is_on_edge, 0])
             plane = outline.mesh(num_points=num_nodes, refine=refine, boundary_points=angles if len(angles) else None)
         else:
@@ -85,7 +95,7 @@ def graded_layers(
 def _distinct_positions(planes: Float[np.ndarray, " k"], lower_end: float, upper_end: float) -> Float[np.ndarray, " s"]:
     """Distinct positions of the planes between `lower_end` and `upper_end`, with these two ends included."""
     inner_positions = np.sort(planes[(planes > lower_end) & (planes < upper_end)])
-    distinct_positions, min_gap = [lower_end], _MERGE_DISTANCE * (upper_end - lower_end)
+    distinct_positions, min_gap = [lower_end], _RELATIVE_MERGE_DISTANCE * (upper_end - lower_end)
     for position in inner_positions:
         if position - distinct_positions[-1] > min_gap and upper_end - position > min_gap:
             distinct_positions.append(float(position))
@@ -102,8 +112,8 @@ def _divide_axis(positions: Float[np.ndarray, " s"], max_size: float) -> Float[n
         midpoints = (samples[1:] + samples[:-1]) / 2
         widths = np.minimum(
             max_size,
-            _SMALLEST_CELL * max_size
-            + _CELL_GROWTH * np.minimum(midpoints - lower_position, upper_position - midpoints),
+            _RELATIVE_SMALLEST_CELL_SIZE * max_size
+            + _CELL_SIZE_GROWTH * np.minimum(midpoints - lower_position, upper_position - midpoints),
         )
         cumulative_count = np.concatenate([[0.0], np.cumsum(np.diff(samples) / widths)])
         num_cells = max(1, round(cumulative_count[-1]))
@@ -132,7 +142,7 @@ def _grid_triangles(rows: int, columns: int) -> Int[np.ndarray, "t 3"]:
     )
     a = i * columns + j
     b, c, d = a + columns, a + columns + 1, a + 1
-    is_even = ((i + j) % 2 == 0)[:, None]
-    first_triangles = np.where(is_even, np.stack([a, b, c], axis=1), np.stack([a, b, d], axis=1))
-    second_triangles = np.where(is_even, np.stack([a, c, d], axis=1), np.stack([b, c, d], axis=1))
+    is_even_square = ((i + j) % 2 == 0)[:, None]
+    first_triangles = np.where(is_even_square, np.stack([a, b, c], axis=1), np.stack([a, b, d], axis=1))
+    second_triangles = np.where(is_even_square, np.stack([a, c, d], axis=1), np.stack([b, c, d], axis=1))
     return np.concatenate([first_triangles, second_triangles])

@@ -62,12 +62,12 @@ class Solid(Body):
         The mesh has the tags 'bottom', 'top', 'side', and the tags of the outline's mesh. Raises `ValueError` as
         `jeit.mesh.box` does.
         """
-        from jeit.mesh.solids import base_counter, choose_layers, layer
+        from jeit.mesh.solids import choose_layers, count_of_base_nodes, layer
 
         num_base_points, num_layers = choose_layers(
             float(self.outline.area), self.thickness, num_points, cell_size, None
         )
-        with nodes_of_solid(num_points, base_counter(float(self.outline.area), self.thickness, None)):
+        with nodes_of_solid(num_points, count_of_base_nodes(float(self.outline.area), self.thickness, None)):
             plane = self.outline.mesh(num_points=num_base_points, cell_size=cell_size, refine=refine)
         return layer(plane, self.thickness, num_layers)
 
@@ -125,10 +125,10 @@ class OwnMesh(Body):
         return self.given
 
 
-def as_body(given: Body | Mesh) -> Body:
+def as_body(mesh_or_body: Body | Mesh) -> Body:
     """Convert a mesh to a body; a body is returned unchanged. Raises `ValueError` for an argument that is neither a
     body nor a mesh."""
-    if isinstance(given, Mesh):
-        return OwnMesh(given)
-    check_kind("domain", given, Body, "an outline such as Disk(0.05), a Solid, or a Mesh")
-    return given
+    if isinstance(mesh_or_body, Mesh):
+        return OwnMesh(mesh_or_body)
+    check_kind("domain", mesh_or_body, Body, "an outline such as Disk(0.05), a Solid, or a Mesh")
+    return mesh_or_body

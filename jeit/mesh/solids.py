@@ -165,9 +165,9 @@ def stacked_cells(cells: np.ndarray, num_nodes: int, num_layers: int) -> np.ndar
 
 def stacked_wall(edges: np.ndarray, num_nodes: int, num_layers: int) -> np.ndarray:
     """Triangles (2 e num_layers, 3) of the wall above edges (e, 2), divided like the prisms in `stacked_cells`."""
-    lower_nodes, upper_nodes = np.sort(edges.astype(np.int64), axis=1).T
-    lower_triangles = np.stack([lower_nodes, upper_nodes, upper_nodes + num_nodes], axis=1)
-    upper_triangles = np.stack([lower_nodes, lower_nodes + num_nodes, upper_nodes + num_nodes], axis=1)
+    smaller_nodes, larger_nodes = np.sort(edges.astype(np.int64), axis=1).T
+    lower_triangles = np.stack([smaller_nodes, larger_nodes, larger_nodes + num_nodes], axis=1)
+    upper_triangles = np.stack([smaller_nodes, smaller_nodes + num_nodes, larger_nodes + num_nodes], axis=1)
     return np.concatenate(
         [face + k * num_nodes for k in range(num_layers) for face in (lower_triangles, upper_triangles)]
     )
@@ -287,9 +287,9 @@ def box(
     """
     width, depth = check_length("width", width), check_length("depth", depth)
     height = check_length("height", height)
-    base_points, layers = choose_layers(width * depth, height, num_points, cell_size, num_layers)
-    with size_checked(), nodes_of_solid(num_points, base_counter(width * depth, height, num_layers)):
-        base = rectangle(width, depth, num_points=base_points, cell_size=cell_size, refine=refine)
+    plane_points, layers = choose_layers(width * depth, height, num_points, cell_size, num_layers)
+    with size_checked(), nodes_of_solid(num_points, count_of_base_nodes(width * depth, height, num_layers)):
+        base = rectangle(width, depth, num_points=plane_points, cell_size=cell_size, refine=refine)
         return layer(base, height, layers)
 
 
@@ -325,11 +325,11 @@ def cylinder(
     ```
     """
     radius, height = check_length("radius", radius, 2), check_length("height", height)
-    base_points, layers = choose_layers(np.pi * radius**2, height, num_points, cell_size, num_layers)
-    with size_checked(), nodes_of_solid(num_points, base_counter(np.pi * radius**2, height, num_layers)):
+    plane_points, layers = choose_layers(np.pi * radius**2, height, num_points, cell_size, num_layers)
+    with size_checked(), nodes_of_solid(num_points, count_of_base_nodes(np.pi * radius**2, height, num_layers)):
         base = disk(
             radius,
-            num_points=base_points,
+            num_points=plane_points,
             cell_size=cell_size,
             refine=refine,
             num_boundary=num_boundary,
@@ -338,7 +338,7 @@ def cylinder(
         return layer(base, height, layers)
 
 
-def base_counter(area: float, height: float, num_layers: int | None) -> Callable[[int], int]:
+def count_of_base_nodes(area: float, height: float, num_layers: int | None) -> Callable[[int], int]:
     """Return a function that computes the number of nodes of a solid's base from the number of nodes of the solid."""
     return lambda num_points: choose_layers(area, height, num_points, None, num_layers)[0] or num_points
 
@@ -348,12 +348,12 @@ def choose_layers(
 ) -> tuple[int | None, int]:
     """Numbers of nodes of the base of `area` m², and of layers up to `height` metres. The number of nodes is None if a
     cell size is specified."""
-    target = unstructured.Target.create(num_points, cell_size)
+    target_num_points = unstructured.MeshTarget.create(num_points, cell_size)
     if num_layers is not None:
         num_layers = unstructured.check_count("num_layers", num_layers, 1)
-    if target.cell_size is not None:
-        return None, num_layers or max(1, round(height / target.cell_size))
-    num_nodes = target.num_points if target.is_requested else 4000
+    if target_num_points.cell_size is not None:
+        return None, num_layers or max(1, round(height / target_num_points.cell_size))
+    num_nodes = target_num_points.num_points if target_num_points.is_requested else 4000
     # A solid of base area A and height H, with node spacing h in the plane and along z, has n = (1.1 A / h²) (H / h +
     # 1) nodes.
     if num_layers is None:

@@ -42,11 +42,11 @@ def match_facets(facets: np.ndarray, num_points: int) -> tuple[np.ndarray, np.nd
     key = facet_keys(facets, num_points)
     sort_order = np.argsort(key, kind="stable")
     sorted_keys = key[sort_order]
-    is_same = sorted_keys[1:] == sorted_keys[:-1]
-    triple_positions = np.flatnonzero(is_same[1:] & is_same[:-1])
-    if triple_positions.size:
-        return sort_order[:0], sort_order[:0], sort_order[triple_positions[0] : triple_positions[0] + 3]
-    position = np.flatnonzero(is_same)
+    is_same_as_next = sorted_keys[1:] == sorted_keys[:-1]
+    triply_used_positions = np.flatnonzero(is_same_as_next[1:] & is_same_as_next[:-1])
+    if triply_used_positions.size:
+        return sort_order[:0], sort_order[:0], sort_order[triply_used_positions[0] : triply_used_positions[0] + 3]
+    position = np.flatnonzero(is_same_as_next)
     return sort_order[position], sort_order[position + 1], sort_order[:0]
 
 
@@ -65,12 +65,12 @@ def pair_facets(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             f"cells (among them {(overcrowded_facets // width).tolist()}), so the mesh is not manifold. Remove the "
             "surplus cells."
         )
-    is_odd = odd_permutation(facets)
-    overlapping = np.flatnonzero(is_odd[first_facets] == is_odd[second_facets])
-    if overlapping.size:
-        pair = np.sort([first_facets[overlapping[0]] // width, second_facets[overlapping[0]] // width]).tolist()
+    is_odd_permutation = odd_permutation(facets)
+    overlaps = np.flatnonzero(is_odd_permutation[first_facets] == is_odd_permutation[second_facets])
+    if overlaps.size:
+        pair = np.sort([first_facets[overlaps[0]] // width, second_facets[overlaps[0]] // width]).tolist()
         raise ValueError(
-            f"cells: {overlapping.size} pair(s) of neighbouring cells overlap, first {pair}: both lie on the same side "
+            f"cells: {overlaps.size} pair(s) of neighbouring cells overlap, first {pair}: both lie on the same side "
             "of the facet they share. A node has been moved across a facet (an inverted cell), or the cells "
             "come from two meshes laid over each other. Rebuild the mesh or move the node back."
         )
@@ -140,11 +140,11 @@ def check_loop(vertices: ArrayLike, name: str, *, clockwise: bool) -> np.ndarray
         first_index = int(np.argmin(length))
         vertex_hint = " Do not repeat the first vertex at the end." if first_index == len(loop) - 1 else " Remove one."
         raise ValueError(f"{name}: vertices {first_index} and {(first_index + 1) % len(loop)} coincide.{vertex_hint}")
-    crossing = _first_crossing(loop)
-    if crossing is not None:
+    sides = _first_crossing(loop)
+    if sides is not None:
         raise ValueError(
-            f"{name}: the outline crosses or touches itself: side {crossing[0]} (from vertex {crossing[0]}) meets side "
-            f"{crossing[1]}. Give the vertices in order along a simple closed outline."
+            f"{name}: the outline crosses or touches itself: side {sides[0]} (from vertex {sides[0]}) meets side "
+            f"{sides[1]}. Give the vertices in order along a simple closed outline."
         )
     if (signed_area(loop) < 0) != clockwise:
         loop = np.concatenate([loop[:1], loop[:0:-1]])

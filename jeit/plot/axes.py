@@ -11,7 +11,7 @@ from matplotlib.transforms import ScaledTranslation
 from jeit.plot.colours import DARK_GREY, LIGHT_GREY
 
 
-def axes_or_new(ax: Axes | None, size: tuple[float, float] = (6.4, 5.6)) -> Axes:
+def get_or_create_axes(ax: Axes | None, size: tuple[float, float] = (6.4, 5.6)) -> Axes:
     """Return `ax`, or, if it is None, the axes of a new pyplot figure of `size` inches."""
     if ax is not None:
         return ax
@@ -50,7 +50,7 @@ def extent_of(points: np.ndarray) -> tuple[float, float, float, float]:
     return (lower_corner[0], upper_corner[0], lower_corner[1], upper_corner[1])
 
 
-def soften_axes(ax: Axes) -> None:
+def style_graph_axes(ax: Axes) -> None:
     """Style the axes of a graph: spines only at the left and at the bottom, in grey, and dark tick labels."""
     ax.spines[["top", "right"]].set_visible(False)
     ax.spines[["left", "bottom"]].set_color(LIGHT_GREY)
@@ -84,5 +84,5 @@ def draw_scale_bar(ax: Axes, extent: tuple[float, float, float, float]) -> None:
 
 
 def _round_to_scale_length(length: float) -> float:
-    decade = 10 ** math.floor(math.log10(length))
-    return max(step * decade for step in (1, 2, 5) if step * decade <= length * (1 + 1e-9))
+    power_of_ten = 10 ** math.floor(math.log10(length))
+    return max(step * power_of_ten for step in (1, 2, 5) if step * power_of_ten <= length * (1 + 1e-9))

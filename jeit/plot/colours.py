@@ -16,12 +16,12 @@ from jeit_solvers.module import Module
 DARK_GREY = "#26292e"
 LIGHT_GREY = "#8b9098"
 # Colour map of changes: red is more conductive, blue more resistive, and white no change.
-DIVERGING = "RdBu_r"
-SEQUENTIAL = "viridis"
+DIVERGING_COLOUR_MAP = "RdBu_r"
+SEQUENTIAL_COLOUR_MAP = "viridis"
 # Colours of curves in one plot, at most six.
 SERIES_COLOURS = ("#1f6fb4", "#d1495b", "#2a9d6f", "#8a5cb8", "#d98a1c", "#5b6470")
 SERIES_MARKERS = ("o", "s", "^", "D", "v", "P")
-_PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
+_SI_PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 # Minimum distance between the ticks of a colour bar of factors, as a share of its limit.
 _MIN_TICK_SPACING = 0.2
 
@@ -32,18 +32,18 @@ def draw_colour_bar(
     label: str,
     *,
     show_sign: bool = False,
-    as_factors: bool = False,
+    has_factor_labels: bool = False,
     position: Axes | None = None,
 ) -> None:
     """Draw a slim colour bar at the right of `ax`, or on the axes `position`; `show_sign`: whether tick labels have a
-    sign, for differences; `as_factors`: whether the values are log₁₀ of factors, which the tick labels state."""
+    sign, for differences; `has_factor_labels`: whether the values are log₁₀ of factors, which the tick labels state."""
     placement: dict[str, Any] = (
         {"ax": ax, "shrink": 0.72, "aspect": 28, "pad": 0.02} if position is None else {"cax": position}
     )
     bar = ax.figure.colorbar(mappable, ticks=MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]), **placement)
-    if as_factors:
-        ticks = _factor_ticks(mappable.get_clim()[1] or 0.0)
-        bar.set_ticks(list(ticks), labels=list(ticks.values()))
+    if has_factor_labels:
+        tick_labels_by_value = _factor_ticks(mappable.get_clim()[1] or 0.0)
+        bar.set_ticks(list(tick_labels_by_value), labels=list(tick_labels_by_value.values()))
     elif show_sign:
         bar.ax.yaxis.set_major_formatter(
             lambda value, _: "0" if abs(value) < 1e-12 else f"{value:+g}".replace("-", "−")
@@ -53,16 +53,19 @@ def draw_colour_bar(
     bar.ax.tick_params(length=2, color=LIGHT_GREY, labelcolor=DARK_GREY)
 
 
-def _factor_ticks(limit: float) -> dict[float, str]:
-    """Ticks of a colour bar from -`limit` to `limit`, log₁₀ of factors, and their labels, such as "×2" and "÷2"."""
-    factors = [1 + step * 10.0**decade for decade in (-4, -3, -2, -1) for step in (1, 2, 5)]
-    factors += [step * 10.0**decade for decade in range(10) for step in (2, 5, 10)]
-    ticks, spacing = {0.0: "1"}, _MIN_TICK_SPACING * limit
+def _factor_ticks(max_log_factor: float) -> dict[float, str]:
+    """Ticks of a colour bar from -`max_log_factor` to `max_log_factor`, log₁₀ of factors, and their labels, such as
+    "×2" and "÷2"."""
+    factors = [1 + step * 10.0**exponent for exponent in (-4, -3, -2, -1) for step in (1, 2, 5)]
+    factors += [step * 10.0**exponent for exponent in range(10) for step in (2, 5, 10)]
+    labels_by_value, spacing = {0.0: "1"}, _MIN_TICK_SPACING * max_log_factor
     for factor in sorted(factors, reverse=True):
-        tick = math.log10(factor)
-        if spacing <= tick <= limit * (1 + 1e-9) and all(abs(tick - other_tick) >= spacing for other_tick in ticks):
-            ticks |= {tick: f"×{factor:g}", -tick: f"÷{factor:g}"}
-    return ticks
+        tick_value = math.log10(factor)
+        if spacing <= tick_value <= max_log_factor * (1 + 1e-9) and all(
+            abs(tick_value - other_tick) >= spacing for other_tick in labels_by_value
+        ):
+            labels_by_value |= {tick_value: f"×{factor:g}", -tick_value: f"÷{factor:g}"}
+    return labels_by_value
 
 
 def choose_si_prefix(max_value: float, unit: str) -> tuple[float, str]:
@@ -72,7 +75,7 @@ def choose_si_prefix(max_value: float, unit: str) -> tuple[float, str]:
         return 1.0, unit
     exponent = 3 * math.floor(math.log10(max_value) / 3 + 1e-9)
     exponent = min(max(exponent, -12), 9)
-    return 10.0**-exponent, _PREFIXES[exponent] + unit
+    return 10.0**-exponent, _SI_PREFIXES[exponent] + unit
 
 
 class ColourScale(Module):
@@ -136,7 +139,7 @@ class ColourScale(Module):
             f"Change of {conductivity_name}" if self.difference else conductivity_name.capitalize()
         )
         label = f"{quantity} ({prefixed_unit})" if prefixed_unit else quantity
-        colour_map = self.colour_map or (DIVERGING if self.difference else SEQUENTIAL)
+        colour_map = self.colour_map or (DIVERGING_COLOUR_MAP if self.difference else SEQUENTIAL_COLOUR_MAP)
         return FittedScale(factor, label, {"cmap": colour_map, "vmin": lower_limit, "vmax": upper_limit}, self)
 
 
@@ -158,7 +161,7 @@ class FittedScale(Module):
                 mappable,
                 self.label,
                 show_sign=self.scale.difference,
-                as_factors=self.scale.logarithmic,
+                has_factor_labels=self.scale.logarithmic,
                 position=position,
             )
 

@@ -157,10 +157,10 @@ def from_channels(
         raise ValueError("from_channels: the measurement patterns contain NaN or infinity. Mask channels instead.")
     _, first_rows, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     # Keep the order of first appearance, so that a file's numbering of its patterns is preserved.
-    appearance = np.argsort(first_rows)
-    rank = np.empty_like(appearance)
-    rank[appearance] = np.arange(len(appearance))
-    return Protocol(drive, rows[first_rows[appearance]], drive_indices, rank[inverse.ravel()], name)
+    order_of_appearance = np.argsort(first_rows)
+    rank = np.empty_like(order_of_appearance)
+    rank[order_of_appearance] = np.arange(len(order_of_appearance))
+    return Protocol(drive, rows[first_rows[order_of_appearance]], drive_indices, rank[inverse.ravel()], name)
 
 
 def _convert_to_matrix(values: Any, pattern_kind: str) -> np.ndarray:
@@ -259,7 +259,7 @@ def haar(
         pattern = np.zeros(count)
         pattern[first_half], pattern[second_half] = len(second_half), -len(first_half)
         drives.append(pattern / len(first_half))  # the first half is at least as large as the second
-        groups += [half for half in (first_half, second_half) if len(half) > 1]
+        groups += [group_half for group_half in (first_half, second_half) if len(group_half) > 1]
     drive = np.array(drives)
     return _all_combinations("haar", drive / np.abs(drive).max(axis=1, keepdims=True), measurement, reference, current)
 
@@ -305,8 +305,8 @@ def optimal(
     max_drives = count - 1 if number is None else check_count(number, "optimal: number", 1)
     # Project the matrices to an orthonormal basis of the currents that sum to zero.
     basis = scipy.linalg.null_space(np.ones((1, count)))
-    dissipated = basis.T @ first_transfer @ basis
-    change = dissipated
+    power_matrix = basis.T @ first_transfer @ basis
+    change = power_matrix
     if other is not None:
         second_transfer = _check_transfer("other", other)
         if second_transfer.shape != first_transfer.shape:
@@ -314,13 +314,13 @@ def optimal(
                 f"other: its shape is {second_transfer.shape}, and that of transfer {first_transfer.shape}; give one "
                 "body's."
             )
-        change = dissipated - basis.T @ second_transfer @ basis
-    if np.linalg.norm(change) <= _MIN_DISTINGUISHABILITY * np.linalg.norm(dissipated):
+        change = power_matrix - basis.T @ second_transfer @ basis
+    if np.linalg.norm(change) <= _MIN_DISTINGUISHABILITY * np.linalg.norm(power_matrix):
         raise ValueError("other: it equals transfer, and no current distinguishes them.")
     if power is None:
         values, directions = _sort_descending(np.linalg.eigh(change @ change))
     else:
-        directions, values = _drives_for_power(dissipated, change, power, other is None)
+        directions, values = _drives_for_power(power_matrix, change, power, other is None)
     is_distinguishing = values > _MIN_DISTINGUISHABILITY * values[0]
     drive = (basis @ directions[:, is_distinguishing][:, :max_drives]).T
     # The sign of an eigenvector is arbitrary: make its largest component positive.
@@ -333,23 +333,23 @@ def optimal(
     return _all_combinations("optimal for a given power", drive, measurement, reference, 1.0)
 
 
-def _drives_for_power(dissipated, change, power: float, has_one_body: bool) -> tuple[np.ndarray, np.ndarray]:
+def _drives_for_power(power_matrix, change, power: float, has_one_body: bool) -> tuple[np.ndarray, np.ndarray]:
     """Directions of the drives that maximise distinguishability for fixed power, and their squared
     distinguishabilities, the largest first."""
     if has_one_body:
         raise ValueError("power needs other: with one body alone the currents for a given power are those of no power.")
     if isinstance(power, bool) or not isinstance(power, int | float) or not 0 < power < np.inf:
         raise ValueError(f"power must be a positive number of watts; it is {power!r}.")
-    symmetric = (dissipated + dissipated.T) / 2
+    symmetric = (power_matrix + power_matrix.T) / 2
     if np.linalg.eigvalsh(symmetric)[0] <= 0:
         raise ValueError("transfer: some currents dissipate no power in it; is it the transfer impedance of a body?")
     values, directions = _sort_descending(scipy.linalg.eigh(change @ change, symmetric))
     return directions, values
 
 
-def _sort_descending(eigenpairs) -> tuple[np.ndarray, np.ndarray]:
+def _sort_descending(values_and_vectors) -> tuple[np.ndarray, np.ndarray]:
     """Sort eigenvalues and eigenvectors by eigenvalue, with the largest first."""
-    values, vectors = eigenpairs
+    values, vectors = values_and_vectors
     return values[::-1], vectors[:, ::-1]
 
 

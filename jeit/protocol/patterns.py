@@ -87,13 +87,13 @@ class CrossedPairs:
         # Channels are selected with NumPy at unit current, so that the argument `current` may be traced.
         drive = pair_patterns(self.drive, self.num_electrodes)
         measurement = pair_patterns(self.measurement, self.num_electrodes)
-        is_kept = np.ones(len(drive_index), dtype=bool)
+        is_selected = np.ones(len(drive_index), dtype=bool)
         if not driven_electrodes:
-            is_kept &= ~shares_electrode(drive, measurement)[drive_index, measurement_index]
+            is_selected &= ~shares_electrode(drive, measurement)[drive_index, measurement_index]
         if reciprocal == "half":
             pairs, _ = reciprocal_channel_pairs(drive, measurement, drive_index, measurement_index)
-            is_kept[pairs[:, 1]] = False
-        if not is_kept.any():
+            is_selected[pairs[:, 1]] = False
+        if not is_selected.any():
             raise ValueError(
                 f"{self.where}: every channel measures on a driven electrode, so none is left. Pass "
                 "driven_electrodes=True, or measure other pairs."
@@ -101,8 +101,8 @@ class CrossedPairs:
         return Protocol(
             drive=current * drive,
             measurement=measurement,
-            drive_index=drive_index[is_kept],
-            measurement_index=measurement_index[is_kept],
+            drive_index=drive_index[is_selected],
+            measurement_index=measurement_index[is_selected],
             name=name,
         )
 
@@ -323,13 +323,13 @@ def reference_electrode(
     electrode_indices(reference, count + 1)
     _check_skipped(skipped, "skipped", count, "reference_electrode")
     boundary = np.array([k for k in range(count + 1) if k != reference])
-    drive_kind = "adjacent" if skipped == 0 else f"skip-{skipped}"
+    drive_name = "adjacent" if skipped == 0 else f"skip-{skipped}"
     drive, measurement = (
         boundary[ring_pairs(count, skipped + 1)],
         np.stack([boundary, np.full(count, reference)], axis=1),
     )
     return CrossedPairs("reference_electrode", count + 1, drive, measurement).protocol(
-        f"{drive_kind} drive against reference electrode, {count} + 1 electrodes",
+        f"{drive_name} drive against reference electrode, {count} + 1 electrodes",
         current=current,
         driven_electrodes=driven_electrodes,
         order=order,

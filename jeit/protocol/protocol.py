@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import did_you_mean, object_text
 from jeit.protocol.reciprocity import reciprocal_channel_pairs
-from jeit_solvers.engines import as_array, either_engine, has_values
+from jeit_solvers.engines import as_array, has_values, numpy_or_compiled
 from jeit_solvers.module import Module
 
 
@@ -157,7 +157,7 @@ def _convert_to_indices(values) -> Array:
     return as_array(values, np.int32)
 
 
-@either_engine
+@numpy_or_compiled
 def _select_rows(patterns, row_indices):
     return patterns[row_indices]
 
@@ -320,14 +320,14 @@ class Protocol(Module):
         )
         # Differences of two electrodes are independent, so only drives with other measurements need be examined.
         has_many_electrodes = np.count_nonzero(rows, axis=1) > 2
-        num_redundant, ranks = 0, {}
+        num_redundant_channels, ranks = 0, {}
         for drive_number in np.unique(drive[has_many_electrodes[measurement]]):
             drive_rows = np.sort(measurement[drive == drive_number])
             key = drive_rows.tobytes()
             if key not in ranks:
                 ranks[key] = int(np.linalg.matrix_rank(rows[drive_rows], tol=1e-9))
-            num_redundant += len(drive_rows) - ranks[key]
-        return num_redundant
+            num_redundant_channels += len(drive_rows) - ranks[key]
+        return num_redundant_channels
 
     def reciprocal_pairs(self) -> tuple[Int[np.ndarray, "P 2"], Float[np.ndarray, " P"]]:
         """Pairs of channels whose voltages are proportional by reciprocity, and the ratios of their voltages.

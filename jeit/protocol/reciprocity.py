@@ -17,8 +17,8 @@ def _direction_keys(patterns: np.ndarray) -> tuple[list[bytes], np.ndarray]:
     = scale * unit pattern."""
     # The first entry that is not tiny determines scale and sign, so that proportional rows have the same unit row.
     size = np.max(np.abs(patterns), axis=1, keepdims=True)
-    first_entries = np.argmax(np.abs(patterns) > 1e-9 * size, axis=1)
-    scale = patterns[np.arange(len(patterns)), first_entries]
+    first_nonzero_indices = np.argmax(np.abs(patterns) > 1e-9 * size, axis=1)
+    scale = patterns[np.arange(len(patterns)), first_nonzero_indices]
     unit = np.round(patterns / scale[:, None], 9) + 0.0  # + 0.0 turns -0.0 into 0.0
     return [row.tobytes() for row in unit], scale
 
@@ -40,10 +40,10 @@ def reciprocal_channel_pairs(
     gain = drive_scale[drive_index] * measurement_scale[measurement_index]
     pairs, ratios = [], []
     for first_channel, (d, m) in enumerate(zip(drive_index, measurement_index, strict=True)):
-        second_channel = channel.get((measurement_key[m], drive_key[d]))
-        if second_channel is not None and first_channel < second_channel:
-            pairs.append((first_channel, second_channel))
-            ratios.append(gain[second_channel] / gain[first_channel])
+        reciprocal_channel = channel.get((measurement_key[m], drive_key[d]))
+        if reciprocal_channel is not None and first_channel < reciprocal_channel:
+            pairs.append((first_channel, reciprocal_channel))
+            ratios.append(gain[reciprocal_channel] / gain[first_channel])
     return np.array(pairs, dtype=int).reshape(-1, 2), np.array(ratios, dtype=float)
 
 

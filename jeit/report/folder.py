@@ -16,7 +16,7 @@ import numpy as np
 
 from jeit.data import Measurement
 from jeit.electrodes import AbstractElectrodes
-from jeit.files import whole_files
+from jeit.files import atomically_written_files
 from jeit.mesh import Body
 
 # Handling of characters that cannot be encoded, such as invalid bytes in the names of files.
@@ -28,7 +28,7 @@ def results(folder: str | Path, names: tuple[str, ...]) -> Iterator[Path]:
     """Context manager with a temporary folder for files of the given `names`. The files are moved to `folder` together
     once all of them are written; `folder` is created if needed. Raises `ValueError` if the path `folder` cannot be a
     folder."""
-    with whole_files(results_folder(folder, names)) as temporary_folder:
+    with atomically_written_files(results_folder(folder, names)) as temporary_folder:
         yield temporary_folder
 
 

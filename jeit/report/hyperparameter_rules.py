@@ -10,12 +10,12 @@ import numpy as np
 
 from jeit.arguments import counted, percent
 from jeit.data import Measurement, estimate_noise, impossible_signs, reciprocity_error
-from jeit.data.frame_checks import MOST_RECIPROCITY_ERROR
+from jeit.data.frame_checks import MAX_RECIPROCITY_ERROR
 from jeit.data.quality import rounding_deviation
 from jeit.forward import ForwardModel
 from jeit.imaging import imaging_mesh
 from jeit.imaging.hyperparameter_rules import ComparedRules, RuleOutcome
-from jeit.imaging.wiring import MOST_MISFIT, find_wiring
+from jeit.imaging.wiring import MAX_WIRING_MISFIT, find_wiring
 from jeit.mesh import Mesh
 from jeit.report.folder import (
     describe_domain,
@@ -87,20 +87,20 @@ def _describe_wiring(measurement: Measurement) -> str | None:
         imaging_mesh(domain, electrodes, None, usual=_MAX_MESH_NODES), electrodes, measurement.protocol
     )
     wiring, error = find_wiring(model, reference), reciprocity_error(reference)
-    if error is not None and error > MOST_RECIPROCITY_ERROR and not wiring.explanation:
+    if error is not None and error > MAX_RECIPROCITY_ERROR and not wiring.explanation:
         return (
             f"reciprocity broken by {percent(error)}, and nothing that was tried mends it: channels or drives in "
             "another order than described, or nothing but noise"
         )
     if wiring.fault:
         return wiring.fault
-    if wiring.described > MOST_MISFIT:
+    if wiring.described > MAX_WIRING_MISFIT:
         return f"nothing that was tried speaks against the description, but it misses {percent(wiring.described)}"
     return "nothing speaks against the description"
 
 
 # Maximum number of inclusions marked in one image, so that the marks do not overlap.
-_MAX_MARKED = 8
+_MAX_MARKED_INCLUSIONS = 8
 
 
 def write_choice(result: ComparedRules, folder: str | Path) -> None:
@@ -155,17 +155,17 @@ def draw_choice(result: ComparedRules):
 
 def _draw_outcome(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
     """Draw the image of one rule with its own colour scale; inclusions are marked unless there are more than
-    `_MAX_MARKED`."""
+    `_MAX_MARKED_INCLUSIONS`."""
     from jeit.plot import ColourScale, plot_image
     from jeit.plot.colours import DARK_GREY
-    from jeit.plot.imaging.judgement import COLOURS
+    from jeit.plot.imaging.judgement import RULE_COLOURS
 
     num_inclusions = len(outcome.inclusions)
-    marked_inclusions = outcome.inclusions if num_inclusions <= _MAX_MARKED else ()
+    marked_inclusions = outcome.inclusions if num_inclusions <= _MAX_MARKED_INCLUSIONS else ()
     plot_image(mesh, outcome.change, inclusions=marked_inclusions, scale=ColourScale(bar=False), ax=ax)
     _draw_scale(ax, float(jnp.abs(outcome.change).max()), "S" if mesh.dimension == 2 else "S/m")
     ax.set_title(
-        f"{name}\n{counted(num_inclusions, 'inclusion')}", color=COLOURS.get(name, DARK_GREY), fontsize=11, pad=0
+        f"{name}\n{counted(num_inclusions, 'inclusion')}", color=RULE_COLOURS.get(name, DARK_GREY), fontsize=11, pad=0
     )
 
 
@@ -174,10 +174,10 @@ def _draw_scale(ax, max_value: float, unit: str) -> None:
     from jeit.plot.colours import DARK_GREY, LIGHT_GREY, choose_si_prefix
 
     factor, unit = choose_si_prefix(max_value, unit)
-    scale_limit = factor * max_value
+    colour_limit = factor * max_value
     mappable = next(artist for artist in (*ax.images, *ax.collections) if artist.get_array() is not None)
     bar = ax.figure.colorbar(mappable, ax=ax, orientation="horizontal", shrink=0.62, aspect=18, pad=0.01)
-    bar.set_ticks([-scale_limit, 0, scale_limit], labels=[f"−{scale_limit:.3g}", "0", f"+{scale_limit:.3g} {unit}"])
+    bar.set_ticks([-colour_limit, 0, colour_limit], labels=[f"−{colour_limit:.3g}", "0", f"+{colour_limit:.3g} {unit}"])
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
     bar.ax.tick_params(length=2, color=LIGHT_GREY, labelcolor=DARK_GREY, labelsize=8)
 

@@ -152,8 +152,14 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
         ax=figure.subplots(),
     )
     if truth is not None:
-        ring = {"marker": "o", "markersize": 15, "markerfacecolor": "none", "markeredgewidth": 2, "linestyle": "none"}
-        ax.plot(*truth, color="#157f3b", label="pressed here", **ring)
+        electrode_ring = {
+            "marker": "o",
+            "markersize": 15,
+            "markerfacecolor": "none",
+            "markeredgewidth": 2,
+            "linestyle": "none",
+        }
+        ax.plot(*truth, color="#157f3b", label="pressed here", **electrode_ring)
     if result.labels is not None:
         draw_labels(result.labels, result.extent, ax=ax)
     elif result.shapes is not None:
@@ -170,9 +176,9 @@ def _write_doubts(figure, warning_texts: Sequence[str]) -> None:
     """Write the first doubt about an image below it, and the number of further doubts."""
     if not warning_texts:
         return
-    further_text = f" {len(warning_texts) - 1} more in report.json." if len(warning_texts) > 1 else ""
+    number_of_others_text = f" {len(warning_texts) - 1} more in report.json." if len(warning_texts) > 1 else ""
     width = int(_LETTERS_PER_INCH * figure.get_size_inches()[0])
-    figure.supxlabel(fill(f"Doubt: {warning_texts[0]}{further_text}", width), fontsize=8, color=_DOUBT_COLOUR)
+    figure.supxlabel(fill(f"Doubt: {warning_texts[0]}{number_of_others_text}", width), fontsize=8, color=_DOUBT_COLOUR)
 
 
 def report_image(result: ImagedDifference) -> dict[str, Any]:

@@ -108,12 +108,12 @@ def saved_extras(
         "inclusion_sizes": np.array([inclusion.area for inclusion in inclusions], float),
         "inclusion_peaks": np.array([inclusion.peak for inclusion in inclusions], float),
     }
-    forms = [inclusion.form for inclusion in inclusions if inclusion.form is not None]
-    if forms and len(forms) == len(inclusions):
+    solid_forms = [inclusion.form for inclusion in inclusions if inclusion.form is not None]
+    if solid_forms and len(solid_forms) == len(inclusions):
         extras |= {
-            "inclusion_centres": np.array([form.centre for form in forms]),
-            "inclusion_axes": np.array([form.axes for form in forms]),
-            "inclusion_columns": np.array([form.column for form in forms]),
+            "inclusion_centres": np.array([form.centre for form in solid_forms]),
+            "inclusion_axes": np.array([form.axes for form in solid_forms]),
+            "inclusion_columns": np.array([form.column for form in solid_forms]),
         }
     return extras
 
@@ -224,10 +224,12 @@ def _read_inclusions(mesh: Mesh, arrays: dict[str, np.ndarray]) -> tuple[Inclusi
         raise ValueError("'inclusion_centroids', '_sizes' and '_peaks' do not belong together; write it again.")
     if not all(array.dtype.kind == "f" and np.isfinite(array).all() for array in (centroids, sizes, peaks)):
         raise ValueError("inclusions have values that are not finite; write it again.")
-    records = zip(centroids.tolist(), sizes.tolist(), peaks.tolist(), _read_forms(arrays, num_inclusions), strict=True)
+    inclusion_values = zip(
+        centroids.tolist(), sizes.tolist(), peaks.tolist(), _read_forms(arrays, num_inclusions), strict=True
+    )
     return tuple(
         Inclusion(1 if peak > 0 else -1, tuple(centroid), size, peak, mesh.is_surface, form)
-        for centroid, size, peak, form in records
+        for centroid, size, peak, form in inclusion_values
     )
 
 
@@ -295,11 +297,11 @@ def write_views(
     """
     if image.mesh.dimension != 3 and planes:
         raise ValueError("planes cut solids; this image is of a sheet. Leave them out.")
-    figures = _draw_figures(image, camera, levels, planes, axis, slices)
-    with results(folder, tuple(figures)) as temporary_folder:
-        for name, figure in figures.items():
+    figures_by_name = _draw_figures(image, camera, levels, planes, axis, slices)
+    with results(folder, tuple(figures_by_name)) as temporary_folder:
+        for name, figure in figures_by_name.items():
             figure.savefig(temporary_folder / name, dpi=_DPI)
-    return tuple(figures)
+    return tuple(figures_by_name)
 
 
 def drawn_values(image: SavedImage) -> tuple[np.ndarray, "ColourScale"]:

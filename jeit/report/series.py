@@ -15,7 +15,7 @@ from jeit.imaging.sequence import ImagedSequence
 from jeit.mesh import Mesh
 from jeit.report.folder import describe_measurement, results, to_plain_values, write_json, write_rows
 
-FILMS = (".gif", ".mp4")
+FILM_FORMATS = (".gif", ".mp4")
 FILM_FRAMES = 120
 """Maximum number of frames of a film."""
 # Maximum number of frames per second of a film, and default number if the rate of the stream is not known.
@@ -25,8 +25,8 @@ _MAX_RATE, _DEFAULT_RATE = 25.0, 10.0
 def check_film(name: str) -> str:
     """Check the name of a film's file, and return it. Raises `ValueError` for an unknown suffix, a path with a folder,
     and for .mp4 if ffmpeg is not installed."""
-    if Path(name).suffix.lower() not in FILMS or Path(name).name != name:
-        raise ValueError(f"film must be a name that ends in {' or '.join(FILMS)}; it is '{name}'.")
+    if Path(name).suffix.lower() not in FILM_FORMATS or Path(name).name != name:
+        raise ValueError(f"film must be a name that ends in {' or '.join(FILM_FORMATS)}; it is '{name}'.")
     if name.lower().endswith(".mp4"):
         from matplotlib.animation import FFMpegWriter
 
@@ -168,7 +168,7 @@ def write_series(
 
 def _report(sequence: ImagedSequence, curves: Mapping[str, np.ndarray], oscillations: Sequence[Oscillation]) -> dict:
     series = sequence.series
-    reported = []
+    oscillation_reports = []
     for fitted_oscillation in oscillations:
         region_oscillations = {
             name: oscillation(curve, series.times, fitted_oscillation.frequency) for name, curve in curves.items()
@@ -181,7 +181,7 @@ def _report(sequence: ImagedSequence, curves: Mapping[str, np.ndarray], oscillat
             }
             for name, component in region_oscillations.items()
         }
-        reported.append(
+        oscillation_reports.append(
             {
                 "frequency": fitted_oscillation.frequency,
                 "resolution": fitted_oscillation.resolution,
@@ -202,6 +202,6 @@ def _report(sequence: ImagedSequence, curves: Mapping[str, np.ndarray], oscillat
             "unit": series.unit,
             "hyperparameter": float(sequence.reconstruction.hyperparameter),
             "doubts": list(sequence.doubts),
-            "oscillations": reported,
+            "oscillations": oscillation_reports,
         }
     )

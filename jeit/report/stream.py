@@ -20,7 +20,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jeit.arguments import counted, describe, is_number
-from jeit.files import clear_unfinished, whole_files, written_whole
+from jeit.files import atomically_written_file, atomically_written_files, remove_unfinished_files
 from jeit.image.inclusions import StrongestRegion
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.streaming.stream import FrameImage, FrameStatus
@@ -31,14 +31,14 @@ PICTURES = ("contact sheet", "film")
 """Names of the pictures of a stream, as passed to `drawing`."""
 
 _COLUMNS = ("frame", "status", "channels", "misfit", "iterations", "latency_ms", "x_m", "y_m", "peak", "reason")
-_WITHOUT_IMAGE = (FrameStatus.REFUSED, FrameStatus.UNCHANGED)
+_STATUSES_WITHOUT_IMAGE = (FrameStatus.REFUSED, FrameStatus.UNCHANGED)
 # End of the colour scale of streams without changes, as a share of the background; large enough that noise is not
 # visible.
-_MIN_SCALE_SHARE = 0.01
+_MIN_COLOUR_SCALE_SHARE = 0.01
 # Maximum number of refused frames named below the contact sheet.
-_MAX_NAMED = 8
-# Number of bytes read and compressed at once, and maximum number of values of a `Sample`.
-_BLOCK_BYTES, _MAX_SAMPLE = 2**20, 2**16
+_MAX_NAMED_FRAMES = 8
+# Number of bytes read and compressed at once, and maximum number of values of a `SeriesSample`.
+_BLOCK_BYTES, _MAX_SAMPLE_VALUES = 2**20, 2**16
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def write_stream(
     folder = results_folder(folder, file_names)
     for earlier_name in file_names[1:]:
         (folder / earlier_name).unlink(missing_ok=True)  # the file belongs to an earlier stream
-    clear_unfinished(folder)
+    remove_unfinished_files(folder)
     report = drawing or (lambda task: None)
     mesh, summary = calibration.model.mesh, _StreamSummary(calibration)
     with GrowingRows(folder, (mesh.num_cells,)) as rows:
@@ -139,7 +139,7 @@ class _StreamSummary:
         mesh, self.background = calibration.model.mesh, float(calibration.conductivity)
         self._strongest_region = StrongestRegion(mesh)
         self._empty_image = np.full(mesh.num_cells, np.nan, np.float32)
-        self.latency, self.counts, self.first_reason = Sample(), {}, ""
+        self.latency, self.counts, self.first_reason = SeriesSample(), {}, ""
         self.refused_frames, self.first_imaged, self.max_change = [], -1, 0.0
 
     def add_frame(self, frame_image: FrameImage) -> tuple[list[object], Float[np.ndarray, " m"]]:
@@ -147,7 +147,7 @@ class _StreamSummary:
         self.counts[str(frame_image.status)] = self.counts.get(str(frame_image.status), 0) + 1
         if frame_image.conductivity is None:
             self.first_reason = self.first_reason or frame_image.reason
-            self.refused_frames += [frame_image.number] if len(self.refused_frames) < _MAX_NAMED else []
+            self.refused_frames += [frame_image.number] if len(self.refused_frames) < _MAX_NAMED_FRAMES else []
             return _table_row(frame_image, self._strongest_region, self.background), self._empty_image
         self.first_imaged = frame_image.number if self.first_imaged < 0 else self.first_imaged
         self.latency.append(frame_image.latency)
@@ -157,10 +157,12 @@ class _StreamSummary:
 
     @property
     def colour_limit(self) -> float:
-        """End of the colour scale: the maximum change, or, for streams without changes, `_MIN_SCALE_SHARE` times the
-        background, so that noise does not fill the scale."""
-        changed = sum(self.counts.values()) > sum(self.counts.get(status, 0) for status in _WITHOUT_IMAGE)
-        return self.max_change if changed else _MIN_SCALE_SHARE * self.background
+        """End of the colour scale: the maximum change, or, for streams without changes, `_MIN_COLOUR_SCALE_SHARE` times
+        the background, so that noise does not fill the scale."""
+        has_changed_frames = sum(self.counts.values()) > sum(
+            self.counts.get(status, 0) for status in _STATUSES_WITHOUT_IMAGE
+        )
+        return self.max_change if has_changed_frames else _MIN_COLOUR_SCALE_SHARE * self.background
 
 
 @dataclass(frozen=True)
@@ -176,21 +178,21 @@ class _StreamPictures:
     def draw_pictures(self, rows: GrowingRows, summary: _StreamSummary) -> None:
         """Draw the contact sheet and the film from evenly spaced rows."""
         from jeit.plot import ColourScale, plot_frames
-        from jeit.plot.imaging.series import SHEET_FRAMES, FrameCount
+        from jeit.plot.imaging.series import NUM_CONTACT_SHEET_FRAMES, FrameCount
 
         model, colour_limit = summary.calibration.model, summary.colour_limit
         self.report(PICTURES[0])
-        changes, titles = self._selected_changes(rows, summary, SHEET_FRAMES)
+        changes, titles = self._selected_changes(rows, summary, NUM_CONTACT_SHEET_FRAMES)
         count = FrameCount(rows.number, summary.counts.get("refused", 0), self._titles(summary.refused_frames))
         scale = ColourScale(limit=colour_limit)
         sheet = plot_frames(model.mesh, changes, model.electrodes, titles=titles, scale=scale, count=count)
-        with written_whole(self.folder / "frames.png") as file:
+        with atomically_written_file(self.folder / "frames.png") as file:
             sheet.savefig(file, dpi=120)
         if self.film is None:
             return
         changes, titles = self._selected_changes(rows, summary, FILM_FRAMES)
         film_rate = None if self.rate is None else self.rate * len(changes) / rows.number
-        with whole_files(self.folder) as temporary_folder:
+        with atomically_written_files(self.folder) as temporary_folder:
             write_film(
                 temporary_folder / self.film,
                 model.mesh,
@@ -311,12 +313,12 @@ class GrowingRows:
         `other_arrays`. The rows are copied block by block; for large files, `progress` is called with the percentage
         written."""
         header = {"descr": "<f4", "fortran_order": False, "shape": (self.number, *self.shape)}
-        with written_whole(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        with atomically_written_file(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array_header_1_0(member, header)
-                for share_done, block in self._blocks():
+                for completed_share, block in self._blocks():
                     if progress is not None and self._file.tell() > _BLOCK_BYTES:
-                        progress(f"{100 * share_done:.0f} %")
+                        progress(f"{100 * completed_share:.0f} %")
                     member.write(block)
             for other_name, values in other_arrays.items():
                 with archive.open(f"{other_name}.npy", "w", force_zip64=True) as member:
@@ -350,7 +352,7 @@ def reporting_partial_results(rows: GrowingRows) -> Iterator[None]:
         raise OSError(error.errno, message, str(rows.folder)) from error
 
 
-class Sample:
+class SeriesSample:
     """Evenly spaced sample of a series of numbers of any length: every number of a series of up to 65,536 numbers,
     every second number of a longer series, then every fourth, and so on. Of a long series, 32,768 to 65,536 numbers are
     stored."""
@@ -361,7 +363,7 @@ class Sample:
     def append(self, value: float) -> None:
         """Add the next number of the series, and store it if it belongs to the sample."""
         if self._number % self._step == 0:
-            if len(self._values) == _MAX_SAMPLE:
+            if len(self._values) == _MAX_SAMPLE_VALUES:
                 self._values, self._step = self._values[::2], 2 * self._step
             self._values.append(value)
         self._number += 1

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind, describe, is_number
 from jeit.electrodes import AbstractElectrodes
-from jeit.files import whole_files
+from jeit.files import atomically_written_files
 from jeit.mesh import Mesh, write
 from jeit.mesh.mesh import facet_measures
 from jeit.report.folder import results_folder
@@ -53,7 +53,7 @@ def write_vtu(
     path = Path(path)
     if path.suffix.lower() != ".vtu":
         raise ValueError(f"path: {path.name[:80]} must end in .vtu.")
-    with whole_files(results_folder(path.parent, (path.name,))) as temporary_folder:
+    with atomically_written_files(results_folder(path.parent, (path.name,))) as temporary_folder:
         draft_vtu(temporary_folder / path.name, mesh, cell_data, point_data=point_data, electrodes=electrodes)
 
 
@@ -110,7 +110,7 @@ def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: 
         "  </Collection>",
         "</VTKFile>",
     ]
-    with whole_files(results_folder(path.parent, (path.name, *names))) as temporary_folder:
+    with atomically_written_files(results_folder(path.parent, (path.name, *names))) as temporary_folder:
         for k, name in enumerate(names):
             draft_vtu(temporary_folder / name, mesh, {key: array[k] for key, array in values.items()})
         (temporary_folder / path.name).write_text("\n".join(lines) + "\n", "utf-8")
@@ -144,7 +144,7 @@ def write_xdmf(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: Mappin
     kind = {3: "triangle", 4: "tetra"}[mesh.cells.shape[1]]
     folder = results_folder(path.parent, (path.name,))
     with (
-        whole_files(folder) as temporary_folder,
+        atomically_written_files(folder) as temporary_folder,
         TimeSeriesWriter(str(temporary_folder / path.name), data_format="XML") as file,
     ):
         file.write_points_cells(points, [(kind, np.asarray(mesh.cells))])

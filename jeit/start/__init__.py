@@ -4,7 +4,7 @@ processes."""
 from __future__ import annotations
 
 from jeit.start.jax_setup import (
-    discarded_damaged,
+    discard_damaged_cache_files,
     keep_compiled_code,
     quick_compilation,
     refuse_compiled_code_in_forks,
@@ -12,7 +12,7 @@ from jeit.start.jax_setup import (
 )
 
 __all__ = [
-    "discarded_damaged",
+    "discard_damaged_cache_files",
     "keep_compiled_code",
     "quick_compilation",
     "refuse_compiled_code_in_forks",

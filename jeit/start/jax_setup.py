@@ -46,8 +46,8 @@ def quick_compilation() -> str:
     Code without optimisation compiles in a quarter of the time. The flags depend on the version of jaxlib, because XLA
     (JAX's compiler) aborts the process at unknown flags.
     """
-    fusion = " --xla_cpu_use_fusion_emitters=false" if version("jaxlib").startswith("0.10.") else ""
-    return f"--xla_backend_optimization_level=0{fusion}"
+    fusion_option = " --xla_cpu_use_fusion_emitters=false" if version("jaxlib").startswith("0.10.") else ""
+    return f"--xla_backend_optimization_level=0{fusion_option}"
 
 
 _refuses_compilation = False
@@ -116,7 +116,7 @@ def keep_compiled_code() -> None:
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
-def discarded_damaged(warning: str) -> bool:
+def discard_damaged_cache_files(warning: str) -> bool:
     """Whether a warning is JAX's message that a cached program could not be read; if so, delete all cached files with
     the program's name.
 

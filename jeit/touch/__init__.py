@@ -18,7 +18,7 @@ _find, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 def __getattr__(name: str):
     if name == "LogitBoostClassifier":
-        from jeit.arguments.extras import optional
+        from jeit.arguments.extras import import_optional
 
-        optional("sklearn", name)
+        import_optional("sklearn", name)
     return _find(name)

@@ -25,7 +25,7 @@ _MIN_LOADS = 3
 # Minimum number of touches with each load.
 _MIN_REPETITIONS = 3
 # Fractions of the maximum response between which rise and fall times are measured.
-_RISE_START, _RISE_END = 0.1, 0.9
+_RISE_START_FRACTION, _RISE_END_FRACTION = 0.1, 0.9
 
 
 class Localisation(NamedTuple):
@@ -155,11 +155,15 @@ def response_times(seconds: ArrayLike, response: ArrayLike) -> tuple[float, floa
         raise ValueError(
             "response is nowhere positive; give the response to a touch, with the sign that makes it positive."
         )
-    rise_start, rise_end = (int(np.argmax(response >= share * max_response)) for share in (_RISE_START, _RISE_END))
-    fall_start = len(response) - 1 - int(np.argmax(response[::-1] >= _RISE_END * max_response))
-    is_low = response[fall_start:] < _RISE_START * max_response
+    rise_start, rise_end = (
+        int(np.argmax(response >= share * max_response)) for share in (_RISE_START_FRACTION, _RISE_END_FRACTION)
+    )
+    fall_start_index = len(response) - 1 - int(np.argmax(response[::-1] >= _RISE_END_FRACTION * max_response))
+    is_below_rise_start = response[fall_start_index:] < _RISE_START_FRACTION * max_response
     fall_time = (
-        float(seconds[fall_start + int(np.argmax(is_low))] - seconds[fall_start]) if is_low.any() else float("inf")
+        float(seconds[fall_start_index + int(np.argmax(is_below_rise_start))] - seconds[fall_start_index])
+        if is_below_rise_start.any()
+        else float("inf")
     )
     return float(seconds[rise_end] - seconds[rise_start]), fall_time
 

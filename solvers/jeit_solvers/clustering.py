@@ -105,8 +105,8 @@ def _check_count(name: str, count: int) -> None:
 @partial(jax.jit, static_argnums=(3, 4))
 def _kmeans(points, key, stopping_criteria: tuple[Any, Any], num_clusters: int, restarts: int) -> KMeans:
     # Labels have no derivative. The derivative of the means for constant labels needs no loop.
-    find_best = in_turn(partial(_best_restart, num_clusters, restarts))
-    best_state = find_best(jax.lax.stop_gradient(points), key, stopping_criteria)
+    find_best_restart = in_turn(partial(_best_restart, num_clusters, restarts))
+    best_state = find_best_restart(jax.lax.stop_gradient(points), key, stopping_criteria)
     centres = _cluster_means(points, best_state.labels, best_state.centres)
     return KMeans(
         centres=centres,
@@ -139,10 +139,10 @@ def _best_restart(num_clusters: int, restarts: int, points, key, stopping_criter
     # start after the other, and no start waits for the slowest.
     draws = jax.random.uniform(key, (restarts, num_clusters, _num_candidates(num_clusters)), points.dtype)
     starts = jax.vmap(lambda draws: _kmeans_plus_plus(centred, squares, draws))(draws)
-    descend = in_turn(_lloyd)
-    final_states = jax.vmap(lambda start: descend(start, centred, squares, stopping_criteria))(starts)
-    best_end = jax.tree.map(lambda array: array[jnp.argmin(final_states.inertia)], final_states)
-    return eqx.tree_at(lambda state: state.centres, best_end, best_end.centres + mean)
+    minimise_inertia = in_turn(_lloyd)
+    final_states = jax.vmap(lambda start: minimise_inertia(start, centred, squares, stopping_criteria))(starts)
+    best_final_state = jax.tree.map(lambda array: array[jnp.argmin(final_states.inertia)], final_states)
+    return eqx.tree_at(lambda state: state.centres, best_final_state, best_final_state.centres + mean)
 
 
 def _num_candidates(num_clusters: int) -> int:
@@ -150,27 +150,27 @@ def _num_candidates(num_clusters: int) -> int:
     return 2 + int(np.log(num_clusters))
 
 
-def _kmeans_plus_plus(points, squares, draws: Float[Array, "k trials"]) -> Float[Array, "k d"]:
+def _kmeans_plus_plus(points, squares, random_numbers: Float[Array, "k trials"]) -> Float[Array, "k d"]:
     """Greedy k-means++: a few points are drawn with probabilities proportional to their squared distance to the nearest
-    centre. The next centre is the drawn point that lowers the sum of the squared distances most. `draws`: random
-    numbers from 0 to 1."""
+    centre. The next centre is the drawn point that lowers the sum of the squared distances most. `random_numbers`:
+    random numbers from 0 to 1."""
     last_index = len(points) - 1
 
     def squared_distances(point_indices):
         return jnp.maximum(squares[point_indices][:, None] - 2 * points[point_indices] @ points.T + squares, 0)
 
-    def add_centre(nearest_distances, draws):
+    def add_centre(nearest_distances, random_numbers):
         cumulative_weights = jnp.cumsum(nearest_distances)
         candidates = jnp.searchsorted(
-            cumulative_weights, draws * cumulative_weights[-1], side="right", method="compare_all"
+            cumulative_weights, random_numbers * cumulative_weights[-1], side="right", method="compare_all"
         )
         candidates = jnp.minimum(candidates, last_index)
-        lowered_distances = jnp.minimum(nearest_distances, squared_distances(candidates))
-        best_index = jnp.argmin(jnp.sum(lowered_distances, axis=1))
-        return lowered_distances[best_index], candidates[best_index]
+        distances_with_candidates = jnp.minimum(nearest_distances, squared_distances(candidates))
+        best_index = jnp.argmin(jnp.sum(distances_with_candidates, axis=1))
+        return distances_with_candidates[best_index], candidates[best_index]
 
-    first_index = jnp.minimum((draws[0, :1] * len(points)).astype(int), last_index)
-    _, other_indices = jax.lax.scan(add_centre, squared_distances(first_index)[0], draws[1:])
+    first_index = jnp.minimum((random_numbers[0, :1] * len(points)).astype(int), last_index)
+    _, other_indices = jax.lax.scan(add_centre, squared_distances(first_index)[0], random_numbers[1:])
     return points[jnp.concatenate([first_index, other_indices])]
 
 
@@ -185,17 +185,17 @@ def _lloyd(start, points, squares, stopping_criteria) -> _State:
         """Squared distances between `centres` and points, minus the squared norms of the points."""
         return jnp.sum(centres**2, axis=1)[:, None] - 2 * centres @ points.T
 
-    def update_scores(scores, centres, is_moved):
+    def update_scores(scores, centres, is_moved_centre):
         """Update the scores of the centres that moved. After a few steps most centres do not move, and their scores do
         not change."""
 
         def score_moved_centres():
-            centre_indices = jnp.nonzero(is_moved, size=max_moved, fill_value=num_clusters)[0]
+            centre_indices = jnp.nonzero(is_moved_centre, size=max_moved, fill_value=num_clusters)[0]
             return scores.at[centre_indices].set(
                 compute_scores(jnp.take(centres, centre_indices, axis=0, mode="clip")), mode="drop"
             )
 
-        return jax.lax.cond(jnp.sum(is_moved) <= max_moved, score_moved_centres, lambda: compute_scores(centres))
+        return jax.lax.cond(jnp.sum(is_moved_centre) <= max_moved, score_moved_centres, lambda: compute_scores(centres))
 
     def assign(scores):
         """Labels, distances and inertia for the nearest centres; of several equally near centres the first is used.
@@ -217,22 +217,22 @@ def _lloyd(start, points, squares, stopping_criteria) -> _State:
         centres = _cluster_means(points, labels, state.centres)
         scores = update_scores(scores, centres, jnp.any(centres != state.centres, axis=1))
         labels, distances, inertia = assign(scores)
-        settled = jnp.all(labels == state.labels) | (state.inertia - inertia <= tolerance * state.inertia)
-        return _State(centres, labels, distances, inertia, state.steps + 1, settled), scores
+        has_converged = jnp.all(labels == state.labels) | (state.inertia - inertia <= tolerance * state.inertia)
+        return _State(centres, labels, distances, inertia, state.steps + 1, has_converged), scores
 
     def is_unfinished(loop):
         return ~loop[0].is_converged & (loop[0].steps < max_steps)
 
     scores = compute_scores(start)
-    first_state = _State(start, *assign(scores), jnp.zeros((), int), jnp.zeros((), bool))
-    return jax.lax.while_loop(is_unfinished, step, (first_state, scores))[0]
+    initial_state = _State(start, *assign(scores), jnp.zeros((), int), jnp.zeros((), bool))
+    return jax.lax.while_loop(is_unfinished, step, (initial_state, scores))[0]
 
 
 def _fill_empty_clusters(labels, distance, counts) -> Int[Array, " n"]:
     """Assign the points that lie farthest from their centres to the empty clusters, and return the new labels."""
     is_empty = counts == 0
-    spare_distances = jnp.where(counts[labels] > 1, distance, -1)
-    farthest_points = jax.lax.top_k(spare_distances, len(counts))[1]
+    distances_in_large_clusters = jnp.where(counts[labels] > 1, distance, -1)
+    farthest_points = jax.lax.top_k(distances_in_large_clusters, len(counts))[1]
     moved_points = jnp.where(is_empty, farthest_points[jnp.cumsum(is_empty) - 1], len(labels))
     return labels.at[moved_points].set(jnp.arange(len(counts)), mode="drop")
 
@@ -245,14 +245,14 @@ def _cluster_means(points, labels, default_means) -> Float[Array, "k d"]:
     """Mean of the points of each cluster; for empty clusters the rows of `default_means` (k, d)."""
     num_clusters = len(default_means)
 
-    def scattered(points, labels):
+    def sum_by_scattering(points, labels):
         return jax.ops.segment_sum(points, labels, num_clusters)
 
-    def multiplied(points, labels):
+    def sum_by_product(points, labels):
         return jax.nn.one_hot(labels, num_clusters, dtype=points.dtype, axis=0) @ points
 
     # On a CPU a sum by index costs a fifth of the product; on accelerators the order of such a sum, and so its
     # rounding, is random.
-    totals = jax.lax.platform_dependent(points, labels, cpu=scattered, default=multiplied)
+    totals = jax.lax.platform_dependent(points, labels, cpu=sum_by_scattering, default=sum_by_product)
     counts = _cluster_sizes(labels, num_clusters)[:, None]
     return jnp.where(counts > 0, totals / jnp.maximum(counts, 1), default_means)

@@ -73,11 +73,11 @@ def over_cores(function: Callable[[Int[np.ndarray, "c s"]], Array], num_parts: i
     num_groups = -(-num_parts // group_size)
     num_cores = min(number_of_cores(), num_groups)
     num_groups = -(-num_groups // num_cores)
-    part_groups = np.minimum(np.arange(num_cores * num_groups * group_size), num_parts - 1).reshape(
+    parts_by_core = np.minimum(np.arange(num_cores * num_groups * group_size), num_parts - 1).reshape(
         num_cores, num_groups, group_size
     )
     with ThreadPoolExecutor(num_cores) as pool:
-        results = list(pool.map(lambda part: jax.block_until_ready(function(part)), part_groups))
+        results = list(pool.map(lambda part: jax.block_until_ready(function(part)), parts_by_core))
     return results[0] if num_cores == 1 else jnp.concatenate(results)
 
 
@@ -105,11 +105,11 @@ def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
     on_cores(lambda part: squares.__setitem__(part, part**2), range(4))
     ```
     """
-    call, is_nested = _Call(function, parts), getattr(_thread, "has_core", False)
+    call, is_nested_call = _Call(function, parts), getattr(_thread, "has_core", False)
     with one_thread_of_blas() if len(parts) > 1 else contextlib.nullcontext():
-        if len(parts) <= 1 or is_nested or not call.take_core():
+        if len(parts) <= 1 or is_nested_call or not call.take_core():
             call.process_parts()
-        with call.free_cores.lend() if is_nested else contextlib.nullcontext():
+        with call.free_cores.lend() if is_nested_call else contextlib.nullcontext():
             call.wait_until_done()
     if call.errors:
         raise call.errors[0]
@@ -137,7 +137,10 @@ class _Call:
 
     def process_parts(self) -> None:
         """Process parts until none is left, and start further threads meanwhile."""
-        calls_around, _thread.abandoned_calls = getattr(_thread, "abandoned_calls", ()), self.abandoned_calls
+        outer_abandoned_calls, _thread.abandoned_calls = (
+            getattr(_thread, "abandoned_calls", ()),
+            self.abandoned_calls,
+        )
         try:
             with np.errstate(all="ignore"):  # every thread has its own error state
                 while self.remaining_parts and not self.abandoned.is_set():
@@ -152,7 +155,7 @@ class _Call:
             self.abandoned.set()
             self.errors.append(error)
         finally:
-            _thread.abandoned_calls = calls_around
+            _thread.abandoned_calls = outer_abandoned_calls
 
     def _process_parts_on_core(self) -> None:
         _thread.has_core = True

@@ -14,10 +14,10 @@ from jaxtyping import Array, Float, Inexact
 from jeit_solvers.engines import host, namespace
 
 # Sizes of the smallest blocks of recursive inversion, without and with LAPACK.
-_BLOCK, _LAPACK_BLOCK = 8, 128
+_BLOCK_SIZE, _LAPACK_BLOCK_SIZE = 8, 128
 # Number of smallest blocks that a compiled loop over rows may span. It runs about as fast as recursion down to one
 # block, and compiles in half the time.
-_BLOCKS_OF_A_LOOP = 4
+_MAX_BLOCKS_OF_LOOP = 4
 # Maximum size of compiled matrices that are inverted by recursion.
 _MAX_RECURSIVE_SIZE = 128
 # Number of matrices in a batch above which unrolled code is used.
@@ -150,14 +150,14 @@ def _inverse_cholesky_recursive(matrices: Inexact[Array, "batch s s"]) -> Inexac
     matrix. The smallest blocks are inverted by unrolled code in large batches. In small batches a loop over short
     vectors inverts larger blocks, the larger the fewer the matrices."""
     batch, size, _ = matrices.shape
-    is_numpy = isinstance(matrices, np.ndarray)
-    uses_lapack = is_numpy and not np.iscomplexobj(matrices)
-    block = _LAPACK_BLOCK if uses_lapack else _BLOCK if batch > 4 else 2 * _BLOCK
-    is_loop = not is_numpy and batch <= _MIN_UNROLLED_BATCH
-    if size <= (_BLOCKS_OF_A_LOOP * block if is_loop else block):
+    is_numpy_array = isinstance(matrices, np.ndarray)
+    uses_lapack = is_numpy_array and not np.iscomplexobj(matrices)
+    block = _LAPACK_BLOCK_SIZE if uses_lapack else _BLOCK_SIZE if batch > 4 else 2 * _BLOCK_SIZE
+    uses_loop = not is_numpy_array and batch <= _MIN_UNROLLED_BATCH
+    if size <= (_MAX_BLOCKS_OF_LOOP * block if uses_loop else block):
         if uses_lapack:
             return _inverse_cholesky_lapack(matrices)
-        return _inverse_cholesky_by_rows(matrices) if is_loop else _inverse_cholesky_unrolled(matrices)
+        return _inverse_cholesky_by_rows(matrices) if uses_loop else _inverse_cholesky_unrolled(matrices)
     first_size = block * -(-size // (2 * block))
     first_inverse = _inverse_cholesky_recursive(matrices[:, :first_size, :first_size])
     lower_block = matrices[:, first_size:, :first_size] @ _transposed(first_inverse)
@@ -176,10 +176,10 @@ def _inverse_cholesky_unrolled(matrices: Inexact[Array, "batch s s"]) -> Inexact
     """Inverse Cholesky factors by elimination of [A | 1] to [L^T | W], row by row, in unrolled code."""
     size, xp = matrices.shape[-1], namespace(matrices)
     identity = xp.broadcast_to(xp.eye(size, dtype=matrices.dtype), matrices.shape)
-    augmented = xp.concatenate([matrices, identity], axis=-1)
+    augmented_matrices = xp.concatenate([matrices, identity], axis=-1)
     rows = []
     for k in range(size):
-        row = augmented[:, k]
+        row = augmented_matrices[:, k]
         for previous in rows:
             row = row - previous[:, k : k + 1] * previous
         rows.append(row * _inverse_square_root(row[:, k : k + 1]))
@@ -191,15 +191,15 @@ def _inverse_cholesky_by_rows(matrices: Inexact[Array, "batch s s"]) -> Inexact[
     reduced by all previous rows in one product."""
     size = matrices.shape[-1]
     identity = jnp.broadcast_to(jnp.eye(size, dtype=matrices.dtype), matrices.shape)
-    augmented = jnp.concatenate([matrices, identity], axis=-1)
+    augmented_matrices = jnp.concatenate([matrices, identity], axis=-1)
 
     def next_row(finished_rows, k):
         weights = _transposed(jax.lax.dynamic_index_in_dim(finished_rows, k, axis=2))
-        row = jax.lax.dynamic_index_in_dim(augmented, k, axis=1) - weights @ finished_rows
+        row = jax.lax.dynamic_index_in_dim(augmented_matrices, k, axis=1) - weights @ finished_rows
         row = row * _inverse_square_root(jax.lax.dynamic_slice_in_dim(row, k, 1, axis=2))
         return jax.lax.dynamic_update_slice_in_dim(finished_rows, row, k, axis=1), None
 
-    finished_rows, _ = jax.lax.scan(next_row, jnp.zeros_like(augmented), jnp.arange(size))
+    finished_rows, _ = jax.lax.scan(next_row, jnp.zeros_like(augmented_matrices), jnp.arange(size))
     return finished_rows[..., size:]
 
 

@@ -47,7 +47,7 @@ def in_turn(function: Callable[..., Any]) -> Callable[..., Any]:
     inverses = jax.vmap(in_turn(jnp.linalg.inv))(jnp.stack([dense, 2 * dense]))
     ```
     """
-    return differentiable_batches(function, one_by_one)
+    return differentiable_batches(function, map_one_by_one)
 
 
 def differentiable_batches(function: Callable[..., Any], batch_rule: Callable[..., Any]) -> Callable[..., Any]:
@@ -79,10 +79,10 @@ def differentiable_batches(function: Callable[..., Any], batch_rule: Callable[..
         moving = [number for number, direction in enumerate(directions) if not _is_zero_tangent(direction)]
 
         def restricted(*values):
-            merged = list(leaves)
+            all_leaves = list(leaves)
             for number, value in zip(moving, values, strict=True):
-                merged[number] = value
-            return function(*jax.tree.unflatten(structure, merged))
+                all_leaves[number] = value
+            return function(*jax.tree.unflatten(structure, all_leaves))
 
         return jax.jvp(restricted, [leaves[i] for i in moving], [directions[i] for i in moving])
 
@@ -93,13 +93,17 @@ def _is_zero_tangent(tangent: Any) -> bool:
     return isinstance(tangent, SymbolicZero)
 
 
-def one_by_one(
-    batchable: Callable[..., Any], unbatched: Callable[..., Any], axis_size: int, batched: Any, *arguments: Any
+def map_one_by_one(
+    batched_function: Callable[..., Any],
+    unbatched_function: Callable[..., Any],
+    axis_size: int,
+    batched_flags: Any,
+    *arguments: Any,
 ) -> Any:
     """Call a function for each element of a batch: one after the other on a CPU, all at once on accelerators."""
     del axis_size
     leaves, structure = jax.tree.flatten(arguments)
-    flags = jax.tree.leaves(batched)
+    flags = jax.tree.leaves(batched_flags)
     batched_leaves = [leaf for leaf, is_batched in zip(leaves, flags, strict=True) if is_batched]
     shared_leaves = [leaf for leaf, is_batched in zip(leaves, flags, strict=True) if not is_batched]
 
@@ -110,17 +114,17 @@ def one_by_one(
         )
 
     def call_in_turn(batched_leaves, shared_leaves):
-        return jax.lax.map(lambda own_values: call(batchable, own_values, shared_leaves), batched_leaves)
+        return jax.lax.map(lambda own_values: call(batched_function, own_values, shared_leaves), batched_leaves)
 
     def call_together(batched_leaves, shared_leaves):
-        return jax.vmap(lambda own_values: call(unbatched, own_values, shared_leaves))(batched_leaves)
+        return jax.vmap(lambda own_values: call(unbatched_function, own_values, shared_leaves))(batched_leaves)
 
     return jax.lax.platform_dependent(batched_leaves, shared_leaves, cpu=call_in_turn, default=call_together)
 
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
-_PROCESS = os.getpid()
+_IMPORTING_PROCESS_ID = os.getpid()
 # Size of a complex step for derivatives; its square is negligible in double precision.
 _COMPLEX_STEP = 1e-100
 
@@ -141,7 +145,7 @@ def has_values(*trees: Any) -> bool:
 
 def is_forked() -> bool:
     """Whether this process was forked from the process that imported this module; compiled code may hang in a fork."""
-    return os.getpid() != _PROCESS
+    return os.getpid() != _IMPORTING_PROCESS_ID
 
 
 def on_host(tree: Any) -> Any:
@@ -177,13 +181,15 @@ def empty_for_jax(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
     return memory[start : start + size].view(dtype).reshape(shape)
 
 
-def product_for_jax(left: Inexact[np.ndarray, "*f k"], right: Inexact[np.ndarray, "k m"]) -> Inexact[Array, "*f m"]:
+def product_for_jax(
+    left_matrix: Inexact[np.ndarray, "*f k"], right_matrix: Inexact[np.ndarray, "k m"]
+) -> Inexact[Array, "*f m"]:
     """Multiply two NumPy matrices and return the product as a JAX array. A large product is computed in memory that JAX
     can use without a copy, because a copy would take longer than the product."""
-    shape, dtype = (*left.shape[:-1], right.shape[1]), np.result_type(left, right)
+    shape, dtype = (*left_matrix.shape[:-1], right_matrix.shape[1]), np.result_type(left_matrix, right_matrix)
     if math.prod(shape) * dtype.itemsize < _MIN_SHARED_BYTES:
-        return _to_jax(left @ right)
-    return jax.device_put(np.matmul(left, right, out=empty_for_jax(shape, dtype)))
+        return _to_jax(left_matrix @ right_matrix)
+    return jax.device_put(np.matmul(left_matrix, right_matrix, out=empty_for_jax(shape, dtype)))
 
 
 @jax.jit
@@ -211,7 +217,7 @@ def evaluate_in_numpy(function: Callable[..., Any], *arguments: Any, **named: An
         return function(*arguments, **named)
 
 
-def either_engine(function: _Function) -> _Function:
+def numpy_or_compiled(function: _Function) -> _Function:
     """Make `function` of arrays run in NumPy if all values are known, and in a compiled program if any array is traced.
 
     The results are JAX arrays, unless all arguments are NumPy arrays.
@@ -233,7 +239,7 @@ def values_at_once(function: _Function) -> _Function:
     """Make `function` of arrays run in NumPy if all values are known, and unchanged, not compiled, if any array is
     traced.
 
-    This suits functions that must read some values even if other arrays are traced, which `either_engine` does not
+    This suits functions that must read some values even if other arrays are traced, which `numpy_or_compiled` does not
     allow. The results are JAX arrays, unless all arguments are NumPy arrays.
     """
 
@@ -247,7 +253,7 @@ def values_at_once(function: _Function) -> _Function:
     return call  # pyright: ignore[reportReturnType]
 
 
-class Recent:
+class RecentResultsCache:
     """Cache of the last few results of a function of immutable pytrees. A result is reused if the arguments, or the
     arrays in them, are the same objects as before."""
 
@@ -317,9 +323,9 @@ def complex_slope(function: Callable[[Any], Any], x: Any, row_index: int) -> Any
 
 
 def _complex_step(function, x, row: int) -> tuple[Any, Any]:
-    shifted = x.astype(complex)
-    shifted[row] += 1j * _COMPLEX_STEP
-    complex_values = function(shifted)
+    shifted_point = x.astype(complex)
+    shifted_point[row] += 1j * _COMPLEX_STEP
+    complex_values = function(shifted_point)
     return jax.tree.map(np.real, complex_values), jax.tree.map(
         lambda values: np.imag(values) / _COMPLEX_STEP, complex_values
     )

@@ -5,7 +5,7 @@ import pytest
 from microphone_arrays import MICROPHONES, OUTLINE, listen
 
 from jeit.acoustic import Taps, calibrate_microphones
-from jeit.acoustic.decay import DECAYS, InverseSquare
+from jeit.acoustic.decay import DECAY_MODELS, InverseSquare
 from jeit.layout import grid
 
 PLACES = grid(0.18, 0.18, 13, 13)
@@ -62,7 +62,7 @@ def exact():
 @pytest.mark.parametrize(
     ("decay", "seed"),
     [("inverse-square", 0), ("attenuated", 0), pytest.param("exponential", 0, marks=pytest.mark.slow)]
-    + [pytest.param(decay, seed, marks=pytest.mark.slow) for decay in DECAYS for seed in (1, 2)],
+    + [pytest.param(decay, seed, marks=pytest.mark.slow) for decay in DECAY_MODELS for seed in (1, 2)],
 )
 def test_exact_data_give_the_parameters(decay, seed):
     """The parameters are exact to 1e-6 with unknown strengths, and the rest of the fit is consistent."""
@@ -78,7 +78,7 @@ def test_exact_data_give_the_parameters(decay, seed):
     np.testing.assert_allclose(fit.explained, 1, atol=1e-9)
     np.testing.assert_allclose(fit.distance, np.sqrt(SQUARED), atol=1e-8)
     assert float(np.log(fit.calibration.microphone_array.decay.gain).mean()) == pytest.approx(0, abs=1e-12)
-    assert isinstance(fit.calibration.microphone_array.decay, DECAYS[decay])
+    assert isinstance(fit.calibration.microphone_array.decay, DECAY_MODELS[decay])
     # No parameter is known better than to a thousandth.
     np.testing.assert_allclose(fit.calibration.microphone_array.noise.relative, 1e-3)
     np.testing.assert_array_equal(fit.calibration.microphone_array.noise.deviation, 0)

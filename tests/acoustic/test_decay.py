@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.acoustic.decay import DECAYS, AttenuatedInverseSquare, Exponential, InverseSquare, find_decay
+from jeit.acoustic.decay import DECAY_MODELS, AttenuatedInverseSquare, Exponential, InverseSquare, find_decay
 
 A, B, LENGTH = np.array([2e-3, 5e-4]), np.array([1e-3, 3e-4]), np.array([0.05, 0.02])
 DISTANCE = np.array([[0.0, 0.01, 0.2], [0.0, 0.03, 0.1]])
@@ -18,7 +18,7 @@ every = pytest.mark.parametrize("name", FORMULAS)
 
 
 def model(name):
-    return DECAYS[name](*(np.asarray(values) for values in FORMULAS[name][0]))
+    return DECAY_MODELS[name](*(np.asarray(values) for values in FORMULAS[name][0]))
 
 
 @every
@@ -48,7 +48,7 @@ def test_gain_is_the_response_at_the_microphone(name):
 def test_logarithms_and_back(name):
     one = model(name)
     np.testing.assert_allclose(one.logarithms(), np.log(FORMULAS[name][0]), rtol=1e-14)
-    again = DECAYS[name].from_logarithms(one.logarithms())
+    again = DECAY_MODELS[name].from_logarithms(one.logarithms())
     for key, values in zip(one.parameters, FORMULAS[name][0], strict=True):
         np.testing.assert_allclose(getattr(again, key), values, rtol=1e-14)
 
@@ -56,7 +56,7 @@ def test_logarithms_and_back(name):
 @every
 def test_the_first_parameter_is_a_factor(name):
     factor = np.eye(len(FORMULAS[name][0]))[:, :1] * np.log(3.0)
-    shifted = DECAYS[name].from_logarithms(model(name).logarithms() + factor)
+    shifted = DECAY_MODELS[name].from_logarithms(model(name).logarithms() + factor)
     squared = np.asarray(DISTANCE**2)
     difference = shifted.log_response(squared) - model(name).log_response(squared)
     np.testing.assert_allclose(difference, np.log(3.0), rtol=1e-12)
@@ -78,7 +78,7 @@ def test_slopes(name):
     direction = np.asarray(np.random.default_rng(1).normal(size=values.shape))
 
     def response(logarithms):
-        return DECAYS[name].from_logarithms(logarithms).log_response(squared)
+        return DECAY_MODELS[name].from_logarithms(logarithms).log_response(squared)
 
     def slope_of(values):
         return jax.jvp(response, (values,), (direction,))[1]
@@ -104,7 +104,7 @@ def test_the_start_reaches_one_spacing(name):
     """The gain is 1 at the microphone for the exponential and inverse square, and smaller but not zero one spacing
     away.
     """
-    start = DECAYS[name].start(0.04, 5)
+    start = DECAY_MODELS[name].start(0.04, 5)
     response = np.exp(start.log_response(np.asarray(np.full((5, 2), [0.0, 0.04**2]))))
     np.testing.assert_allclose(response[:, 0], 1, rtol=1e-5)
     assert ((response[:, 1] > 0.2) & (response[:, 1] < 0.7)).all()
@@ -112,10 +112,10 @@ def test_the_start_reaches_one_spacing(name):
 
 @every
 def test_bounds_contain_the_start(name):
-    low, high = (np.array(bound) for bound in DECAYS[name].bounds(0.2))
-    start = np.asarray(DECAYS[name].start(0.04, 1).logarithms())[:, 0]
+    low, high = (np.array(bound) for bound in DECAY_MODELS[name].bounds(0.2))
+    start = np.asarray(DECAY_MODELS[name].start(0.04, 1).logarithms())[:, 0]
     assert ((low < start) & (start < high)).all()
-    assert len(low) == len(high) == len(DECAYS[name].parameters)
+    assert len(low) == len(high) == len(DECAY_MODELS[name].parameters)
     # The factor is free. The other parameters are bounded on both sides.
     assert np.isinf(low[0])
     assert np.isinf(high[0])

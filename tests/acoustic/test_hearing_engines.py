@@ -10,7 +10,7 @@ import pytest
 from microphone_arrays import array, assert_same, both, inside, noisy, quick_likelihood, received_power, same_shape
 
 from jeit.acoustic import Localiser, cramer_rao, touch_tracks, track
-from jeit.acoustic.decay import DECAYS
+from jeit.acoustic.decay import DECAY_MODELS
 from jeit.acoustic.localisation.locations import Locations, LocationStatus
 from jeit.acoustic.localisation.two_sources import locate_two
 from jeit_solvers.engines import slopes
@@ -114,14 +114,14 @@ def test_tracks(monkeypatch):
     )
 
 
-@pytest.mark.parametrize("name", DECAYS)
+@pytest.mark.parametrize("name", DECAY_MODELS)
 def test_slopes_of_decay_models(name):
     """Complex steps agree with JAX's derivatives."""
-    values = np.log(np.random.default_rng(13).uniform(0.5, 2.0, (len(DECAYS[name].parameters), 5)))
+    values = np.log(np.random.default_rng(13).uniform(0.5, 2.0, (len(DECAY_MODELS[name].parameters), 5)))
     squared = np.geomspace(1e-6, 1.0, 35).reshape(5, 7)
 
     def of(squared):
-        return lambda values: DECAYS[name].from_logarithms(values).log_response(squared)
+        return lambda values: DECAY_MODELS[name].from_logarithms(values).log_response(squared)
 
     assert_same(
         slopes(of(squared), values), jax.jit(lambda values: slopes(of(jnp.asarray(squared)), values))(values), 1e-13

@@ -11,7 +11,7 @@ from microphone_arrays import MICROPHONES, OUTLINE, listen, models
 from jeit.acoustic import Calibration, Intensities, Taps, calibrate_microphones, locate
 from jeit.acoustic.calibration.calibrate import CalibrationFit, fit_each_decay, select_fit
 from jeit.acoustic.calibration.usable_microphones import LeftOutTaps, _assign_folds
-from jeit.acoustic.decay import DECAYS
+from jeit.acoustic.decay import DECAY_MODELS
 from jeit.layout import grid
 
 ARRAY, PLACES = MICROPHONES[9], grid(0.18, 0.18, 7, 7)
@@ -43,7 +43,7 @@ def test_auto_chooses_the_law_that_simulated_the_taps(law):
     fit = select_fit(*fitted(law))
     assert fit.calibration.microphone_array.decay.name == law
     assert fit.left_out[0][1] < 2.1e-3
-    assert {name for name, _ in fit.left_out} == set(DECAYS)
+    assert {name for name, _ in fit.left_out} == set(DECAY_MODELS)
 
 
 def test_the_chosen_fit_is_that_of_its_law_alone():
@@ -93,7 +93,7 @@ def test_taps_in_another_order_are_refused_by_every_law():
     power = np.random.default_rng(1).permutation(LAWS["inverse-square"])
     fits, refused = fit_each_decay(taps(power, 0.2))
     assert fits == {}
-    assert set(refused) == set(DECAYS)
+    assert set(refused) == set(DECAY_MODELS)
     with pytest.raises(ValueError, match="in the order of the taps"):
         select_fit(fits, refused)
 

@@ -54,7 +54,7 @@ def test_of_five_microphones_none_is_left_out():
     microphone_array, power = frames()
     power[:, 5:] = np.nan
     power[:, 4] *= 0.02
-    assert find_setup_changes(microphone_array, power, np.isfinite(power)).altered == []
+    assert find_setup_changes(microphone_array, power, np.isfinite(power)).altered_microphones == []
 
 
 @pytest.mark.parametrize("pair", [(0, 8), (3, 4), (1, 2)])

@@ -8,7 +8,7 @@ import pytest
 from benchmarks.problems.located_arrays import located, located_by_each, plainly_located, taps_of
 from benchmarks.problems.simulated_arrays import DEVELOPMENT, REPORTED, draw_array, steep_array
 from jeit.acoustic.calibration.calibrate import fit_each_decay, select_fit
-from jeit.acoustic.decay import DECAYS
+from jeit.acoustic.decay import DECAY_MODELS
 
 FEW = {"microphones": (9, 12), "tap_side": (7, 7), "repeats": (1, 1)}
 
@@ -50,7 +50,7 @@ def test_the_fit_reports_its_law_and_the_reason(steep):
     fit = steep[0]
     names, off = zip(*fit.left_out, strict=True)
     assert names[0] == fit.calibration.microphone_array.decay.name == "attenuated"
-    assert set(names) == set(DECAYS)
+    assert set(names) == set(DECAY_MODELS)
     assert off[0] == min(off)
     message = (
         f"locates taps left out of the fit to {1e3 * off[0]:.1f} mm, median (inverse-square {1e3 * off[1]:.1f} mm, "
@@ -66,7 +66,7 @@ def test_random_arrays(seed):
     """
     found = located_by_each(draw_array(replace(DEVELOPMENT, **FEW), seed, touches=30))
     assert {one.message for one in found.values()} == {""}
-    assert found["auto"].median < 1.3 * min(found[name].median for name in DECAYS)
+    assert found["auto"].median < 1.3 * min(found[name].median for name in DECAY_MODELS)
     assert found["auto"].held(1) > 0.8
     assert found["auto"].silence == 0
 

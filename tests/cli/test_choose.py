@@ -9,7 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from jeit.cli.commands.choose import show
+from jeit.cli.commands.choose import print_comparison_of_rules
 from jeit.data import read
 from jeit.image import Inclusion
 from jeit.imaging import ImagingSettings, compare_on_data, image_difference
@@ -147,7 +147,7 @@ def test_a_rule_that_cannot_choose_is_refused_alone(tank, capsys):
     assert list(result.outcomes) == ["gcv"]
     assert "needs to know the noise" in result.refused["discrepancy"]
     assert report_choice(result)["refused"] == result.refused
-    show(Console(width=200), result)
+    print_comparison_of_rules(Console(width=200), result)
     assert "needs to know the noise" in capsys.readouterr().out
     with pytest.raises(ValueError, match="needs to know the noise"):
         compare_on_data(touched, rest, settings, rules=["discrepancy"])

@@ -110,11 +110,11 @@ def test_steps_are_printed_with_their_duration_once_they_end(monkeypatch):
     for quiet in (False, True):
         file = io.StringIO()
         with contextlib.suppress(KeyError), Steps(Console(file=file), quiet=quiet) as step:
-            assert step.under_way == ""
+            assert step.current_step_name == ""
             for name, seconds in (("read", 0.04), ("image", 12.34), ("write", 1.0)):
                 step(name)
                 step.report("half")
-                assert step.under_way == name
+                assert step.current_step_name == name
                 now[0] += seconds
             raise KeyError
         printed[quiet] = [line.split() for line in file.getvalue().splitlines()]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jeit
-from jeit.imaging.calibration import SHEET_POINTS, SOLID_POINTS
+from jeit.imaging.calibration import DEFAULT_SHEET_NUM_POINTS, DEFAULT_SOLID_NUM_POINTS
 from jeit.inverse.prior.matern import PRIORS
 
 
@@ -56,7 +56,7 @@ def test_help_states_the_defaults(run):
     for value in (settings.method, settings.prior, rule):
         assert f"{value} (default)" in text
     assert settings.num_points is None
-    assert f"(default {SHEET_POINTS}; of a solid body {SOLID_POINTS})" in text
+    assert f"(default {DEFAULT_SHEET_NUM_POINTS}; of a solid body {DEFAULT_SOLID_NUM_POINTS})" in text
 
 
 @pytest.mark.parametrize("command", ["reconstruct", "choose"])

@@ -25,7 +25,7 @@ from jeit.touch.commands.touch_watch import _describe_touch
 def coarse_images():
     """Image on a coarse mesh, for which the commands have no option."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jeit.imaging.stream_preparation.STREAM_POINTS", 250)
+        patch.setattr("jeit.imaging.stream_preparation.DEFAULT_STREAM_NUM_POINTS", 250)
         yield
 
 

@@ -10,12 +10,12 @@ from scipy.ndimage import binary_erosion, label
 
 from jeit.arguments import counted
 from jeit.cli.console import format_in_one_unit
-from jeit.cli.options import NETWORK
+from jeit.cli.options import NETWORK_METHOD
 from jeit.data import read, write_table
 from jeit.imaging import METHODS, StreamSettings
 from jeit.imaging.method import AUTO
-from jeit.imaging.stream_preparation import STREAM_POINTS
-from jeit.inverse.streaming.imager import FRAME_STEPS
+from jeit.imaging.stream_preparation import DEFAULT_STREAM_NUM_POINTS
+from jeit.inverse.streaming.imager import MAX_STEPS_PER_FRAME
 
 FEW = ("--num-points", 250)
 
@@ -189,14 +189,14 @@ def test_help_of_a_stream_states_the_defaults(run):
     settings = StreamSettings()
     printed = " ".join(run("stream", "--help")[1].replace("│", " ").split())
     assert f"{settings.solver.name} (default)" in printed
-    assert f"(default {STREAM_POINTS})" in printed
+    assert f"(default {DEFAULT_STREAM_NUM_POINTS})" in printed
     assert f"{settings.memory:g} (default)" in printed
-    assert f"(default {FRAME_STEPS})" in printed
+    assert f"(default {MAX_STEPS_PER_FRAME})" in printed
 
 
 def test_help_lists_the_accepted_methods(run):
     printed = " ".join(run("reconstruct", "--help")[1].replace("│", " ").split())
-    assert [name for name in (AUTO, *METHODS, NETWORK) if name not in printed] == []
+    assert [name for name in (AUTO, *METHODS, NETWORK_METHOD) if name not in printed] == []
 
 
 @pytest.mark.parametrize(

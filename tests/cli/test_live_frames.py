@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jeit.cli import streams
-from jeit.cli.streams import FrameCounter, LiveFrames, Stopping
+from jeit.cli.streams import FrameCounter, LiveFrames, StreamStopper
 
 
 @pytest.fixture
@@ -102,11 +102,11 @@ def test_ctrl_c_ends_the_stream(clock):
         signal.raise_signal(signal.SIGINT)
         yield from frames(clock, 3)
 
-    with Stopping() as stopping:
-        assert len(list(stopping.until(LiveFrames(lines(), 10.0, 10.0)))) == 3
+    with StreamStopper() as stopping:
+        assert len(list(stopping.frames_until_signal(LiveFrames(lines(), 10.0, 10.0)))) == 3
     seen = []
-    with Stopping() as stopping:
-        for second, _ in stopping.until(LiveFrames(frames(clock, 9), 10.0, 10.0)):
+    with StreamStopper() as stopping:
+        for second, _ in stopping.frames_until_signal(LiveFrames(frames(clock, 9), 10.0, 10.0)):
             seen.append(second)
             if len(seen) == 4:
                 signal.raise_signal(signal.SIGINT)

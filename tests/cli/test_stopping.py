@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer import Exit
 
-from jeit.cli.streams import Stopping
+from jeit.cli.streams import StreamStopper
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
@@ -124,18 +124,18 @@ def test_ignored_signals_stay_ignored():
     """As under nohup."""
     earlier = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        with Stopping() as stopping:
+        with StreamStopper() as stopping:
             assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
             signal.raise_signal(signal.SIGINT)
-            assert list(stopping.until([1, 2])) == [1, 2]
+            assert list(stopping.frames_until_signal([1, 2])) == [1, 2]
     finally:
         signal.signal(signal.SIGINT, earlier)
 
 
 def test_a_second_signal_ends_the_process_at_once():
     def stream():
-        with Stopping() as stopping:
-            for _ in stopping.until(range(9)):
+        with StreamStopper() as stopping:
+            for _ in stopping.frames_until_signal(range(9)):
                 signal.raise_signal(signal.SIGINT)
                 signal.raise_signal(signal.SIGTERM)
 

@@ -19,7 +19,7 @@ from jeit.touch.commands.touch import _print_touches
 def small_ensembles():
     """Ensembles of a few members, for which the command has no option."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jeit.touch.learnt.methods._NUM_MEMBERS", 8)
+        patch.setattr("jeit.touch.learnt.methods._NUM_ENSEMBLE_MEMBERS", 8)
         yield
 
 

@@ -191,7 +191,7 @@ def test_histograms_share_their_bins(ax):
     ],
 )
 def test_refuses_bad_input(match, draw, monkeypatch, ax):
-    monkeypatch.setattr("jeit.design.plots.responses.axes_or_new", lambda *_: ax)
+    monkeypatch.setattr("jeit.design.plots.responses.get_or_create_axes", lambda *_: ax)
     with pytest.raises(ValueError, match=match):
         draw(four())
 

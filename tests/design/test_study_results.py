@@ -26,7 +26,7 @@ from jeit.design.skin.sheet_touches import sheet_touches
 from jeit.design.skin.touched_cells import touched_cells
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.design.study import batch, open_results, read_study, run_study
-from jeit.design.study.spec import Point
+from jeit.design.study.spec import StudyPoint
 from jeit.electrodes import FaceDiscs, SheetDiscs
 from jeit.forward import ForwardModel
 from jeit.mesh import Rectangle, layer, rectangle
@@ -139,7 +139,7 @@ def test_the_error_at_a_place_that_is_not_determined_is_infinite_and_counted(tmp
     """Two voltages, measured repeatedly, for a place and an amplitude."""
     (tmp_path / "study.toml").write_text(SWEEP.replace('"blind_spot"', '"localisation_error"'), "utf-8")
     study = read_study(tmp_path / "study.toml")
-    measured = Point.measurement_protocol
+    measured = StudyPoint.measurement_protocol
 
     def two(point, current):
         protocol = measured(point, current)
@@ -147,7 +147,7 @@ def test_the_error_at_a_place_that_is_not_determined_is_infinite_and_counted(tmp
         parts = protocol.drive_index[rows], protocol.measurement_index[rows]
         return eqx.tree_at(lambda one: (one.drive_index, one.measurement_index), protocol, parts)
 
-    monkeypatch.setattr(Point, "measurement_protocol", two)
+    monkeypatch.setattr(StudyPoint, "measurement_protocol", two)
     data = run_study(study, store_path)
     assert np.isposinf(data.localisation_error_mean).all()
     assert np.isposinf(data.localisation_error_max).all()

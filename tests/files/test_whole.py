@@ -4,13 +4,13 @@ import os
 import subprocess
 import sys
 
-from jeit.files import whole_files, written_whole
+from jeit.files import atomically_written_file, atomically_written_files
 
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from jeit.files import whole_files, written_whole
-with whole_files(Path(sys.argv[1])) as made, written_whole(Path(sys.argv[1]) / "one") as file:
+from jeit.files import atomically_written_files, atomically_written_file
+with atomically_written_files(Path(sys.argv[1])) as made, atomically_written_file(Path(sys.argv[1]) / "one") as file:
     (made / "two").write_text("half")
     file.write(b"half")
     os.kill(os.getpid(), signal.SIGKILL)
@@ -28,15 +28,15 @@ def test_remains_of_a_killed_process_are_removed_by_the_next(tmp_path):
     elsewhere = tmp_path / f".jeit-00000000-{living[2]}-{'0' * 8}.part"
     for one in (other, elsewhere):
         one.write_text("of a process that lives, or of another machine")
-    with written_whole(tmp_path / "one") as file:
+    with atomically_written_file(tmp_path / "one") as file:
         file.write(b"after")
     assert {one.name for one in tmp_path.iterdir()} == {"one", other.name, elsewhere.name}
     assert (tmp_path / "one").read_text() == "after"
 
 
 def test_a_file_being_written_is_not_removed_by_another_process(tmp_path):
-    with whole_files(tmp_path) as made:
+    with atomically_written_files(tmp_path) as made:
         (made / "two").write_text("two")
-        with written_whole(tmp_path / "one") as file:
+        with atomically_written_file(tmp_path / "one") as file:
             file.write(b"one")
     assert sorted(one.name for one in tmp_path.iterdir()) == ["one", "two"]

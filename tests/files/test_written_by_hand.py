@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from jeit import protocol
 from jeit.acoustic import Calibration
 from jeit.acoustic.calibration.calibration_tables import CalibrationTable, MicrophoneTable
-from jeit.acoustic.decay import DECAYS
+from jeit.acoustic.decay import DECAY_MODELS
 from jeit.data import description_tables, load_description
 from jeit.data.described_body import ELECTRODES, SHAPES
 from jeit.design import read_described_skin
@@ -325,8 +325,8 @@ def test_unchanged_calibrations_are_read(file):
 
 
 def test_tables_cover_all_kinds_and_options():
-    assert {*get_args(CalibrationTable.model_fields["decay"].annotation)} == {*DECAYS}
-    assert {name for kind in DECAYS.values() for name in kind.parameters} <= {*MicrophoneTable.model_fields}
+    assert {*get_args(CalibrationTable.model_fields["decay"].annotation)} == {*DECAY_MODELS}
+    assert {name for kind in DECAY_MODELS.values() for name in kind.parameters} <= {*MicrophoneTable.model_fields}
     assert {*kinds(description_tables.GeometryTable, "shape")} == {*SHAPES}
     assert {*kinds(description_tables.ElectrodesTable, "kind")} == {*ELECTRODES, "facets"}
     constructed = kinds(description_tables.ConstructedTable, "kind")
@@ -377,7 +377,7 @@ class One(Table):
 class Small(Table):
     """A table of tables."""
 
-    subject = "a list"
+    name_in_messages = "a list"
     microphones: list[One]
     strengths: list[float]
 
@@ -385,7 +385,7 @@ class Small(Table):
 class Named(Table):
     """A table of one word."""
 
-    subject = "a name"
+    name_in_messages = "a name"
     word: Word
 
 

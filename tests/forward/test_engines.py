@@ -121,7 +121,7 @@ def test_a_requested_solver_is_used(parts):
 def test_a_large_jacobian_is_computed_on_all_cores(parts, monkeypatch):
     model = ForwardModel(*parts)
     expected = np.asarray(model.jacobian(1.0))
-    monkeypatch.setattr(forward_model, "_BLOCK_ENTRIES", 200)
+    monkeypatch.setattr(forward_model, "_MAX_BLOCK_ENTRIES", 200)
     monkeypatch.setattr(forward_model, "_MIN_PARALLEL_BLOCKS", 2)
     assert_same(model.jacobian(1.0), expected)
 

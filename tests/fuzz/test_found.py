@@ -14,7 +14,7 @@ from oracle import outcome
 from readers import READERS
 
 from jeit.cli import main
-from jeit.cli.options import make_folder, remembering_files
+from jeit.cli.options import make_folder, recording_input_files
 from jeit.files import check_archive, matlab, read_toml
 from jeit.layout import read_layout
 from jeit.mesh import read as read_mesh
@@ -337,7 +337,7 @@ def test_transforms_too_large(tmp_path):
 def test_an_output_of_an_earlier_run_is_not_an_input(tmp_path):
     """Only files that are read must not be overwritten."""
     (tmp_path / "report.json").write_text("{}")
-    command = remembering_files(lambda **_: make_folder(tmp_path, ("report.json",)))
+    command = recording_input_files(lambda **_: make_folder(tmp_path, ("report.json",)))
     command(output=tmp_path / "report.json", data="elsewhere")
     with pytest.raises(ValueError, match="would be written over"):
         command(output=tmp_path, data=str(tmp_path / "report.json"))

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from jeit.cli.commands.reconstruct import show
+from jeit.cli.commands.reconstruct import print_imaging_result
 from jeit.cli.console import plain_console
 from jeit.data import screen
 from jeit.electrodes import BoundaryElectrodes
@@ -46,7 +46,7 @@ def test_the_frame_is_reported_and_written(name, tmp_path, capsys):
     result = image_difference(measured, base, SETTINGS, frame=frame)
     np.testing.assert_array_equal(np.asarray(result.measurement.voltages)[0], FULL)
     assert (result.frame, result.num_frames) == (number, measured.num_frames)
-    show(plain_console(), result, frame_given=frame is not None)
+    print_imaging_result(plain_console(), result, frame_given=frame is not None)
     assert f"frame {label} background " in " ".join(capsys.readouterr().out.split())
     write_image(result, tmp_path)
     data = json.loads((tmp_path / "report.json").read_text())["data"]
@@ -55,7 +55,7 @@ def test_the_frame_is_reported_and_written(name, tmp_path, capsys):
 
 
 def test_one_frame_is_not_numbered(capsys):
-    show(plain_console(), image_difference(tank(FULL), tank(EMPTY), SETTINGS))
+    print_imaging_result(plain_console(), image_difference(tank(FULL), tank(EMPTY), SETTINGS))
     assert "frame " not in capsys.readouterr().out
 
 

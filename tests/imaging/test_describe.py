@@ -30,7 +30,7 @@ RING = {"layout": "ring", "width": 0.012}
 def coarse_models():
     """There is no option for the meshes of the compared descriptions."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jeit.imaging.describe._NODES", {2: 300})
+        patch.setattr("jeit.imaging.describe._NUM_NODES_BY_DIMENSION", {2: 300})
         yield
 
 

@@ -209,18 +209,20 @@ def test_the_evidence_is_that_of_a_dense_covariance():
     data, level, columns = ((weight * values.T[..., channels]).T for values in (difference, reference, patterns))
     size, reciprocal = np.sqrt(np.mean(data**2)), basis[:, :6] @ basis[:, :6].T
     level, columns = reciprocal @ level, reciprocal @ columns
-    level *= electrode_changes._MAX_FACTOR * size * np.sqrt(9) / np.linalg.norm(level)
+    level *= electrode_changes._MAX_COMMON_CONTACT_FACTOR * size * np.sqrt(9) / np.linalg.norm(level)
     for logarithms in ([-0.5, -2.0, -2.5], [-0.5, -2.0, -2.5, -1.0], [0.2, -1.0, -3.5, 0.4]):
         conductivity, noise, error = np.exp(2 * np.array(logarithms[:3])) * size**2
         covariance = conductivity * (basis * eigenvalues) @ basis.T * 9 / eigenvalues.sum() + noise * np.eye(9)
         covariance += error * reciprocal + np.outer(level, level)
-        departure = (logarithms[:3] - electrode_changes._INITIAL_LOGARITHMS[:3]) / electrode_changes._LOGARITHMS_WIDTH
+        departure = (
+            logarithms[:3] - electrode_changes._INITIAL_LOG_DEVIATIONS[:3]
+        ) / electrode_changes._LOG_DEVIATIONS_PRIOR_WIDTH
         prior = departure @ departure
         if len(logarithms) == 4:
             covariance += np.exp(2 * logarithms[3]) * columns @ columns.T
             prior += (2 * max(logarithms[3], 0)) ** 2
         expected = 0.5 * (data @ np.linalg.solve(covariance, data) + np.linalg.slogdet(covariance)[1] + prior)
-        np.testing.assert_allclose(problem._cost(np.array(logarithms)), expected, rtol=1e-9)
+        np.testing.assert_allclose(problem._negative_log_posterior(np.array(logarithms)), expected, rtol=1e-9)
 
 
 def test_a_series_prefers_the_movement_of_many_electrodes_to_that_of_one():

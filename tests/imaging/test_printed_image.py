@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_chosen_frame import EMPTY, FULL, MODEL, SETTINGS, tank
 
-from jeit.cli.commands.reconstruct import show
+from jeit.cli.commands.reconstruct import print_imaging_result
 from jeit.cli.console import plain_console
 from jeit.image import Inclusion, Raster
 from jeit.imaging import ImagingSettings, calibration, image_difference
@@ -31,7 +31,7 @@ def printed(imaged, capsys):
     """Print the image with some of its properties replaced; return the text, and the names of the rows."""
 
     def call(**changed):
-        show(plain_console(), replace(imaged, **changed))
+        print_imaging_result(plain_console(), replace(imaged, **changed))
         lines = capsys.readouterr().out.splitlines()
         table = lines[2 : lines.index("", 2)]
         return " ".join(" ".join(lines).split()), [name for line in table if (name := line[:15].strip())]
@@ -194,7 +194,7 @@ def test_the_first_doubt_is_written_in_the_picture(imaged):
 def test_a_step_takes_the_time_from_its_beginning_to_its_end(monkeypatch):
     now, begun = [100.0], []
     monkeypatch.setattr(calibration.time, "perf_counter", lambda: now[0])
-    clock = calibration.Clock(begun.append)
+    clock = calibration.StepTimer(begun.append)
     for step, seconds in (("mesh", 2.5), ("image", 0.25)):
         with clock(step):
             assert begun[-1] == step

@@ -23,7 +23,7 @@ DESCRIPTION = parse_description(tomllib.loads(TOML), "skin.toml")
 def coarse_images():
     """Learning has no option for the mesh of its images."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jeit.imaging.stream_preparation.STREAM_POINTS", 250)
+        patch.setattr("jeit.imaging.stream_preparation.DEFAULT_STREAM_NUM_POINTS", 250)
         yield
 
 

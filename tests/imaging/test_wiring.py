@@ -55,7 +55,7 @@ def test_a_sound_tank_raises_no_alarm(protocol):
         electrodes = ELECTRODES.with_contact_impedance(impedance)
         model = ForwardModel(MODEL.mesh, electrodes, protocol)
         wiring = find_wiring(model, measured(model))
-        assert wiring.as_described
+        assert wiring.is_described_wiring
         assert wiring.fault == ""
 
 
@@ -142,7 +142,7 @@ def test_a_shifted_first_electrode_is_detected_where_the_body_shows_it():
     assert "look counted the other way round" in explanation
     assert "electrode 1" not in explanation
     # A round, uniform tank looks the same from all electrodes.
-    assert find_wiring(MODEL, measured(places=shifted)).as_described
+    assert find_wiring(MODEL, measured(places=shifted)).is_described_wiring
 
 
 def test_a_frame_that_nothing_explains_is_refused_too():
@@ -151,7 +151,7 @@ def test_a_frame_that_nothing_explains_is_refused_too():
     wiring = find_wiring(
         MODEL, Measurement(voltages, np.ones(208, bool), frame.protocol, electrodes=ELECTRODES, domain=DISK)
     )
-    assert wiring.as_described
+    assert wiring.is_described_wiring
     assert "no order of channels, sign, or exchange" in wiring.fault
 
 

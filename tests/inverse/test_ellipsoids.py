@@ -28,7 +28,7 @@ from jeit.inverse.shapes import (
 from jeit.inverse.shapes.bodies import Bodies
 from jeit.inverse.shapes.ellipsoid import Ellipsoids
 from jeit.inverse.shapes.finer_mesh import refine_at_surfaces
-from jeit.inverse.shapes.problem import Fit, ShapeProblem
+from jeit.inverse.shapes.problem import ShapeFit, ShapeProblem
 from jeit.mesh import box, measures
 from jeit.protocol import opposite
 
@@ -88,9 +88,9 @@ def test_the_contrast_is_explored_once_for_each_material(ellipsoids, monkeypatch
     monkeypatch.setattr(quantities, "quantify", quantify)
     monkeypatch.setattr(quantities, "centroid_radius", lambda *_: 0.0)
     problem: Any = SimpleNamespace(
-        fit=lambda bodies, coefficients, steps: Fit(bodies, coefficients, 1.0, ROWS), misfit=lambda fit: 0.9
+        fit=lambda bodies, coefficients, steps: ShapeFit(bodies, coefficients, 1.0, ROWS), misfit=lambda fit: 0.9
     )
-    fit = Fit(same, point, 1.0, ROWS)
+    fit = ShapeFit(same, point, 1.0, ROWS)
     found = quantities.with_quantities(problem, fit, Accuracy(np.ones(3)), [0.1, 0.2, 0.3], [2, 0, 1])  # pyright: ignore
     materials = [(one.change, one.change_interval, one.measure) for one in found]
     assert materials == [(2, "material of body 0", 0.3), (0, "material of body 0", 0.1), (1, "material of body 1", 0.2)]
@@ -136,7 +136,7 @@ def test_bodies_keep_their_effect_when_they_become_one_material(ellipsoids):
         np.testing.assert_allclose(effect(ellipsoids, point, k, ends), effect(same, after, k, ends))
     # So do they when the contrast of their material is explored; the other material keeps its own.
     problem: Any = SimpleNamespace(
-        fit=lambda bodies, start, *_: Fit(bodies, start, 1.0, ROWS), surprise=lambda fit: 7.0
+        fit=lambda bodies, start, *_: ShapeFit(bodies, start, 1.0, ROWS), negative_log_evidence=lambda fit: 7.0
     )
     last = np.log(same.body(2, after).contrast)
     for log_contrast in (last - 0.5, last + 1.0):
@@ -157,9 +157,9 @@ def test_the_kind_of_bodies_can_be_given(coarse):
     columns, point = bodies.with_other_kind([0], bodies.of_radii([RADIUS]))
     assert columns.odds == 0
     problem: Any = None
-    result = number_and_kinds.SearchResult(Fit(bodies, point, 1.0, ROWS), [9.0], ())  # pyright: ignore
+    result = number_and_kinds.SearchResult(ShapeFit(bodies, point, 1.0, ROWS), [9.0], ())  # pyright: ignore
     assert number_and_kinds.alternative_fits(problem, result)[1] is None
-    assert alternatives.alternatives(problem, Fit(columns, point, 1.0, ROWS)) == [
+    assert alternatives.alternatives(problem, ShapeFit(columns, point, 1.0, ROWS)) == [
         (None, pytest.approx(np.nan, nan_ok=True))
     ]
 
@@ -172,7 +172,7 @@ def test_the_deviation_of_a_common_contrast_includes_that_of_separate_ones(ellip
     class Evidence:
         """Separate contrasts are `worse`, have three times the deviation, and the last is twice the common one."""
 
-        def surprise(self, fit):
+        def negative_log_evidence(self, fit):
             return fit.bodies.odds + (0.0 if fit.bodies.same_material.any() else worse)
 
         def deviations(self, fit):
@@ -181,7 +181,7 @@ def test_the_deviation_of_a_common_contrast_includes_that_of_separate_ones(ellip
     problem: Any = Evidence()
     moved = point.copy()
     moved[25] = np.log(2) / spread
-    one, each = Fit(same, point, 1.0, ROWS), Fit(ellipsoids, moved, 1.0, ROWS)
+    one, each = ShapeFit(same, point, 1.0, ROWS), ShapeFit(ellipsoids, moved, 1.0, ROWS)
     found = alternatives.contrast_deviations(problem, one, each)
     slope = spread * contrast
     wide = [0.3 * slope, 0.3 * slope, contrast + 0.3 * 2 * slope]
@@ -247,7 +247,7 @@ def test_a_ball_is_distinguished_from_a_ghost(coarse, fine, monkeypatch):
     """One mesh fewer than by default, and coarser ones. test_fitted_ellipsoids.py tests a resistive ball with the
     default meshes."""
     monkeypatch.setattr(search, "_MAX_REFINEMENTS", 2)
-    monkeypatch.setattr(search, "_EDGE_LENGTHS", ((0.7,), (0.5,)))
+    monkeypatch.setattr(search, "_RELATIVE_EDGE_LENGTHS_BY_REFINEMENT", ((0.7,), (0.5,)))
     ratio = 4.0
     cut_along, held, rest = fine
     change = np.asarray(cut_along.voltages(BATH * np.where(held, ratio, 1.0))) - rest
@@ -346,7 +346,7 @@ def test_on_a_finer_mesh_a_ball_changes_voltages_as_on_one_cut_along_it(coarse, 
     wanted = (there - rest) * (4 / 3 * np.pi * RADIUS**3 / inside)
     prior = EllipsoidPrior(modes=1, contrast=abs(np.log(factor)))
     balls = Ellipsoids.create(coarse.mesh, prior, [BALL], [1 if factor > 1 else -1])
-    fit = Fit(balls, balls.of_radii([RADIUS]), 0.0, ROWS)
+    fit = ShapeFit(balls, balls.of_radii([RADIUS]), 0.0, ROWS)
     there = refine_at_surfaces(shape_problem(coarse), fit, (0.5,))
     assert coarse.mesh.num_points < there.problem.model.mesh.num_points < 3 * coarse.mesh.num_points
     change = there.change(coarse.protocol, there.bodies.image(fit.coefficients).image, 0.0)
@@ -360,7 +360,7 @@ def test_plates_and_discs_stay_where_they_are_on_a_finer_mesh():
     given = ForwardModel(mesh, electrodes, opposite(18, current=1e-3))
     problem = shape_problem(given)
     balls = Ellipsoids.create(mesh, EllipsoidPrior(), [[0.0, -0.06, 0.05]], [1])  # outside of the wall
-    there = refine_at_surfaces(problem, Fit(balls, balls.of_radii([0.02]), 0.0, ROWS), (0.3,))
+    there = refine_at_surfaces(problem, ShapeFit(balls, balls.of_radii([0.02]), 0.0, ROWS), (0.3,))
     model = there.problem.model
     assert model.mesh.num_points > 2 * mesh.num_points
     area, given_area = (np.asarray(one.electrodes.contact(one.mesh).load).sum(axis=0) for one in (model, given))
@@ -369,16 +369,18 @@ def test_plates_and_discs_stay_where_they_are_on_a_finer_mesh():
 
 def test_conductivity_of_partly_covered_cells(ellipsoids):
     share = np.array([0.0, 0.5, 1.0])
-    conductive, resistive = (np.exp(ellipsoids.mixture(share, np.log(ratio))[0]) for ratio in (4.0, 0.25))
+    conductive, resistive = (
+        np.exp(ellipsoids.mixed_log_conductivity(share, np.log(ratio))[0]) for ratio in (4.0, 0.25)
+    )
     np.testing.assert_allclose(conductive, [1, 1 / (0.5 + 0.5 / 4), 4], rtol=1e-12)
     np.testing.assert_allclose(resistive, [1, (0.5 + 0.5 * 0.5) ** 2, 0.25], rtol=1e-12)
 
 
 def test_refined_cells_know_their_parent_cells(coarse, monkeypatch):
     """Of the mesh before all refinements."""
-    monkeypatch.setattr(finer_mesh, "_MAX_NODES", 10.0)
+    monkeypatch.setattr(finer_mesh, "_MAX_NODE_RATIO", 10.0)
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])
-    there = refine_at_surfaces(shape_problem(coarse), Fit(balls, balls.of_radii([RADIUS]), 0.0, ROWS), (0.6, 0.3))
+    there = refine_at_surfaces(shape_problem(coarse), ShapeFit(balls, balls.of_radii([RADIUS]), 0.0, ROWS), (0.6, 0.3))
     volume = np.asarray(measures(there.problem.model.mesh))
     np.testing.assert_allclose(np.bincount(there.cell, volume), np.asarray(measures(coarse.mesh)), rtol=1e-9)
 
@@ -387,7 +389,7 @@ def test_refined_cells_know_their_parent_cells(coarse, monkeypatch):
 def test_edges_are_refined_while_the_mesh_grows_little():
     coarse = model(400)
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])
-    fit, problem = Fit(balls, balls.of_radii([RADIUS]), 0.0, ROWS), shape_problem(coarse)
+    fit, problem = ShapeFit(balls, balls.of_radii([RADIUS]), 0.0, ROWS), shape_problem(coarse)
     few, many = (refine_at_surfaces(problem, fit, (edge,)).problem.model.mesh.num_points for edge in (1.0, 0.3))
     assert few < 1.5 * coarse.mesh.num_points < many
     assert refine_at_surfaces(problem, fit, (1.0, 0.3)).problem.model.mesh.num_points == few

@@ -207,7 +207,7 @@ def test_gradients_of_batches_are_batches_of_gradients():
         found = reconstruct(MODEL, frame, 1e-3, prior=Gaussian(0.04), hyperparameter=3.0, noise=0.01 * np.abs(EMPTY))
         return 1e3 * WEIGHT @ found.conductivity
 
-    one_by_one, gradients = zip(*map(jax.jit(jax.value_and_grad(value)), frames), strict=True)
+    map_one_by_one, gradients = zip(*map(jax.jit(jax.value_and_grad(value)), frames), strict=True)
     values, together = jax.vmap(jax.value_and_grad(value))(frames)
-    np.testing.assert_allclose(values, one_by_one, rtol=1e-8)
+    np.testing.assert_allclose(values, map_one_by_one, rtol=1e-8)
     np.testing.assert_allclose(together, np.stack(gradients), rtol=1e-7)

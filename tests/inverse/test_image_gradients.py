@@ -164,9 +164,9 @@ def test_batches_of_linear_images():
         xp = np if isinstance(frame, np.ndarray) else jnp
         return one_step(MODEL, 1e-3, hyperparameter=30.0, noise=0.01 * xp.abs(frame)).image(frame - EMPTY)
 
-    one_by_one = np.stack([linear(frame) for frame in frames])
+    map_one_by_one = np.stack([linear(frame) for frame in frames])
     batch = jax.jit(jax.vmap(linear))(frames)
-    np.testing.assert_allclose(batch, one_by_one, rtol=0, atol=1e-9 * abs(one_by_one).max())
+    np.testing.assert_allclose(batch, map_one_by_one, rtol=0, atol=1e-9 * abs(map_one_by_one).max())
 
 
 @pytest.mark.slow

@@ -33,7 +33,7 @@ def test_jacobians_by_blocks(number, model, monkeypatch):
     weights, channels = RANDOM.normal(size=(3, number)), np.arange(number)
     expected = weights @ np.asarray(model.jacobian(1.0))[:number]
     monkeypatch.setattr(forward_model, "_CELLS_AT_ONCE", 70)
-    monkeypatch.setattr(forward_model, "_BLOCK_ENTRIES", 70 * number)
+    monkeypatch.setattr(forward_model, "_MAX_BLOCK_ENTRIES", 70 * number)
     assert model.mesh.num_cells > 3 * 70
     assert model.mesh.num_cells % 70
     found = combined_jacobian(model, 1.0, channels, weights)

@@ -9,7 +9,7 @@ from ball_in_a_box import BALL, RADIUS, SIZE
 
 from jeit.inverse.shapes import EllipsoidPrior, alternatives, number_and_kinds, search
 from jeit.inverse.shapes.ellipsoid import Ellipsoids
-from jeit.inverse.shapes.problem import Fit
+from jeit.inverse.shapes.problem import ShapeFit
 from jeit.mesh import box
 
 MESH = box(*SIZE, num_points=400)
@@ -27,16 +27,16 @@ def test_an_alternative_kind_depends_on_the_data_alone_and_has_its_own_deviation
         """The other kind is `worse` and has twice the deviation."""
 
         def fit(self, bodies, coefficients, *steps):
-            return Fit(bodies, coefficients, 1.0, ROWS)
+            return ShapeFit(bodies, coefficients, 1.0, ROWS)
 
-        def surprise(self, fit):
+        def negative_log_evidence(self, fit):
             return fit.bodies.odds + (0.0 if fit.bodies.is_other_kind[0] == column else worse)
 
         def deviations(self, fit):
             return np.full(len(fit.coefficients), 0.1 if fit.bodies.is_other_kind[0] == column else 0.2)
 
     problem: Any = Evidence()
-    fitted = Fit(bodies, coefficients, 1.0, ROWS)
+    fitted = ShapeFit(bodies, coefficients, 1.0, ROWS)
     ((other, deviation),) = alternatives.alternatives(problem, fitted)  # pyright: ignore
     assert (other is None) == decided
     if other is not None:
@@ -54,13 +54,13 @@ def test_a_kind_that_the_data_exclude_by_far_is_not_tried_again():
 
         def fit(self, bodies, coefficients, *steps):
             tried.append(bodies.is_other_kind.tolist())
-            return Fit(bodies, coefficients, 200.0 if bodies.is_other_kind[0] else 20.0, ROWS)
+            return ShapeFit(bodies, coefficients, 200.0 if bodies.is_other_kind[0] else 20.0, ROWS)
 
-        def surprise(self, fit):
+        def negative_log_evidence(self, fit):
             return fit.bodies.odds + fit.cost
 
     problem: Any = Evidence()
-    found = number_and_kinds.SearchResult(Fit(bodies, bodies.of_radii([0.02, 0.02]), 1.0, ROWS), [9.0, 9.0], ())  # pyright: ignore
+    found = number_and_kinds.SearchResult(ShapeFit(bodies, bodies.of_radii([0.02, 0.02]), 1.0, ROWS), [9.0, 9.0], ())  # pyright: ignore
     found, change = number_and_kinds.alternative_fits(problem, found)
     assert change is None
     assert sorted(tried) == [[False, True], [True, False], [True, True]]  # in any order, on several cores
@@ -82,9 +82,9 @@ class Costs:
 
     def fit(self, bodies, coefficients, steps, *_):
         self.steps.append(steps)
-        return Fit(bodies, coefficients, self.costs.pop(0), ROWS)
+        return ShapeFit(bodies, coefficients, self.costs.pop(0), ROWS)
 
-    def surprise(self, fit):
+    def negative_log_evidence(self, fit):
         return fit.cost
 
 
@@ -93,17 +93,17 @@ def test_fits_that_cannot_be_supported_are_not_made():
     bodies = Ellipsoids.create(MESH, EllipsoidPrior(), [[0.0, 0.0, 0.05], [0.03, 0.0, 0.04]], [1, 1])
     coefficients = bodies.of_radii([0.02, 0.02])
     nothing_left: Any = Costs()
-    assert number_and_kinds._split_bodies(nothing_left, Fit(bodies, coefficients, 1.9, ROWS), 1.0) is None
+    assert number_and_kinds._split_bodies(nothing_left, ShapeFit(bodies, coefficients, 1.9, ROWS), 1.0) is None
     without = bodies.without(0, coefficients)
     hopeless: Any = Costs(1000.0)
     assert number_and_kinds._fit_without(hopeless, 30.0, without).cost == 1000.0
     # Of two trials the one with the least cost has more parameters than any cost could justify.
-    trials = [Fit(bodies, coefficients, cost, ROWS) for cost in (1.0, 2.0)]
+    trials = [ShapeFit(bodies, coefficients, cost, ROWS) for cost in (1.0, 2.0)]
     evidence: Any = SimpleNamespace(
-        surprise=lambda fit: {1.0: 12.0, 2.0: 9.0, 3.0: 10.0}[fit.cost],
-        fit=lambda bodies, coefficients, steps: Fit(bodies, coefficients, 2.0, ROWS),
+        negative_log_evidence=lambda fit: {1.0: 12.0, 2.0: 9.0, 3.0: 10.0}[fit.cost],
+        fit=lambda bodies, coefficients, steps: ShapeFit(bodies, coefficients, 2.0, ROWS),
     )
-    fitted = Fit(bodies, coefficients, 3.0, ROWS)
+    fitted = ShapeFit(bodies, coefficients, 3.0, ROWS)
     assert number_and_kinds._best_fit(evidence, fitted, trials[:1]) is None
     assert number_and_kinds._best_fit(evidence, fitted, trials) is not None
     doubtful: Any = Costs(800.0, 20.0)
@@ -118,7 +118,7 @@ def test_certain_bodies_are_fitted_together_before_others_are_tried():
     class Recorded:
         def fit_level(self, bodies, coefficients, level, steps):
             fitted.append((list(bodies.sign), coefficients))
-            return level, Fit(bodies, coefficients, 1.0, ROWS), 0.0  # no other is more probable
+            return level, ShapeFit(bodies, coefficients, 1.0, ROWS), 0.0  # no other is more probable
 
     places = [BALL, [-0.03, 0.04, 0.03], [0.0, 0.0, 0.05]]
     balls = Ellipsoids.create(MESH, EllipsoidPrior(modes=1), places, [1, 1, -1])
@@ -136,8 +136,8 @@ def test_splits_are_tried_unless_a_change_of_kind_is_likelier_than_any(monkeypat
     """The bodies cost 4, and -log evidence is 12.5, so that a perfect fit would have 8.5."""
     tried = []
     bodies = Ellipsoids.create(MESH, EllipsoidPrior(), [[0.0, 0.0, 0.05]], [1])
-    base, changed = (Fit(bodies, bodies.of_radii([0.02]), cost, ROWS) for cost in (4.0, 1.0))
-    problem: Any = SimpleNamespace(surprise=lambda fit: 12.5 if fit is base else found)
+    base, changed = (ShapeFit(bodies, bodies.of_radii([0.02]), cost, ROWS) for cost in (4.0, 1.0))
+    problem: Any = SimpleNamespace(negative_log_evidence=lambda fit: 12.5 if fit is base else found)
     result = number_and_kinds.SearchResult(base, [9.0], ())
     monkeypatch.setattr(number_and_kinds, "alternative_fits", lambda *_: (result, changed))
     monkeypatch.setattr(number_and_kinds, "_split_bodies", lambda *_: tried.append(True))

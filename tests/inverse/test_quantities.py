@@ -54,7 +54,7 @@ def test_quantities_of_a_fitted_body_and_wider_intervals_by_model_errors(monkeyp
 
     The data are of the same mesh, so that the error of the mesh is set to zero.
     """
-    monkeypatch.setitem(alternatives._MESH_DEVIATION, 2, 1e-9)
+    monkeypatch.setitem(alternatives._MESH_LOG_CONTRAST_DEVIATION, 2, 1e-9)
     model = ForwardModel(DISK.mesh(num_points=500), DESCRIBED, PROTOCOL)
     middle, radius = np.asarray(centroids(model.mesh)), 0.025
     inside = np.linalg.norm(middle - [0.02, 0.035], axis=1) < radius
@@ -156,7 +156,7 @@ def test_errors_of_the_mesh_and_of_the_size_widen_intervals(monkeypatch):
     options = {"start": [(1, (0.02, 0.03), 0.02)], "noise": noise, "prior": StarPrior(modes=1)}
     found = {}
     for mesh, size, strength in ((1e-9, 1e-9, 0.0), (0.3, 1e-9, 0.0), (1e-9, 0.05, 0.0), (1e-9, 1e-9, 0.1)):
-        monkeypatch.setitem(alternatives._MESH_DEVIATION, 2, mesh)
+        monkeypatch.setitem(alternatives._MESH_LOG_CONTRAST_DEVIATION, 2, mesh)
         accuracy = Accuracy(noise, None, size, strength)
         (one,) = reconstruct_shapes(model, voltages, SIGMA, accuracy=accuracy, **options).bodies
         low, high = one.quantities.change_interval
@@ -215,8 +215,8 @@ def test_changes_of_electrodes_are_errors_of_the_channels_and_are_estimated():
         fit: Any = SimpleNamespace(rows=(-difference, None))
         estimate = changes.voltages(1.0, fit, model.protocol)
         assert np.linalg.norm(estimate - (moved - rest)) < share * np.linalg.norm(moved - rest)
-        assert changes.likeliest_level(fit) > 0
-    assert changes.likeliest_level(SimpleNamespace(rows=(np.zeros(len(data.weight)), None))) == 0  # pyright: ignore
+        assert changes.most_likely_level(fit) > 0
+    assert changes.most_likely_level(SimpleNamespace(rows=(np.zeros(len(data.weight)), None))) == 0  # pyright: ignore
 
 
 def test_errors_are_scaled_to_the_misfit_of_a_fit():

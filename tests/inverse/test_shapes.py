@@ -9,7 +9,7 @@ from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse.shapes import Star, StarPrior, reconstruct_shapes
 from jeit.inverse.shapes.number_and_kinds import remove_unsupported
-from jeit.inverse.shapes.problem import Fit
+from jeit.inverse.shapes.problem import ShapeFit
 from jeit.inverse.shapes.star import Stars
 from jeit.layout import ring
 from jeit.mesh import Disk, centroids
@@ -130,9 +130,9 @@ class Listed:
         self.costs, self.weight = costs, weight
 
     def fit(self, bodies, coefficients, *steps):
-        return Fit(bodies, coefficients, self.costs[bodies.names], ())
+        return ShapeFit(bodies, coefficients, self.costs[bodies.names], ())
 
-    def surprise(self, fit):
+    def negative_log_evidence(self, fit):
         return fit.cost + self.weight * len(fit.bodies.names)
 
 
@@ -155,7 +155,7 @@ def test_ghosts_are_removed_weakest_first(least_rise, weight, left, ghosts):
     np.testing.assert_allclose([rise for _, rise in result.doubtful], [rise for _, rise in ghosts])
     # Body a is beyond doubt, so it is left out only once.
     rises = {"abc": [900 / 40, 60 / 40, 44 / 40], "ab": [900 / 44, 55 / 44], "a": [900 / 55]}
-    np.testing.assert_allclose(result.rises, rises[left])
+    np.testing.assert_allclose(result.objective_ratios, rises[left])
 
 
 @pytest.mark.slow

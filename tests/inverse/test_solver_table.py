@@ -54,7 +54,7 @@ SOLVERS = {
 
 
 @functools.cache
-def pose(name):
+def pose_least_squares(name):
     """Model, voltages of a finer one, options, and the best possible reconstruction."""
     make, centre, radius, conductivity = PROBLEMS[name]
     fine, model = make(2000), make(300)
@@ -83,7 +83,7 @@ def cases():
 
 @pytest.mark.parametrize(("problem", "name"), list(cases()))
 def test_every_solver_on_every_problem(problem, name):
-    model, voltages, options, best = pose(problem)
+    model, voltages, options, best = pose_least_squares(problem)
     solver, limit = SOLVERS[name]
     result = reconstruct(model, voltages, 1.0, solver=solver, **options)
     assert result.status == "converged", result.reason
@@ -97,7 +97,7 @@ def test_every_solver_on_every_problem(problem, name):
 @pytest.mark.slow
 @pytest.mark.parametrize(("problem", "name"), BOUNDED)
 def test_inactive_bounds_change_nothing(problem, name):
-    model, voltages, options, free = pose(problem)
+    model, voltages, options, free = pose_least_squares(problem)
     within = Parametrisation(bounds=(1e-3, 1e3))
     result = reconstruct(model, voltages, 1.0, solver=SOLVERS[name][0], parametrisation=within, **options)
     assert result.status == "converged"
@@ -109,7 +109,7 @@ def test_inactive_bounds_change_nothing(problem, name):
 @pytest.mark.parametrize(("problem", "name"), BOUNDED)
 def test_bounds_hold_and_are_reached(problem, name):
     """With other priors; see test_bounded.py."""
-    model, voltages, options, _ = pose(problem)
+    model, voltages, options, _ = pose_least_squares(problem)
     between = Parametrisation(bounds=(0.95, 1.6))
     result = reconstruct(model, voltages, 1.0, solver=SOLVERS[name][0], parametrisation=between, **options)
     values = np.asarray(result.conductivity)

@@ -18,7 +18,7 @@ from jeit.inverse.nonlinear import (
     Scale,
 )
 from jeit.inverse.nonlinear.problem import independent_data
-from jeit.inverse.nonlinear.reconstruct import pose
+from jeit.inverse.nonlinear.reconstruct import pose_least_squares
 from jeit.layout import grid, ring
 from jeit.mesh import Disk, Rectangle, centroids
 from jeit.protocol import adjacent
@@ -142,7 +142,8 @@ def test_derivative_with_all_unknowns():
     unknowns = [ContactImpedance(model), ElectrodePosition(model, 1e-4), Background(), Scale()]
     small, data = independent_data(model, voltages, np.ones(len(voltages), bool), noise, at_once=False)
     background, unknown = np.ones(model.mesh.num_cells), Parametrisation(unknowns=unknowns)
-    inversion, _ = pose(small, data, background, Gaussian(0.02), 1.0, unknown)  # solvers are compiled for seconds
+    # Solvers are compiled for seconds.
+    inversion, _ = pose_least_squares(small, data, background, Gaussian(0.02), 1.0, unknown)
     point = 0.01 * jax.random.normal(jax.random.key(1), (inversion.num_coefficients,))
     direction = jax.random.normal(jax.random.key(2), point.shape)
     residual, jacobian = eqx.filter_jit(inversion.linearise)(point)

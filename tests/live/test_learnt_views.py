@@ -33,7 +33,7 @@ DESCRIPTION = parse_description(tomllib.loads(TOML), "skin.toml")
 def _quick():
     """Images for gestures are coarse: learning has no option for their mesh."""
     with libraries_found_once(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jeit.imaging.stream_preparation.STREAM_POINTS", 250)
+        patch.setattr("jeit.imaging.stream_preparation.DEFAULT_STREAM_NUM_POINTS", 250)
         yield
 
 

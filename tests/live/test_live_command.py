@@ -31,7 +31,7 @@ from jeit.touch import LearntSkin, Presses, learn_gestures, write_skin
 
 @pytest.fixture(autouse=True)
 def _coarse(monkeypatch):
-    monkeypatch.setattr("jeit.imaging.stream_preparation.STREAM_POINTS", 250)
+    monkeypatch.setattr("jeit.imaging.stream_preparation.DEFAULT_STREAM_NUM_POINTS", 250)
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
         monkeypatch.delenv(name, raising=False)
 

@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 from stand_in import StandIn
 
-from jeit.live.page.application import host_allowed
-from jeit.live.page.hub import Hub, Viewer
+from jeit.live.page.application import is_host_allowed
+from jeit.live.page.hub import PageHub, Viewer
 from jeit.live.page.wire import (
     MAX_COMMAND_LENGTH,
-    NO_PIXEL,
+    OUTSIDE_PIXEL_VALUE,
     Mark,
     picture_message,
     read_command,
@@ -70,7 +70,7 @@ def decoded(message: bytes) -> Any:
     if header["shape"] is None:
         return header, values, None
     whole = np.frombuffer(message, "<i2", offset=start + 4 * values.size).reshape(header["shape"])
-    return header, values, np.where(whole == NO_PIXEL, np.nan, whole * header["scale"])
+    return header, values, np.where(whole == OUTSIDE_PIXEL_VALUE, np.nan, whole * header["scale"])
 
 
 @pytest.fixture
@@ -197,7 +197,7 @@ def test_label_becomes_one_line():
 )
 def test_hosts(header, listening, allowed):
     """This machine's names and addresses are admitted. Names that another site can direct here are not."""
-    assert host_allowed(header, listening) == allowed
+    assert is_host_allowed(header, listening) == allowed
 
 
 def test_strangers_get_nothing(served):
@@ -371,7 +371,7 @@ def test_hub_outlives_a_closed_loop():
     import asyncio
 
     session: Any = StandIn(200.0)
-    hub = Hub(session)
+    hub = PageHub(session)
 
     async def begin():
         hub.start()

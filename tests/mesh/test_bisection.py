@@ -96,7 +96,7 @@ def test_meshes_of_surfaces_in_space_are_refined_and_cut(surface):
 
 
 def test_more_nodes_than_can_be_indexed_are_refused(monkeypatch):
-    monkeypatch.setattr(bisection, "MOST_POINTS", 1000)
+    monkeypatch.setattr(bisection, "MAX_POINTS", 1000)
     with pytest.raises(ValueError, match=r"size asks for more than 1,000 nodes; give longer"):
         bisect(MESHES["disk"], lambda corners: np.full(len(corners), 1e-6))
 

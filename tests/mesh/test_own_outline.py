@@ -16,7 +16,7 @@ from jeit.imaging.calibration import imaging_mesh
 from jeit.layout import Layout, perimeter, quasi_uniform, read_layout, write_layout
 from jeit.mesh import Domain, Rectangle, quality
 from jeit.mesh.generate.curve import create_smooth_curve
-from jeit.mesh.generate.unstructured import Target, mesh_within
+from jeit.mesh.generate.unstructured import MeshTarget, mesh_within
 from jeit.plot import plot_mesh
 from jeit.protocol import adjacent
 from jeit.report.folder import describe_domain
@@ -77,7 +77,7 @@ class Stadium(Domain):
 
     def mesh(self, num_points=None, cell_size=None, refine=None):
         edge = create_smooth_curve(self.perimeter, lambda arc: np.asarray(self.boundary(arc)))
-        return mesh_within([edge], self.area, Target.create(num_points, cell_size), refine)
+        return mesh_within([edge], self.area, MeshTarget.create(num_points, cell_size), refine)
 
     def _from_line(self, points):
         xp = namespace(points)

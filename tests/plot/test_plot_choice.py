@@ -11,7 +11,7 @@ from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.spectrum import Spectrum
 from jeit.mesh import disk
 from jeit.plot import plot_choice
-from jeit.plot.imaging.judgement import COLOURS
+from jeit.plot.imaging.judgement import RULE_COLOURS
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_one_rule_shows_its_criterion_against_the_hyperparameter(rule, choices, 
     x, y = ax.lines[0].get_data()
     np.testing.assert_allclose(x, choice.candidates)
     np.testing.assert_allclose(y, choice.criterion)
-    place = points(ax)["#ffffff" if choice.edge else COLOURS[rule]]
+    place = points(ax)["#ffffff" if choice.edge else RULE_COLOURS[rule]]
     assert place == pytest.approx((float(choice.hyperparameter), choice.read(choice.criterion)))
     assert ax.get_xscale() == "log"
     assert "λ" in ax.get_xlabel()
@@ -64,7 +64,7 @@ def test_the_l_curve_shows_penalty_against_residual(choices, ax):
     np.testing.assert_allclose(x, choice.residual)
     np.testing.assert_allclose(y, choice.penalty)
     expected = choice.read(choice.residual), choice.read(choice.penalty)
-    assert points(ax)[COLOURS["l-curve"]] == pytest.approx(expected)
+    assert points(ax)[RULE_COLOURS["l-curve"]] == pytest.approx(expected)
     assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
     assert "Residual" in ax.get_xlabel()
     assert "Penalty" in ax.get_ylabel()

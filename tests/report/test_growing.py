@@ -14,7 +14,15 @@ from jeit.layout import ring
 from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
 from jeit.report import write_stream
-from jeit.report.stream import _COLUMNS, GrowingRows, GrowingTable, Sample, _StreamPictures, _StreamSummary, _table_row
+from jeit.report.stream import (
+    _COLUMNS,
+    GrowingRows,
+    GrowingTable,
+    SeriesSample,
+    _StreamPictures,
+    _StreamSummary,
+    _table_row,
+)
 
 
 @pytest.fixture(scope="module")
@@ -212,7 +220,7 @@ def test_the_progress_of_large_files_is_reported(number, expected, tmp_path, mon
 
 
 def test_a_sample_of_rows_is_evenly_spaced_and_limited():
-    sample = Sample()
+    sample = SeriesSample()
     for one in range(1000):
         sample.append(one)
     assert sample.values().tolist() == list(range(1000))

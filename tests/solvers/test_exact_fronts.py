@@ -33,7 +33,7 @@ def of_many_fronts(monkeypatch):
     """Use leaves of a few rows, so that small problems have several levels, and threads for any amount of work."""
     monkeypatch.setattr(exact_fronts, "_LEAF_SIZE", 8)
     monkeypatch.setattr(exact_fronts_numpy, "_MIN_PARALLEL_OPERATIONS", 0)
-    monkeypatch.setattr(exact_fronts_numpy, "_ADDED_ROWS", 3)
+    monkeypatch.setattr(exact_fronts_numpy, "_NUM_ROWS_ADDED_AT_ONCE", 3)
     monkeypatch.setattr(exact_fronts, "_CACHED_FRONTS", {})
 
 

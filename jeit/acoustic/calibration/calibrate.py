@@ -20,7 +20,7 @@ from jeit.acoustic.calibration.usable_microphones import (
     exclude_unusable,
     locate_held_out_taps,
 )
-from jeit.acoustic.decay import DECAYS, AbstractDecay, find_decay
+from jeit.acoustic.decay import DECAY_MODELS, AbstractDecay, find_decay
 from jeit.acoustic.microphones import IntensityNoise, MicrophoneArray, noise_from_negative_powers
 from jeit.acoustic.signal.faults import describe_faults, intensity_faults
 from jeit.acoustic.signal.intensity import IntensitySettings, check_settings, tap_intensities
@@ -34,15 +34,15 @@ from jeit_solvers.module import Module
 AUTO = "auto"
 # Minimum relative improvement of the localisation error of left-out taps for which a decay model with more parameters
 # is preferred.
-_MIN_IMPROVEMENT = 0.05
+_MIN_ERROR_DECREASE = 0.05
 # Relative error of the predicted intensities above which the calibration gives a note. On simulated skins with uneven
 # coupling and exact positions, the relative error is 18 to 21 %.
-_LARGE_ERROR = 0.23
+_LARGE_PREDICTION_ERROR = 0.23
 # Of the microphones with enough taps, the minimum fraction that must agree with the decay model, unless left-out taps
 # are located well. If fewer agree, the decay model is rejected.
-_MIN_USABLE_SHARE = 0.5
+_MIN_USABLE_MICROPHONE_SHARE = 0.5
 # Default standard deviation of each coordinate of the microphones' given positions, in metres.
-PLACE_ERROR = 2e-3
+MICROPHONE_POSITION_ERROR = 2e-3
 
 
 class CalibrationFit(Module):
@@ -97,7 +97,7 @@ class CalibrationFit(Module):
     @property
     def note(self) -> str:
         """Text that suggests reasons for a large `error`; empty if the error is not large."""
-        if self.error <= _LARGE_ERROR:
+        if self.error <= _LARGE_PREDICTION_ERROR:
             return ""
         return (
             f"the models miss the recorded levels by {100 * self.error:.0f} %, and places are less certain. "
@@ -115,7 +115,7 @@ def calibrate_microphones(
     taps: Taps,
     *,
     decay: str | type[AbstractDecay] = AUTO,
-    place_error: float = PLACE_ERROR,
+    place_error: float = MICROPHONE_POSITION_ERROR,
     intensity: IntensitySettings | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> CalibrationFit:
@@ -161,7 +161,7 @@ def select_fit(fits: dict[str, CalibrationFit], rejection_reasons: dict[str, str
         raise ValueError(next(iter(rejection_reasons.values())))
     # The fits are in the order of the number of parameters of their decay models.
     smallest_error = min(fit.left_out[0][1] for fit in fits.values())
-    return next(fit for fit in fits.values() if not fit.left_out[0][1] > (1 + _MIN_IMPROVEMENT) * smallest_error)
+    return next(fit for fit in fits.values() if not fit.left_out[0][1] > (1 + _MIN_ERROR_DECREASE) * smallest_error)
 
 
 @np.errstate(all="ignore")  # decay models that cannot be fitted are reported with a reason
@@ -169,7 +169,7 @@ def fit_each_decay(
     taps: Taps,
     decays: Sequence[type[AbstractDecay]] = (),
     *,
-    place_error: float = PLACE_ERROR,
+    place_error: float = MICROPHONE_POSITION_ERROR,
     intensity: IntensitySettings | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[dict[str, CalibrationFit], dict[str, str]]:
@@ -190,7 +190,7 @@ def fit_each_decay(
         report_step("measure intensities")
     fit_input = _read_taps(taps, intensity, place_error)
     fitted_models, rejection_reasons = {}, {}
-    for decay_class in decays or DECAYS.values():
+    for decay_class in decays or DECAY_MODELS.values():
         report_step(f"fit {decay_class.name}")
         try:
             fitted_models[decay_class.name] = _fit_decay_model(decay_class, fit_input)
@@ -230,9 +230,9 @@ class _FittedModel(NamedTuple):
     """Result of the fit of one decay model.
 
     **Fields**: `fit`: the fit; `initial_use`: mask of the intensities used in the first fit, with all microphones;
-    `usable`: mask of the usable microphones; `reasons`: reasons why microphones are unusable; `explained`: fraction of
-    the variance of each microphone's levels that its model explains; `left_out_taps`: localisation errors of left-out
-    taps.
+    `usable`: mask of the usable microphones; `reasons`: reasons why microphones are unusable; `explained`:
+    fraction of the variance of each microphone's levels that its model explains; `left_out_taps`: localisation errors
+    of left-out taps.
     """
 
     fit: TapFit
@@ -275,17 +275,17 @@ def _fit_decay_model(decay_class: type[AbstractDecay], fit_input: _FitInput) -> 
         decay_class, fit_input.microphones, fit_input.positions, fit_input.power, *noise, fit_input.place_error
     )
     initial_use = fit.use.T
-    fit, is_usable, reasons, explained = exclude_unusable(fit, fit_input.faults)
+    fit, is_usable, reasons, explained_variance = exclude_unusable(fit, fit_input.faults)
     left_out_taps = locate_held_out_taps(fit, fit_input.microphones, fit_input.surface, fit_input.positions)
     if is_usable.sum() < 3 or (
-        is_usable.sum() < _MIN_USABLE_SHARE * has_enough_taps.sum() and not left_out_taps.is_better_than_mean
+        is_usable.sum() < _MIN_USABLE_MICROPHONE_SHARE * has_enough_taps.sum() and not left_out_taps.is_better_than_mean
     ):
         raise _NoFitError(
             f"only {is_usable.sum()} of the {has_enough_taps.sum()} microphones that received the taps follow a decay "
             "model, and three are needed, or half: are the rows of positions in the order of the taps, those of "
             f"microphones in the order of the channels? {describe_faults(reasons)}."
         )
-    return _FittedModel(fit, initial_use, is_usable, reasons, explained, left_out_taps)
+    return _FittedModel(fit, initial_use, is_usable, reasons, explained_variance, left_out_taps)
 
 
 def _calibration_fit(taps: Taps, fit_input: _FitInput, fitted: _FittedModel, localisation_errors) -> CalibrationFit:
@@ -298,7 +298,7 @@ def _calibration_fit(taps: Taps, fit_input: _FitInput, fitted: _FittedModel, loc
     shared, errors = fit.shared & is_usable, standard_errors(fit)[: len(fit.logarithms)]
     errors[1:, shared] = np.nan
     decay = on_device(fit.kind.from_logarithms(host.concatenate([fit.logarithms[:1] - log_gain, fit.logarithms[1:]])))
-    is_loud = (fit.use & (fit_input.power > 3 * fit.noise.deviation[:, None])).any(axis=0)
+    is_loud_microphone = (fit.use & (fit_input.power > 3 * fit.noise.deviation[:, None])).any(axis=0)
     microphones = fit_input.microphones + fit.displacement
     calibration = Calibration(
         MicrophoneArray(as_array(microphones), fit_input.surface, decay, on_device(fit.noise)),
@@ -307,7 +307,7 @@ def _calibration_fit(taps: Taps, fit_input: _FitInput, fitted: _FittedModel, loc
         errors,
         fit_input.settings,
         taps.name,
-        _strength_range(strength[is_loud]),
+        _strength_range(strength[is_loud_microphone]),
         fitted.left_out_taps.widening,
     )
     remaining_fields = strength, fit.outlier, fitted.explained, shared, fit.displacement, localisation_errors

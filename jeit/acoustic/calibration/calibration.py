@@ -13,7 +13,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jeit.acoustic.decay import DECAYS
+from jeit.acoustic.decay import DECAY_MODELS
 from jeit.acoustic.microphones import IntensityNoise, MicrophoneArray
 from jeit.acoustic.signal._arrays import check_extent, check_microphones
 from jeit.acoustic.signal.faults import describe_faults
@@ -21,7 +21,7 @@ from jeit.acoustic.signal.intensity import IntensitySettings, check_settings, in
 from jeit.acoustic.signal.recording import Intensities, Recording
 from jeit.acoustic.surface import AbstractSurface, CurvedSurface, Plane
 from jeit.arguments import check_kind, describe
-from jeit.files import read_json, written_whole
+from jeit.files import atomically_written_file, read_json
 from jeit.mesh import Polygon
 from jeit_solvers.engines import as_array, on_host
 from jeit_solvers.module import Module
@@ -87,7 +87,7 @@ class Calibration(Module):
     def save(self, path: str | Path) -> None:
         """Write the calibration to a JSON file, together with the format version and the units."""
         text = json.dumps(self._to_json(), indent=1, ensure_ascii=False, allow_nan=False)
-        with written_whole(path) as file:
+        with atomically_written_file(path) as file:
             file.write(f"{text}\n".encode())
 
     @classmethod
@@ -166,7 +166,7 @@ class Calibration(Module):
     def _from_table(cls, table: CalibrationTable) -> Calibration:
         microphone_tables, decay_class, surface = (
             table.microphones,
-            DECAYS[table.decay],
+            DECAY_MODELS[table.decay],
             _surface_from_table(table.surface),
         )
         for microphone_index, microphone in enumerate(microphone_tables):
@@ -232,10 +232,10 @@ def _surface_from_table(table: SurfaceTable) -> AbstractSurface:
 
 
 def _check_strengths(strengths: np.ndarray) -> tuple[float, float]:
-    low, high = map(float, strengths)
-    if low > high:
-        raise ValueError(f"strengths are {low:g} and {high:g}; give the weaker first.")
-    return low, high
+    min_strength, max_strength = map(float, strengths)
+    if min_strength > max_strength:
+        raise ValueError(f"strengths are {min_strength:g} and {max_strength:g}; give the weaker first.")
+    return min_strength, max_strength
 
 
 def _array_to_lists(array) -> list:
@@ -326,7 +326,10 @@ def _replace_floor(recorded_intensities: Intensities, silence: Intensities) -> I
         ("" if is_working else f"in the silence: {fault}")
         for is_working, fault in zip(is_usable, silence.faults, strict=True)
     ]
-    faults = ["; ".join(filter(None, pair)) for pair in zip(recorded_intensities.faults, silence_faults, strict=True)]
+    faults = [
+        "; ".join(filter(None, floor_pair))
+        for floor_pair in zip(recorded_intensities.faults, silence_faults, strict=True)
+    ]
     return dataclasses.replace(
         recorded_intensities,
         power=recorded_intensities.power + recorded_intensities.floor - silence.floor,

@@ -12,17 +12,17 @@ from jeit.files.schema import Number, Numbers, Table
 
 _MAX_MICROPHONES, _MAX_VERTICES, _MAX_HOLES = 4096, 4096, 64
 
-Positive = Annotated[float, Number(5e-324, math.inf)]
-NotNegative = Annotated[float, Number(0, math.inf)]
+PositiveNumber = Annotated[float, Number(5e-324, math.inf)]
+NonNegativeNumber = Annotated[float, Number(0, math.inf)]
 Text = Annotated[str, Field(max_length=10_000)]
-Vector = Annotated[np.ndarray, Numbers(((3, 3),))]
-Loop = Annotated[np.ndarray, Numbers(((3, _MAX_VERTICES), (2, 2)), -1e6, 1e6, "m")]
+SpaceVector = Annotated[np.ndarray, Numbers(((3, 3),))]
+LoopVertices = Annotated[np.ndarray, Numbers(((3, _MAX_VERTICES), (2, 2)), -1e6, 1e6, "m")]
 
 
 class UnitsTable(Table):
     """Units of the values in a calibration file."""
 
-    subject = "units"
+    name_in_messages = "units"
     length: Literal["m"]
     intensity: Literal["square of the samples' unit"]
 
@@ -30,28 +30,28 @@ class UnitsTable(Table):
 class CurveTable(Table):
     """Parameters of a curved surface; see `CurvedSurface`."""
 
-    subject = "a curve"
-    origin: Vector
+    name_in_messages = "a curve"
+    origin: SpaceVector
     axes: Annotated[np.ndarray, Numbers(((3, 3), (2, 2)))]
-    normal: Vector
+    normal: SpaceVector
     knots: Annotated[np.ndarray, Numbers(((1, 4096), (2, 2)))]
     weights: Annotated[np.ndarray, Numbers(((1, 4096),))]
-    affine: Vector
+    affine: SpaceVector
 
 
 class SurfaceTable(Table):
     """Surface of the skin: its outline, holes and curvature, in metres."""
 
-    subject = "a surface"
-    outline: Loop
-    holes: Annotated[list[Loop], FailFast()] = Field(max_length=_MAX_HOLES)
+    name_in_messages = "a surface"
+    outline: LoopVertices
+    holes: Annotated[list[LoopVertices], FailFast()] = Field(max_length=_MAX_HOLES)
     curve: CurveTable | None = None
 
 
 class IntensityTable(Table):
     """Frequency band and windows with which samples are analysed; see `IntensitySettings`."""
 
-    subject = "intensity"
+    name_in_messages = "intensity"
     low: Annotated[float, Number(0, 1e9, "Hz")] = 50.0
     high: Annotated[float, Number(0, 1e9, "Hz")] = 1000.0
     window: Annotated[float, Number(1e-9, 10, "s")] = 0.05
@@ -61,25 +61,25 @@ class IntensityTable(Table):
 class ErrorsTable(Table):
     """Relative standard error of each parameter of a microphone's decay model; null where unknown."""
 
-    subject = "relative standard errors"
-    a: NotNegative | None = None
-    b: NotNegative | None = None
-    length: NotNegative | None = None
+    name_in_messages = "relative standard errors"
+    a: NonNegativeNumber | None = None
+    b: NonNegativeNumber | None = None
+    length: NonNegativeNumber | None = None
 
 
 class MicrophoneTable(Table):
     """Position, decay model and noise of one microphone."""
 
-    subject = "a microphone"
+    name_in_messages = "a microphone"
     position: Annotated[np.ndarray, Numbers(((2, 3),), -1e6, 1e6, "m")]
-    a: Positive | None = None
-    b: Positive | None = None
-    length: Positive | None = None
+    a: PositiveNumber | None = None
+    b: PositiveNumber | None = None
+    length: PositiveNumber | None = None
     relative_standard_error: ErrorsTable
-    relative_noise: NotNegative
-    noise_floor: NotNegative
-    noise_deviation: NotNegative
-    noise_cross: NotNegative
+    relative_noise: NonNegativeNumber
+    noise_floor: NonNegativeNumber
+    noise_deviation: NonNegativeNumber
+    noise_cross: NonNegativeNumber
     usable: bool
     reason: Text
 
@@ -87,7 +87,7 @@ class MicrophoneTable(Table):
 class CalibrationTable(Table):
     """Content of a calibration file."""
 
-    subject = "a calibration"
+    name_in_messages = "a calibration"
     format: Literal["jeit microphone calibration"]
     version: Literal[1]
     units: UnitsTable

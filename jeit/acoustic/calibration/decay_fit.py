@@ -137,15 +137,15 @@ def fit_jointly(
         cost, system = _normal_equations(problem, *unpack_unknowns(unknowns), is_fitted)
 
         def solve_step(damping):
-            value_step, strength_step = _solve_step(system, damping)
-            slope = np.sum(system.gradient * value_step) + system.tap_gradient @ strength_step
-            quadratic_term = np.einsum("km,lm,mkl->", value_step, value_step, system.matrix)
-            quadratic_term += np.einsum("km,kmn,kn->", value_step, system.penalty, value_step)
-            cross_term = 2 * np.einsum("km,kmt,t->", value_step, system.coupling, strength_step, optimize=True)
+            step_of_values, step_of_strengths = _solve_step(system, damping)
+            slope = np.sum(system.gradient * step_of_values) + system.tap_gradient @ step_of_strengths
+            quadratic_term = np.einsum("km,lm,mkl->", step_of_values, step_of_values, system.matrix)
+            quadratic_term += np.einsum("km,kmn,kn->", step_of_values, system.penalty, step_of_values)
+            cross_term = 2 * np.einsum("km,kmt,t->", step_of_values, system.coupling, step_of_strengths, optimize=True)
             return (
-                np.concatenate([value_step.ravel(), strength_step]),
+                np.concatenate([step_of_values.ravel(), step_of_strengths]),
                 slope,
-                quadratic_term + cross_term + np.sum(system.tap_matrix * strength_step**2),
+                quadratic_term + cross_term + np.sum(system.tap_matrix * step_of_strengths**2),
             )
 
         return cost, solve_step
@@ -193,17 +193,19 @@ def log_covariance(
     """
     schur = _schur_complement(_normal_equations(problem, values, strength, is_fitted)[1], 0.0)
     num_parameters, num_microphones = values.shape
-    is_free = np.asarray(is_fitted).ravel()
+    is_free_parameter = np.asarray(is_fitted).ravel()
     null_direction = np.concatenate([np.ones(num_microphones), np.zeros((num_parameters - 1) * num_microphones)])[
-        is_free
+        is_free_parameter
     ]
-    constraint = np.asarray(scale)[is_free]
+    constraint_matrix = np.asarray(scale)[is_free_parameter]
     result = np.full((num_parameters * num_microphones, num_parameters * num_microphones), np.nan)
     # The data do not determine the direction in which all gains increase and all strengths decrease. This direction is
     # projected out according to the condition on `scale`.
-    inverse = np.linalg.pinv(schur[np.ix_(is_free, is_free)], rcond=1e-12, hermitian=True)
-    projector = np.eye(len(null_direction)) - np.outer(null_direction, constraint) / (constraint @ null_direction)
-    result[np.ix_(is_free, is_free)] = projector @ inverse @ projector.T
+    inverse = np.linalg.pinv(schur[np.ix_(is_free_parameter, is_free_parameter)], rcond=1e-12, hermitian=True)
+    projector = np.eye(len(null_direction)) - np.outer(null_direction, constraint_matrix) / (
+        constraint_matrix @ null_direction
+    )
+    result[np.ix_(is_free_parameter, is_free_parameter)] = projector @ inverse @ projector.T
     return result
 
 
@@ -271,9 +273,9 @@ def _solve_step(system: _NormalEquations, damping):
         np.outer(null_direction, null_direction) / num_microphones + np.diag(np.where(is_fixed, 1.0, 1e-14))
     )
     right_hand_side = -system.gradient + np.einsum("kmt,t->km", system.coupling, system.tap_gradient / diagonal)
-    value_step = solve_definite(schur, right_hand_side.ravel()).reshape(num_parameters, num_microphones)
-    strength_step = -(system.tap_gradient + np.einsum("kmt,km->t", system.coupling, value_step)) / diagonal
-    return value_step, strength_step
+    step_of_values = solve_definite(schur, right_hand_side.ravel()).reshape(num_parameters, num_microphones)
+    step_of_strengths = -(system.tap_gradient + np.einsum("kmt,km->t", system.coupling, step_of_values)) / diagonal
+    return step_of_values, step_of_strengths
 
 
 def _tap_diagonal(system: _NormalEquations, damping):

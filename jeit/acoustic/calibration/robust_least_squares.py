@@ -27,9 +27,9 @@ from jeit_solvers.engines import host, on_host, slopes
 from jeit_solvers.module import Module
 
 # Residuals of levels larger than this number of standard deviations are excluded from the noise estimate.
-_OUTLIER_DEVIATIONS = 4.0
+_MAX_RESIDUAL_DEVIATIONS = 4.0
 # Weight of the median over all microphones in the noise estimate of one microphone, as a number of taps.
-_MEDIAN_WEIGHT = 20.0
+_MEDIAN_WEIGHT_IN_TAPS = 20.0
 # Minimum number of taps for an estimate of the additive noise.
 _MIN_TAPS = 8
 
@@ -39,14 +39,15 @@ def relative_errors(
     received_power: Float[np.ndarray, "M T"],
     residual: Float[np.ndarray, "M T"],
     use: Bool[np.ndarray, "M T"],
-    inflation: float,
+    fixed_parameter_inflation: float,
 ) -> Float[np.ndarray, " M"]:
     """Estimate the relative error τ of each microphone from the mean square of its level residuals in excess of the
     variance of additive noise. Outliers are excluded.
 
-    `received_power`: expected power. `use`: mask of the residuals to use. `inflation`: factor on squared residuals that
-    corrects for the number of fitted parameters. Since the excess variance may be zero or negative if there are few
-    taps, each estimate is shrunk towards the median over all microphones, with the weight of 20 taps.
+    `received_power`: expected power. `use`: mask of the residuals to use. `fixed_parameter_inflation`: factor on
+    squared residuals that corrects for the number of fitted parameters. Since the excess variance may be zero or
+    negative if there are few taps, each estimate is shrunk towards the median over all microphones, with the weight of
+    20 taps.
     """
     floor, deviation, cross_coefficients = (np.asarray(x) for x in (noise.floor, noise.deviation, noise.cross))
     num_inliers, excess_errors = np.zeros(len(received_power)), np.zeros(len(received_power))
@@ -54,21 +55,25 @@ def relative_errors(
         is_used = use[k] & (received_power[k] > 3 * deviation[k])
         if is_used.sum() < 3:
             continue
-        signal, used_residual = received_power[k, is_used], residual[k, is_used]
-        squared_share = (signal / (signal + floor[k])) ** 2
+        signal, usable_residual = received_power[k, is_used], residual[k, is_used]
+        squared_signal_share = (signal / (signal + floor[k])) ** 2
         additive_variance = (cross_coefficients[k] * signal + deviation[k] ** 2) / (signal + floor[k]) ** 2
-        is_inlier = np.abs(used_residual) <= _OUTLIER_DEVIATIONS * max(1.4826 * np.median(np.abs(used_residual)), 1e-15)
+        is_inlier = np.abs(usable_residual) <= _MAX_RESIDUAL_DEVIATIONS * max(
+            1.4826 * np.median(np.abs(usable_residual)), 1e-15
+        )
         for _ in range(3):
-            is_inlier = np.abs(used_residual) <= _OUTLIER_DEVIATIONS * np.sqrt(np.mean(used_residual[is_inlier] ** 2))
+            is_inlier = np.abs(usable_residual) <= _MAX_RESIDUAL_DEVIATIONS * np.sqrt(
+                np.mean(usable_residual[is_inlier] ** 2)
+            )
         num_inliers[k] = is_inlier.sum()
         excess_errors[k] = (
-            inflation * np.mean(used_residual[is_inlier] ** 2) - np.mean(additive_variance[is_inlier])
-        ) / np.mean(squared_share[is_inlier])
+            fixed_parameter_inflation * np.mean(usable_residual[is_inlier] ** 2) - np.mean(additive_variance[is_inlier])
+        ) / np.mean(squared_signal_share[is_inlier])
     if not num_inliers.any():
         return np.full(len(received_power), 0.5)
     median_excess = max(float(np.median(excess_errors[num_inliers > 0])), 0.0)
-    shrunk_excess = (num_inliers * np.minimum(excess_errors, 1.0) + _MEDIAN_WEIGHT * median_excess) / (
-        num_inliers + _MEDIAN_WEIGHT
+    shrunk_excess = (num_inliers * np.minimum(excess_errors, 1.0) + _MEDIAN_WEIGHT_IN_TAPS * median_excess) / (
+        num_inliers + _MEDIAN_WEIGHT_IN_TAPS
     )
     return np.sqrt(np.maximum(shrunk_excess, MIN_RELATIVE_ERROR**2))
 
@@ -77,7 +82,7 @@ def additive_deviations(
     power: Float[np.ndarray, "M T"],
     received_power: Float[np.ndarray, "M T"],
     use: Bool[np.ndarray, "M T"],
-    inflation: float,
+    fixed_parameter_inflation: float,
 ) -> Float[np.ndarray, " M"]:
     """Estimate the additive deviation s of each microphone: the standard deviation of its intensity without a source.
     The estimate is needed if the noise was not measured.
@@ -88,7 +93,7 @@ def additive_deviations(
     underestimated noise causes false detections.
     """
     deviation = np.zeros(len(received_power))
-    trial_shares = np.concatenate([[0.0], np.geomspace(1e-6, 0.5, 18)])
+    trial_additive_variance_shares = np.concatenate([[0.0], np.geomspace(1e-6, 0.5, 18)])
     trial_errors = np.geomspace(MIN_RELATIVE_ERROR, 1.0, 30)
     for k in range(len(received_power)):
         if use[k].sum() < _MIN_TAPS:
@@ -104,14 +109,16 @@ def additive_deviations(
                 + (max_power * relative_deviations[:, None]) ** 2
                 + 1e-30 * max_power**2
             )
-            ratio = np.minimum(inflation * (tap_power - signal) ** 2 / variance, _OUTLIER_DEVIATIONS**2)
+            ratio = np.minimum(
+                fixed_parameter_inflation * (tap_power - signal) ** 2 / variance, _MAX_RESIDUAL_DEVIATIONS**2
+            )
             return np.sum(ratio + np.log(variance), axis=-1).min(axis=0)
 
-        scores = negative_log_likelihood(trial_shares)
+        scores = negative_log_likelihood(trial_additive_variance_shares)
         best_index = int(scores.argmin())
         if scores[best_index] < scores[0] - 6:
-            fine_shares = trial_shares[best_index] * np.geomspace(0.5, 2.0, 9)
-            deviation[k] = max_power * fine_shares[negative_log_likelihood(fine_shares).argmin()]
+            refined_trial_shares = trial_additive_variance_shares[best_index] * np.geomspace(0.5, 2.0, 9)
+            deviation[k] = max_power * refined_trial_shares[negative_log_likelihood(refined_trial_shares).argmin()]
     has_enough_taps = use.sum(axis=1) >= _MIN_TAPS
     median_deviation = float(np.median(deviation[has_enough_taps])) if has_enough_taps.any() else 0.0
     return np.where(has_enough_taps, np.maximum(deviation, 0.5 * median_deviation), deviation)
@@ -120,20 +127,20 @@ def additive_deviations(
 # Maximum number of iterations of the fit with a shared shape, and of the fit with individual shapes.
 _MAX_SHARED_ITERATIONS, _MAX_INDIVIDUAL_ITERATIONS = 6, 12
 # Degrees of freedom of Student's t distribution, from which the weights of the residuals are derived.
-_T_FREEDOM = 5.0
+_STUDENT_DEGREES_OF_FREEDOM = 5.0
 # Ratio of the mean square residual of a tap to the median over all taps, above which the tap is excluded as an outlier.
-_OUTLIER_RATIO = 12.0
+_MAX_TAP_RESIDUAL_RATIO = 12.0
 # Standard deviation of the logarithms of the shape parameters over the array: in the fit with a shared shape.
-_SHARED_SPREAD = 0.03
+_SHARED_SHAPE_DEVIATION = 0.03
 # Standard deviation at the start of the fit with individual shapes, and its limits.
-_INITIAL_SPREAD = 0.5
-_MIN_SPREAD = 0.1
-_MAX_SPREAD = 1.0
+_INITIAL_SHAPE_DEVIATION = 0.5
+_MIN_SHAPE_DEVIATION = 0.1
+_MAX_SHAPE_DEVIATION = 1.0
 # Maximum displacement of a microphone along each coordinate, in units of `place_error`.
-_MAX_DISPLACEMENT = 4.0
+_MAX_RELATIVE_DISPLACEMENT = 4.0
 # Relative standard error of the shape at or above which a microphone's own taps are considered not to determine the
 # shape.
-_UNDETERMINED_ERROR = 0.5
+_UNDETERMINED_SHAPE_ERROR = 0.5
 
 
 class TapFit(Module):
@@ -185,8 +192,8 @@ class TapFit(Module):
     def usable(self) -> Bool[np.ndarray, "M T"]:
         """Mask of the readings (intensities of taps at microphones) with a finite level, of microphones that are not
         excluded."""
-        is_positive = np.nan_to_num(self.power, nan=-np.inf) + self.noise.floor[:, None] > 0
-        return is_positive & ~self.dropped[:, None]
+        is_positive_intensity = np.nan_to_num(self.power, nan=-np.inf) + self.noise.floor[:, None] > 0
+        return is_positive_intensity & ~self.dropped[:, None]
 
     @property
     def use(self) -> Bool[np.ndarray, "M T"]:
@@ -199,7 +206,7 @@ class TapFit(Module):
         return np.asarray(self.use.any(axis=0))
 
     @property
-    def free(self) -> Bool[np.ndarray, "P M"]:
+    def is_fitted_parameter(self) -> Bool[np.ndarray, "P M"]:
         """Mask of the parameters that are fitted to data: those of microphones with usable readings, except parameters
         fixed at a bound."""
         return ~self.at_bound & self.usable.any(axis=1)
@@ -212,9 +219,9 @@ class TapFit(Module):
         If no tap was near a microphone, the data give only an upper bound of the parameter b of the decay model.
         Without the prior, b could be very small, and estimated positions would be drawn to that microphone.
         """
-        spread_without_prior = np.where(np.arange(len(self.spread)) == 1, np.inf, self.spread)
-        own_errors = standard_errors(replace(self, spread=spread_without_prior))[1]
-        return self.usable.any(axis=1) & ~self.at_bound[1] & ~(own_errors < _UNDETERMINED_ERROR)
+        unlimited_spread = np.where(np.arange(len(self.spread)) == 1, np.inf, self.spread)
+        individual_errors = standard_errors(replace(self, spread=unlimited_spread))[1]
+        return self.usable.any(axis=1) & ~self.at_bound[1] & ~(individual_errors < _UNDETERMINED_SHAPE_ERROR)
 
     @property
     def level(self) -> Float[np.ndarray, "M T"]:
@@ -251,8 +258,8 @@ def fit_taps(
     num_displacements = offset.shape[2] if place_error > 0 else 0
     low, high = kind.bounds(array_size)
     lower_bounds, upper_bounds = (
-        np.array([*low, *[-_MAX_DISPLACEMENT] * num_displacements]),
-        np.array([*high, *[_MAX_DISPLACEMENT] * num_displacements]),
+        np.array([*low, *[-_MAX_RELATIVE_DISPLACEMENT] * num_displacements]),
+        np.array([*high, *[_MAX_RELATIVE_DISPLACEMENT] * num_displacements]),
     )
     start = np.asarray(kind.start(spacing if spacing > 0 else array_size / 4, len(microphones)).logarithms())
     start = np.concatenate([start, np.zeros((num_displacements, len(microphones)))])
@@ -266,7 +273,9 @@ def fit_taps(
         known_noise,
         values=np.clip(start, lower_bounds[:, None], upper_bounds[:, None]),
         at_bound=np.zeros(start.shape, bool),
-        spread=_prior_spread(np.full(num_shapes, _SHARED_SPREAD), np.full(num_displacements, _SHARED_SPREAD)),
+        spread=_prior_spread(
+            np.full(num_shapes, _SHARED_SHAPE_DEVIATION), np.full(num_displacements, _SHARED_SHAPE_DEVIATION)
+        ),
         strength=np.zeros(num_taps),
         weight=np.zeros(power.shape),
         outlier=np.zeros(num_taps, bool),
@@ -286,21 +295,23 @@ def fit_taps(
     )
     fit = _alternate_fits(fit, _MAX_SHARED_ITERATIONS)
     return _alternate_fits(
-        replace(fit, spread=_prior_spread(np.full(num_shapes, _INITIAL_SPREAD), np.ones(num_displacements))),
+        replace(fit, spread=_prior_spread(np.full(num_shapes, _INITIAL_SHAPE_DEVIATION), np.ones(num_displacements))),
         _MAX_INDIVIDUAL_ITERATIONS,
-        update_spread=True,
+        updates_shape_deviation=True,
     )
 
 
-def refit_without(fit: TapFit, excluded: Bool[np.ndarray, " M"]) -> TapFit:
-    """Repeat the fit of the decay models without the microphones in the mask `excluded`."""
-    return _alternate_fits(replace(fit, dropped=fit.dropped | excluded), _MAX_INDIVIDUAL_ITERATIONS, update_spread=True)
+def refit_without(fit: TapFit, is_excluded: Bool[np.ndarray, " M"]) -> TapFit:
+    """Repeat the fit of the decay models without the microphones in the mask `is_excluded`."""
+    return _alternate_fits(
+        replace(fit, dropped=fit.dropped | is_excluded), _MAX_INDIVIDUAL_ITERATIONS, updates_shape_deviation=True
+    )
 
 
 def standard_errors(fit: TapFit) -> Float[np.ndarray, "P M"]:
     """Standard deviations (P, M) of the fitted values, for gains normalised as in a `Calibration`; NaN for values fixed
     at a bound."""
-    is_fitted = fit.free
+    is_fitted = fit.is_fitted_parameter
     if is_fitted[0].sum() < 2:
         return np.full(is_fitted.shape, np.nan)
     num_parameters = len(fit.kind.parameters)
@@ -313,9 +324,9 @@ def standard_errors(fit: TapFit) -> Float[np.ndarray, "P M"]:
     return np.sqrt(np.maximum(np.diag(covariance), 0)).reshape(is_fitted.shape)
 
 
-def _alternate_fits(fit: TapFit, iterations: int, *, update_spread: bool = False) -> TapFit:
+def _alternate_fits(fit: TapFit, iterations: int, *, updates_shape_deviation: bool = False) -> TapFit:
     """Alternate between the fit of all microphones and the re-estimation of noise and weights, until convergence or for
-    `iterations` iterations. If `update_spread`, the `spread` of the parameters is also re-estimated."""
+    `iterations` iterations. If `updates_shape_deviation`, the `spread` of the parameters is also re-estimated."""
     for _ in range(iterations):
         previous_values, has_readings = fit.values, np.asarray(fit.usable.any(axis=1))
         values, strength, is_at_bound = fit_with_bounds(
@@ -324,9 +335,9 @@ def _alternate_fits(fit: TapFit, iterations: int, *, update_spread: bool = False
         fit = replace(fit, values=values, strength=strength, at_bound=is_at_bound)
         strength = fit_strengths(fit.problem(with_outliers=True), fit.values, fit.strength)
         fit = _update_noise_and_weights(replace(fit, strength=strength))
-        if update_spread:
+        if updates_shape_deviation:
             fit = replace(fit, spread=_update_spread(fit))
-        if np.abs(fit.values - previous_values)[fit.free].max(initial=0.0) < 1e-9:
+        if np.abs(fit.values - previous_values)[fit.is_fitted_parameter].max(initial=0.0) < 1e-9:
             break
     return fit
 
@@ -354,7 +365,10 @@ def _update_spread(fit: TapFit) -> Float[np.ndarray, " P"]:
         len(displacements), (displacements**2 + errors[num_parameters:] ** 2).mean() if displacements.size else 0.0
     )
     return _prior_spread(
-        *(np.clip(np.sqrt(variance), _MIN_SPREAD, _MAX_SPREAD) for variance in (shape_variance, displacement_variance))
+        *(
+            np.clip(np.sqrt(variance), _MIN_SHAPE_DEVIATION, _MAX_SHAPE_DEVIATION)
+            for variance in (shape_variance, displacement_variance)
+        )
     )
 
 
@@ -365,7 +379,7 @@ def _update_noise_and_weights(fit: TapFit) -> TapFit:
     # The residuals are smaller than the errors of the data, since strengths and parameters were fitted to the data;
     # `inflation` corrects for the difference.
     num_readings = fit.use.sum()
-    num_fitted = fit.received.sum() + fit.free.sum()
+    num_fitted = fit.received.sum() + fit.is_fitted_parameter.sum()
     inflation = num_readings / max(num_readings - num_fitted, 0.1 * num_readings)
     if not fit.known_noise:
         use = np.isfinite(fit.power) & ~fit.outlier
@@ -388,9 +402,12 @@ def _update_noise_and_weights(fit: TapFit) -> TapFit:
     usable = fit.usable
     tap_mean_square = np.minimum(squared_residual, 100.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
     median_mean_square = float(np.median(tap_mean_square[usable.any(axis=0)]))
-    fit = replace(fit, outlier=tap_mean_square > _OUTLIER_RATIO * max(median_mean_square, 0.2))
+    fit = replace(fit, outlier=tap_mean_square > _MAX_TAP_RESIDUAL_RATIO * max(median_mean_square, 0.2))
     variance = _level_variance(fit, received_power)
-    return replace(fit, weight=(_T_FREEDOM + 1) / (_T_FREEDOM + residual**2 / variance) / variance)
+    return replace(
+        fit,
+        weight=(_STUDENT_DEGREES_OF_FREEDOM + 1) / (_STUDENT_DEGREES_OF_FREEDOM + residual**2 / variance) / variance,
+    )
 
 
 def _residual_for_equal_errors(fit: TapFit, received_power: np.ndarray) -> Float[np.ndarray, "M T"]:

@@ -31,12 +31,12 @@ from jeit_solvers import inverse_small, minimise_small
 from jeit_solvers.engines import as_array, evaluate_in_numpy, host, namespace, on_device
 
 # Minimum fraction of the variance of a microphone's levels that its decay model must explain.
-_MIN_EXPLAINED = 0.3
+_MIN_EXPLAINED_VARIANCE = 0.3
 # Maximum ratio of a microphone's relative error to the median error over all microphones, and lower bound of this
 # median.
 _MAX_ERROR_RATIO, _MIN_MEDIAN_ERROR = 2.5, 0.1
 # Minimum decrease of the logarithm of a microphone's response from the nearest to the farthest tap.
-_MIN_DECREASE = 0.1
+_MIN_RESPONSE_DECREASE = 0.1
 
 
 def check_received(
@@ -71,32 +71,36 @@ def exclude_unusable(
     Returns the new fit, the mask of the usable microphones, the reasons why microphones are unusable ("" for usable
     microphones), and the fraction of the variance of each microphone's levels that its model explains.
     """
-    reasons, explained = _exclusions_and_explained_variance(fit, faults)
+    reasons, explained_variance = _exclusions_and_explained_variance(fit, faults)
     is_unusable = np.array([bool(reason) for reason in reasons])
     # The disagreement of some microphones with their models may become apparent only after other microphones are
     # excluded.
     while is_unusable.any() and (~fit.dropped & ~is_unusable).sum() >= 3:
         fit = refit_without(fit, is_unusable)
-        new_reasons, explained = _exclusions_and_explained_variance(fit, ("",) * len(is_unusable), explained)
+        new_reasons, explained_variance = _exclusions_and_explained_variance(
+            fit, ("",) * len(is_unusable), explained_variance
+        )
         is_unusable = np.array([bool(reason) for reason in new_reasons]) & ~fit.dropped
         reasons = tuple(
-            new_reason if is_new else old_reason
-            for new_reason, old_reason, is_new in zip(new_reasons, reasons, is_unusable, strict=True)
+            new_reason if is_newly_unusable else old_reason
+            for new_reason, old_reason, is_newly_unusable in zip(new_reasons, reasons, is_unusable, strict=True)
         )
-    return fit, ~fit.dropped & ~is_unusable, reasons, explained
+    return fit, ~fit.dropped & ~is_unusable, reasons, explained_variance
 
 
 def _exclusions_and_explained_variance(
-    fit: TapFit, faults, explained=None
+    fit: TapFit, faults, previous_explained_variance=None
 ) -> tuple[tuple[str, ...], Float[np.ndarray, " M"]]:
     """Return the reason why each microphone is unusable ("" if usable), and the fraction of the variance of its levels
     that its decay model explains. For excluded microphones this fraction is taken from `explained`."""
     expected_levels, level, use = fit.predicted_level(), fit.level, fit.use
-    decreases = _response_decrease(fit)
+    response_decreases = _response_decrease(fit)
     min_readings = len(fit.kind.parameters) + 2
     deviation, relative = fit.noise.deviation, fit.noise.relative
     median_error = float(np.median(relative[use.any(axis=1)])) if use.any() else 0.0
-    explained_share = np.zeros(len(faults)) if explained is None else explained.copy()
+    explained_variance = (
+        np.zeros(len(faults)) if previous_explained_variance is None else previous_explained_variance.copy()
+    )
     reasons = []
     for k, fault in enumerate(faults):
         is_used = use[k]
@@ -105,11 +109,13 @@ def _exclusions_and_explained_variance(
             reasons.append(fault)
             continue
         variance = np.var(level[k, is_used])
-        explained_share[k] = 1 - np.mean((level - expected_levels)[k, is_used] ** 2) / variance if variance > 0 else 0.0
-        if decreases[k] < _MIN_DECREASE:
+        explained_variance[k] = (
+            1 - np.mean((level - expected_levels)[k, is_used] ** 2) / variance if variance > 0 else 0.0
+        )
+        if response_decreases[k] < _MIN_RESPONSE_DECREASE:
             reasons.append("its intensity does not fall with distance")
-        elif is_used.sum() >= min_readings and not explained_share[k] >= _MIN_EXPLAINED:
-            reasons.append(f"its model explains {100 * max(explained_share[k], 0):.0f} % of what it received")
+        elif is_used.sum() >= min_readings and not explained_variance[k] >= _MIN_EXPLAINED_VARIANCE:
+            reasons.append(f"its model explains {100 * max(explained_variance[k], 0):.0f} % of what it received")
         elif num_received < min_readings:
             reasons.append(f"it received {num_received} of the taps only, and {min_readings} are needed")
         elif relative[k] > _MAX_ERROR_RATIO * max(median_error, _MIN_MEDIAN_ERROR):
@@ -119,15 +125,15 @@ def _exclusions_and_explained_variance(
             )
         else:
             reasons.append("")
-    return tuple(reasons), explained_share
+    return tuple(reasons), explained_variance
 
 
 def _response_decrease(fit: TapFit) -> Float[np.ndarray, " M"]:
     """Decrease (M,) of the logarithm of each microphone's response from the nearest tap to the farthest."""
     response, use = fit.problem().log_response(fit.values), fit.use
     max_response, min_response = (
-        reduction(response, axis=1, where=use, initial=initial_value)
-        for reduction, initial_value in ((np.max, -np.inf), (np.min, np.inf))
+        response_decrease(response, axis=1, where=use, initial=initial_value)
+        for response_decrease, initial_value in ((np.max, -np.inf), (np.min, np.inf))
     )
     return np.where(use.any(axis=1), max_response - min_response, np.inf)
 
@@ -136,13 +142,13 @@ def _response_decrease(fit: TapFit) -> Float[np.ndarray, " M"]:
 _NUM_FOLDS = 4
 # Minimum relative error of the decay models that is assumed when the likelihood is evaluated on a raster of
 # positions.
-_SCREENING_ERROR = 0.2
+_MIN_SCREENING_RELATIVE_ERROR = 0.2
 # Maximum number of steps of a minimisation.
 _MAX_STEPS = 30
 # Minimum number of located taps for an estimate of `widening`; fraction of the taps that the error ellipses must
 # contain; quantile of χ² with two degrees of freedom for this fraction.
-_MIN_LOCATED, _CONTAINED_SHARE = 10, 0.9
-_CHI_SQUARE = -2 * math.log(1 - _CONTAINED_SHARE)
+_MIN_LOCATED_TAPS, _ERROR_ELLIPSE_COVERAGE = 10, 0.9
+_CHI_SQUARE_QUANTILE = -2 * math.log(1 - _ERROR_ELLIPSE_COVERAGE)
 
 
 class LeftOutTaps(NamedTuple):
@@ -169,9 +175,9 @@ class LeftOutTaps(NamedTuple):
         """Factor on covariances for which the 90 % error ellipses contain 90 % of the left-out taps. The factor is at
         least 1, since the errors of the decay models may be larger at other positions."""
         finite_distances = self.squared_mahalanobis[np.isfinite(self.squared_mahalanobis)]
-        if finite_distances.size < _MIN_LOCATED:
+        if finite_distances.size < _MIN_LOCATED_TAPS:
             return 1.0
-        return max(float(np.quantile(finite_distances, _CONTAINED_SHARE)) / _CHI_SQUARE, 1.0)
+        return max(float(np.quantile(finite_distances, _ERROR_ELLIPSE_COVERAGE)) / _CHI_SQUARE_QUANTILE, 1.0)
 
     @property
     def is_better_than_mean(self) -> bool:
@@ -228,19 +234,19 @@ def _locate_most_likely(array: MicrophoneArray, raster: Pixels, power, use):
     (F, d, d) equal those of a `Localiser` up to rounding."""
     xp = namespace(array, power)
     screening_array = eqx.tree_at(
-        lambda tree: tree.noise.relative, array, xp.maximum(array.noise.relative, _SCREENING_ERROR)
+        lambda tree: tree.noise.relative, array, xp.maximum(array.noise.relative, _MIN_SCREENING_RELATIVE_ERROR)
     )
     maps = Likelihood.create(power, use, screening_array).screen(Likelihood.features(screening_array, raster.chart))
     first_positions, second_positions, _ = find_two_lowest_minima(maps, raster)
     pair_likelihood = Likelihood.create(xp.tile(power, 2), xp.tile(use, 2), array)
     low, high = bounding_box(array.surface)
-    surface_length, unbounded = longer_side(array.surface), xp.full(1, xp.inf)
+    surface_length, infinite_bound = longer_side(array.surface), xp.full(1, xp.inf)
     minimum = minimise_small(
         lambda unknowns, frames: Likelihood(frames[0], frames[1], frames[2], array).expand(unknowns),
         pair_likelihood.start(xp.concatenate([first_positions, second_positions], axis=1)),
         pair_likelihood.frames,
-        lower=xp.concatenate([low, -unbounded])[:, None],
-        upper=xp.concatenate([high, unbounded])[:, None],
+        lower=xp.concatenate([low, -infinite_bound])[:, None],
+        upper=xp.concatenate([high, infinite_bound])[:, None],
         largest_step=xp.array([[surface_length / 4], [surface_length / 4], [2.3]]),
         max_steps=_MAX_STEPS,
         tolerance=1e-8,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jeit.cli.options import Quiet, in_options, make_folder, naming_options
+from jeit.cli.options import QuietOption, make_folder, naming_options_in_errors, with_option_names
 
 if TYPE_CHECKING:
     from jeit.acoustic import Taps
@@ -15,14 +15,16 @@ if TYPE_CHECKING:
 
 _OPTIONS = {"path": "--output", "intensity": "--low, --high, --window and --hop"}
 
-BandLow = Annotated[
+LowestFrequencyOption = Annotated[
     float | None, typer.Option(help="Lowest frequency of the band, hertz (default 50, or the calibration's).")
 ]
-BandHigh = Annotated[
+HighestFrequencyOption = Annotated[
     float | None, typer.Option(help="Highest frequency of the band, hertz (default 1000, or the calibration's).")
 ]
-Window = Annotated[float | None, typer.Option(help="Length of a window, seconds (default 0.05, or the calibration's).")]
-Hop = Annotated[
+WindowOption = Annotated[
+    float | None, typer.Option(help="Length of a window, seconds (default 0.05, or the calibration's).")
+]
+HopOption = Annotated[
     float | None,
     typer.Option(
         help="Time from the start of a window to the start of the next, seconds (default 0.0125, or the calibration's)."
@@ -73,11 +75,11 @@ def calibrate_microphones(
             "corrected by the taps; 0 if they are exact."
         ),
     ] = 0.002,
-    low: BandLow = None,
-    high: BandHigh = None,
-    window: Window = None,
-    hop: Hop = None,
-    quiet: Quiet = False,
+    low: LowestFrequencyOption = None,
+    high: HighestFrequencyOption = None,
+    window: WindowOption = None,
+    hop: HopOption = None,
+    quiet: QuietOption = False,
 ) -> None:
     """Calibrate an array of microphones from taps at known places; writes the calibration and a picture of the
     calibration."""
@@ -86,13 +88,13 @@ def calibrate_microphones(
     from jeit.acoustic.calibration.calibrate import AUTO
     from jeit.acoustic.decay import find_decay
     from jeit.acoustic.reports import calibration_files, write_calibration
-    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.cli.console import Steps, plain_console, print_written_files
 
     if not 0 <= place_error < float("inf"):
         raise ValueError(f"--place-error must be zero or positive, in metres; it is {place_error}.")
     settings = intensity_settings(low, high, window, hop)
     console = plain_console()
-    with naming_options(_OPTIONS):
+    with naming_options_in_errors(_OPTIONS):
         decay_model = decay if decay == AUTO else find_decay(decay)
         files = calibration_files(output)
         make_folder(output.parent, tuple(file.name for file in files))
@@ -104,7 +106,7 @@ def calibrate_microphones(
             write_calibration(fit, output)
     if not quiet:
         _print_summary(console, fit, tap_data)
-        say_written(console, output, files[1].name)
+        print_written_files(console, output, files[1].name)
 
 
 def _print_summary(console, fit: "CalibrationFit", taps: "Taps") -> None:
@@ -123,7 +125,7 @@ def _print_summary(console, fit: "CalibrationFit", taps: "Taps") -> None:
             "error of location",
             f"± {1e3 * _location_error(fit, taps):.1f} mm from one window, median (Cramér-Rao bound)",
         ),
-        *([("note", in_options(fit.note, {"decay": "--decay"}))] if fit.note else []),
+        *([("note", with_option_names(fit.note, {"decay": "--decay"}))] if fit.note else []),
         ("scale", "a source of strength 1 has intensity 1 at a typical microphone directly below it"),
     ]
     if fit.shared.any():
@@ -151,10 +153,10 @@ def _location_error(fit: "CalibrationFit", taps: "Taps") -> float:
     from jeit.acoustic import cramer_rao
 
     is_received, usable = fit.strength > 0, np.asarray(fit.calibration.usable)
-    bound = cramer_rao(
+    cramer_rao_bound = cramer_rao(
         fit.calibration.microphone_array, taps.positions[is_received], fit.strength[is_received], use=usable
     )
-    return float(np.median(np.sqrt(np.linalg.eigvalsh(bound)[:, -1])))
+    return float(np.median(np.sqrt(np.linalg.eigvalsh(cramer_rao_bound)[:, -1])))
 
 
 def _parameter_table(fit: "CalibrationFit"):
@@ -166,10 +168,10 @@ def _parameter_table(fit: "CalibrationFit"):
 
     calibration = fit.calibration
     decay, noise = on_host((calibration.microphone_array.decay, calibration.microphone_array.noise))
-    factors, units = {"a": 1.0, "b": 1e6, "length": 1e3}, {"a": "m²", "b": "mm²", "length": "mm"}
+    factors, unit_names = {"a": 1.0, "b": 1e6, "length": 1e3}, {"a": "m²", "b": "mm²", "length": "mm"}
     if decay.name == "exponential":
-        units["a"] = "1"
-    columns = [text for name in decay.parameters for text in (f"{name} / {units[name]}", "± %")]
+        unit_names["a"] = "1"
+    columns = [text for name in decay.parameters for text in (f"{name} / {unit_names[name]}", "± %")]
     table = Table("", *columns, "moved / mm", "error %", "explained %", box=None, padding=(0, 1))
     for column in table.columns[1:]:
         column.justify = "right"

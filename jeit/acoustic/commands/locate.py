@@ -8,15 +8,21 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jeit.acoustic.commands.calibrate_microphones import BandHigh, BandLow, Hop, Window, intensity_settings
-from jeit.cli.options import Quiet, in_options, make_folder, naming_options
+from jeit.acoustic.commands.calibrate_microphones import (
+    HighestFrequencyOption,
+    HopOption,
+    LowestFrequencyOption,
+    WindowOption,
+    intensity_settings,
+)
+from jeit.cli.options import QuietOption, make_folder, naming_options_in_errors, with_option_names
 
 if TYPE_CHECKING:
     from jeit.acoustic import LocatedTouches, Recording
 
 _OPTIONS = {"intensity": "--low, --high, --window and --hop"}
 # Length of the path of a touch above which its start and end are printed instead of its mean position.
-_MIN_STROKE_LENGTH = 0.015  # m
+_MIN_STROKE_PATH_LENGTH = 0.015  # m
 
 
 def locate(
@@ -57,18 +63,18 @@ def locate(
             "the intensities; 0 if they have not changed."
         ),
     ] = 0.1,
-    low: BandLow = None,
-    high: BandHigh = None,
-    window: Window = None,
-    hop: Hop = None,
-    quiet: Quiet = False,
+    low: LowestFrequencyOption = None,
+    high: HighestFrequencyOption = None,
+    window: WindowOption = None,
+    hop: HopOption = None,
+    quiet: QuietOption = False,
 ) -> None:
     """Locate every touch of a recording; writes track.csv, report.json and track.png."""
     from jeit.acoustic import Calibration, locate_touches, read_recording
     from jeit.acoustic.localisation.localiser import METHODS
     from jeit.acoustic.reports import write_track
     from jeit.arguments import check_name
-    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.cli.console import Steps, plain_console, print_written_files
 
     check_name("--method", method, METHODS)
     if not 0 < gap < float("inf"):
@@ -78,7 +84,7 @@ def locate(
     settings = intensity_settings(low, high, window, hop)
     make_folder(output, ("track.csv", "report.json", "track.png"))
     console = plain_console()
-    with Steps(console, quiet=quiet) as step, naming_options(_OPTIONS):
+    with Steps(console, quiet=quiet) as step, naming_options_in_errors(_OPTIONS):
         step("read")
         loaded_calibration = Calibration.load(calibration)
         loaded_recording = read_recording(recording)
@@ -95,7 +101,7 @@ def locate(
         write_track(located_touches, output)
     if not quiet:
         _print_summary(console, located_touches)
-        say_written(console, output / "track.csv", "report.json", "track.png")
+        print_written_files(console, output / "track.csv", "report.json", "track.png")
 
 
 def _read_silence(path: Path, touch_recording) -> "Recording":
@@ -120,7 +126,7 @@ def _print_summary(console, located: "LocatedTouches") -> None:
     counts = ", ".join(f"{number} {status}" for status, number in locations.counts().items())
     rows = [("frames", f"{len(locations.times)}: {counts}"), ("touches", str(len(located.track.touches)))]
     rows += [("faults", describe_faults(locations.faults))] * any(locations.faults)
-    rows += [("note", in_options(note, {"silence": "--silence"})) for note in locations.notes]
+    rows += [("note", with_option_names(note, {"silence": "--silence"})) for note in locations.notes]
     console.print()
     console.print(name_value_table(locations.name, rows))
     if located.track.touches:
@@ -147,7 +153,7 @@ def _table_rows(located: "LocatedTouches") -> Iterator[tuple[str, ...]]:
         frames = slice(touch.first, touch.last + 1)
         positions = 1e3 * track.position[frames, :2]
         error = 1e3 * float(np.median(np.sqrt(np.linalg.eigvalsh(track.covariance[frames])[:, -1])))
-        if touch.length > _MIN_STROKE_LENGTH:
+        if touch.length > _MIN_STROKE_PATH_LENGTH:
             position_cells = [f"{coordinates[0]:z.1f} → {coordinates[-1]:z.1f}" for coordinates in positions.T]
         else:
             position_cells = [f"{coordinates.mean():z.1f}" for coordinates in positions.T]

@@ -38,34 +38,34 @@ from jeit_solvers.engines import as_array, host, on_device, on_host, slopes
 # Factors on the prior standard deviation of the changes, which are tried in turn. The first factor is accepted if one
 # source explains half of the frames. The other factors are accepted only if one source explains nearly all frames,
 # since large changes of the gains let one source explain some pairs of touches too.
-_DEVIATION_FACTORS, _MIN_EXPLAINED_FIRST, _MIN_EXPLAINED_LATER = (1.0, 2.0, 4.0), 0.5, 0.9
+_PRIOR_DEVIATION_FACTORS, _MIN_EXPLAINED_BY_FIRST_FACTOR, _MIN_EXPLAINED_BY_LATER_FACTORS = (1.0, 2.0, 4.0), 0.5, 0.9
 # Maximum number of iterations of the estimate.
 _MAX_ITERATIONS = 4
 # Change of the estimated logarithms below which the iteration ends.
-_CONVERGED_CHANGE = 0.05
+_CONVERGENCE_TOLERANCE = 0.05
 # Side of square cells of the skin, as a fraction of the skin's size. All frames with positions in one cell together
 # have the weight of one frame, since the errors of a decay model are similar at neighbouring positions.
-_CELL_SIZE = 0.3
+_RELATIVE_CELL_SIZE = 0.3
 # Probability that estimated changes are significant although the gains have not changed.
-_FALSE_CHANGE = 0.01
+_FALSE_ALARM_PROBABILITY = 0.01
 # Relative tolerance of the rank of A.
 _RANK_TOLERANCE = 1e-8
 # Fraction of the trace of a frame's Fisher matrix that is added to the diagonal of this matrix, which is singular where
 # few microphones respond.
-_RIDGE = 1e-12
+_RELATIVE_REGULARISATION = 1e-12
 # Number of the loudest frames, in which changes of the setup are searched for.
 _NUM_FRAMES = 24
 # Misfit per degree of freedom above which the search begins.
-_LARGE_MISFIT = 3.0
+_SEARCH_MISFIT = 3.0
 # Value at which the misfit per degree of freedom is clipped.
-_MAX_MISFIT = 100.0
+_CLIPPING_MISFIT = 100.0
 # Maximum ratio of the misfits after and before an accepted change.
 _MAX_MISFIT_RATIO = 0.7
 # Maximum number of changes of the setup that are searched for.
-_MAX_CHANGES = 4
+_MAX_SETUP_CHANGES = 4
 # Leaving out one microphone is a candidate change only if more than this number of microphones are in no accepted
 # change.
-_MIN_REMAINING = 5
+_MIN_UNCHANGED_MICROPHONES = 5
 
 
 class GainChanges(NamedTuple):
@@ -115,11 +115,11 @@ def estimate_gain_changes(
     zero_changes = GainChanges(np.zeros(len(used_mask)), np.zeros_like(centring_matrix))
     if deviation == 0:
         return (zero_changes,)
-    for factor in _DEVIATION_FACTORS:
+    for factor in _PRIOR_DEVIATION_FACTORS:
         changes, explained_share = _estimate_gain_changes(
             microphone_array, power, use, factor * deviation * centring_matrix, locate_frames
         )
-        if explained_share >= (_MIN_EXPLAINED_FIRST if factor == 1 else _MIN_EXPLAINED_LATER):
+        if explained_share >= (_MIN_EXPLAINED_BY_FIRST_FACTOR if factor == 1 else _MIN_EXPLAINED_BY_LATER_FACTORS):
             return (changes,)
     return zero_changes, zero_changes._replace(covariance=deviation**2 * centring_matrix)
 
@@ -134,16 +134,16 @@ def _estimate_gain_changes(
     changes, explained_share = GainChanges(np.zeros(len(scale)), deviation * scale), 0.0
     is_significant = False
     for _ in range(_MAX_ITERATIONS):
-        sources, is_explained = locate_frames(changes.apply(microphone_array))
-        explained_share = float(np.mean(is_explained))
-        if not is_explained.any():
+        sources, is_explained_frame = locate_frames(changes.apply(microphone_array))
+        explained_share = float(np.mean(is_explained_frame))
+        if not is_explained_frame.any():
             break
         array_with_changes = _set_gains_without_uncertainty(microphone_array, changes)
         matrix, right_hand_side = _normal_equations(
             array_with_changes,
-            power[is_explained],
-            use[is_explained],
-            _unknowns_of_sources(array_with_changes, sources, is_explained),
+            power[is_explained_frame],
+            use[is_explained_frame],
+            _unknowns_of_sources(array_with_changes, sources, is_explained_frame),
         )
         right_hand_side = right_hand_side + matrix @ changes.logarithm
         is_significant = _are_significant(matrix, right_hand_side)
@@ -152,7 +152,7 @@ def _estimate_gain_changes(
         changes = GainChanges(
             centring_matrix @ covariance @ right_hand_side, centring_matrix @ covariance @ centring_matrix
         )
-        if np.abs(changes.logarithm - previous_logarithm).max() < _CONVERGED_CHANGE:
+        if np.abs(changes.logarithm - previous_logarithm).max() < _CONVERGENCE_TOLERANCE:
             break
     if not is_significant:
         # The covariance becomes the mean square of the changes about 0, instead of about their estimate.
@@ -166,7 +166,7 @@ def _are_significant(matrix: np.ndarray, right_hand_side: np.ndarray) -> bool:
     eigenvalues, eigenvectors = np.linalg.eigh(matrix)
     is_determined = eigenvalues > _RANK_TOLERANCE * eigenvalues[-1]
     squared_components = (eigenvectors[:, is_determined].T @ right_hand_side) ** 2 / eigenvalues[is_determined]
-    return bool(chdtrc(is_determined.sum(), squared_components.sum()) < _FALSE_CHANGE)
+    return bool(chdtrc(is_determined.sum(), squared_components.sum()) < _FALSE_ALARM_PROBABILITY)
 
 
 def covariance_with_gains(
@@ -210,8 +210,8 @@ def _unknowns_of_sources(
     microphone_array: MicrophoneArray, sources: SourceEstimate, frames
 ) -> Float[np.ndarray, "3 F"]:
     """Chart coordinates and logarithmic strengths of `sources` in the frames with the indices or mask `frames`."""
-    chart = on_host(microphone_array.surface).project(np.asarray(sources.position)[frames].T)
-    return np.concatenate([chart, np.log(np.asarray(sources.strength))[None, frames]])
+    chart_positions = on_host(microphone_array.surface).project(np.asarray(sources.position)[frames].T)
+    return np.concatenate([chart_positions, np.log(np.asarray(sources.strength))[None, frames]])
 
 
 def _linearise_levels(
@@ -229,18 +229,18 @@ def _linearise_levels(
 def _normal_equations(array: MicrophoneArray, power, use, unknowns) -> tuple[np.ndarray, np.ndarray]:
     """Matrix A (M, M) and right-hand side b (M,) of the normal equations of the gain changes, without the prior."""
     likelihood, jacobian, signal_share, weight = _linearise_levels(array, power, use, unknowns)
-    cell_size = _CELL_SIZE * float(longer_side(array.surface))
+    cell_size = _RELATIVE_CELL_SIZE * float(longer_side(array.surface))
     _, cell_indices, frames_per_cell = np.unique(
         np.floor(unknowns[:2] / cell_size), axis=1, return_inverse=True, return_counts=True
     )
     weight = weight / frames_per_cell[cell_indices.ravel()]
     residual = likelihood.level - array.expected(unknowns)[0]
-    share_weights = weight * signal_share
-    coupling = share_weights * jacobian
+    signal_weights = weight * signal_share
+    coupling = signal_weights * jacobian
     inverse_fisher = _inverse_fisher(np.einsum("kmf,lmf->klf", weight * jacobian, jacobian))
     source_response = np.einsum("klf,lmf->kmf", inverse_fisher, coupling)
-    matrix = np.diag((share_weights * signal_share).sum(axis=1)) - np.einsum("kmf,knf->mn", coupling, source_response)
-    right_hand_side = (share_weights * residual).sum(axis=1) - np.einsum(
+    matrix = np.diag((signal_weights * signal_share).sum(axis=1)) - np.einsum("kmf,knf->mn", coupling, source_response)
+    right_hand_side = (signal_weights * residual).sum(axis=1) - np.einsum(
         "kmf,kf->m", source_response, (weight * jacobian * residual).sum(axis=1)
     )
     return matrix, right_hand_side
@@ -248,19 +248,21 @@ def _normal_equations(array: MicrophoneArray, power, use, unknowns) -> tuple[np.
 
 def _inverse_fisher(fisher) -> np.ndarray:
     """Inverses (3, 3, F) of the Fisher matrices of F frames. A ridge makes singular matrices definite."""
-    regularised_fisher = fisher + _RIDGE * np.maximum(np.trace(fisher), 1.0) * np.eye(len(fisher))[:, :, None]
+    regularised_fisher = (
+        fisher + _RELATIVE_REGULARISATION * np.maximum(np.trace(fisher), 1.0) * np.eye(len(fisher))[:, :, None]
+    )
     return np.asarray(inverse_small(regularised_fisher))
 
 
 class SetupChanges(NamedTuple):
     """Changes of the setup since the calibration.
 
-    **Fields**: `exchanged`: pairs of indices of exchanged microphones; `altered`: indices of microphones whose response
-    has changed.
+    **Fields**: `exchanged_pairs`: pairs of indices of exchanged microphones; `altered_microphones`: indices of
+    microphones whose response has changed.
     """
 
-    exchanged: list[tuple[int, int]]
-    altered: list[int]
+    exchanged_pairs: list[tuple[int, int]]
+    altered_microphones: list[int]
 
 
 def find_setup_changes(
@@ -291,20 +293,26 @@ def find_setup_changes(
             np.concatenate([use[:, channel_order] & mask for channel_order, mask in states]),
         )
         ratio = np.asarray(estimates.misfit) / np.maximum(np.asarray(estimates.freedom), 1)
-        return np.minimum(np.nan_to_num(ratio, nan=_MAX_MISFIT), _MAX_MISFIT).reshape(len(states), -1).mean(axis=1)
+        return (
+            np.minimum(np.nan_to_num(ratio, nan=_CLIPPING_MISFIT), _CLIPPING_MISFIT)
+            .reshape(len(states), -1)
+            .mean(axis=1)
+        )
 
     state = np.arange(power.shape[1]), np.ones(power.shape[1], bool)
     current_misfit = float(mean_misfit([state])[0])
     remaining_channels = np.flatnonzero(use.any(axis=0))
     while (
-        current_misfit > _LARGE_MISFIT
-        and len(changes.exchanged) + len(changes.altered) < _MAX_CHANGES
+        current_misfit > _SEARCH_MISFIT
+        and len(changes.exchanged_pairs) + len(changes.altered_microphones) < _MAX_SETUP_CHANGES
         and remaining_channels.size
     ):
         # Altered microphones come first among the candidate changes, since exchanging an altered microphone may lower
         # the misfit too.
-        single_channels = [(int(k),) for k in remaining_channels if remaining_channels.size > _MIN_REMAINING]
-        candidates = single_channels + [(int(k), int(m)) for k, m in combinations(remaining_channels, 2)]
+        single_channel_candidates = [
+            (int(k),) for k in remaining_channels if remaining_channels.size > _MIN_UNCHANGED_MICROPHONES
+        ]
+        candidates = single_channel_candidates + [(int(k), int(m)) for k, m in combinations(remaining_channels, 2)]
         candidate_states = [_apply_change(state, channels) for channels in candidates]
         misfits = mean_misfit(candidate_states)
         best_index = int(misfits.argmin())
@@ -313,11 +321,11 @@ def find_setup_changes(
         current_misfit, state = float(misfits[best_index]), candidate_states[best_index]
         channels = candidates[best_index]
         if len(channels) == 2:
-            changes.exchanged.append((channels[0], channels[1]))
+            changes.exchanged_pairs.append((channels[0], channels[1]))
         else:
-            changes.altered.append(channels[0])
+            changes.altered_microphones.append(channels[0])
         remaining_channels = remaining_channels[~np.isin(remaining_channels, channels)]
-    return changes if current_misfit <= _LARGE_MISFIT else SetupChanges([], [])
+    return changes if current_misfit <= _SEARCH_MISFIT else SetupChanges([], [])
 
 
 def _apply_change(state: tuple[np.ndarray, np.ndarray], channels: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:

@@ -110,8 +110,10 @@ class Consistency(Module):
             return microphone_array.response(chart)
         position = microphone_array.surface.place(chart)
         xp = namespace(position)
-        terms = [xp.sum(position**2, axis=0), *position, xp.ones_like(position[0])]
-        return xp.stack([terms[i] * terms[j] for i in range(len(terms)) for j in range(i + 1)])
+        polynomial_terms = [xp.sum(position**2, axis=0), *position, xp.ones_like(position[0])]
+        return xp.stack(
+            [polynomial_terms[i] * polynomial_terms[j] for i in range(len(polynomial_terms)) for j in range(i + 1)]
+        )
 
     def screen(self, features: Float[Array, "N P"]) -> Float[Array, "F P"]:
         """Loss (F, P) of all frames at candidate positions, computed by matrix products.
@@ -129,18 +131,18 @@ class Consistency(Module):
                 self.power.T**2
             ) @ inverse**2
         decay, positions = self.microphone_array.decay, self.microphone_array.microphones
-        constant = xp.sum(positions**2, axis=1) + decay.b
-        quadratic = xp.column_stack([xp.ones(len(positions)), -2 * positions, constant]) / decay.a[:, None]
-        estimates = [self.power * column[:, None] for column in quadratic.T]
+        constant_term = xp.sum(positions**2, axis=1) + decay.b
+        quadratic_term = xp.column_stack([xp.ones(len(positions)), -2 * positions, constant_term]) / decay.a[:, None]
+        estimates = [self.power * column[:, None] for column in quadratic_term.T]
         loudest_strengths = [xp.take_along_axis(estimate, self.loudest[None], axis=0)[0] for estimate in estimates]
-        totals = [xp.sum(estimate, axis=0) for estimate in estimates]
+        weighted_sums = [xp.sum(estimate, axis=0) for estimate in estimates]
         coefficients = []
         for i in range(len(estimates)):
             for j in range(i + 1):
                 coefficient = (
                     num_used * loudest_strengths[i] * loudest_strengths[j]
-                    - loudest_strengths[i] * totals[j]
-                    - loudest_strengths[j] * totals[i]
+                    - loudest_strengths[i] * weighted_sums[j]
+                    - loudest_strengths[j] * weighted_sums[i]
                 )
                 coefficient = coefficient + xp.sum(estimates[i] * estimates[j], axis=0)
                 coefficients.append(coefficient if i == j else 2 * coefficient)
@@ -177,13 +179,13 @@ class Consistency(Module):
 
 
 # Number of candidate positions along the outline of the skin.
-_OUTLINE_CANDIDATES = 240
+_NUM_OUTLINE_CANDIDATES = 240
 # Distance, as a fraction of the skin's size, below which two minima are considered the same.
-_MIN_VALLEY_DISTANCE = 0.05
+_MIN_DISTANCE_OF_MINIMA = 0.05
 # Number of steps in the second valley before its cost is compared with that of the first valley.
-_TRIAL_STEPS = 8
+_NUM_TRIAL_STEPS = 8
 # Maximum difference of cost for which the minimisation in the second valley continues.
-_MAX_EXCESS = 8.0
+_MAX_COST_DIFFERENCE = 8.0
 # Maximum number of steps of a minimisation.
 _MAX_STEPS = 30
 # Tolerance of the minimisation: predicted decrease of the cost in the next step, relative to 1 + |cost|.
@@ -205,63 +207,63 @@ def find_minima(objective, first_start, second_start, has_second_start):
     xp = namespace(objective, unknowns)
     value = xp.where(xp.isfinite(first_minimum.value), first_minimum.value, xp.inf)
     is_inside = surface.outline.contains(unknowns[:2].T)
-    rival_excess, lowest_value = xp.full(value.shape, xp.inf), value
+    second_minimum_excess, lowest_cost = xp.full(value.shape, xp.inf), value
     if has_second_start is not None:
         # After a few steps, the minimisation continues only in promising second valleys.
         trial_minimum = _minimise_in_plane(
-            objective, objective.start(second_start), ~has_second_start, max_steps=_TRIAL_STEPS
+            objective, objective.start(second_start), ~has_second_start, max_steps=_NUM_TRIAL_STEPS
         )
-        has_second_start = has_second_start & (trial_minimum.value < value + _MAX_EXCESS)
+        has_second_start = has_second_start & (trial_minimum.value < value + _MAX_COST_DIFFERENCE)
         second_minimum = _minimise_in_plane(objective, trial_minimum.x, ~has_second_start)
-        second_value = xp.where(has_second_start & xp.isfinite(second_minimum.value), second_minimum.value, xp.inf)
+        second_cost = xp.where(has_second_start & xp.isfinite(second_minimum.value), second_minimum.value, xp.inf)
         second_is_inside = surface.outline.contains(second_minimum.x[:2].T)
-        is_distinct = xp.linalg.norm(second_minimum.x[:2] - unknowns[:2], axis=0) > _MIN_VALLEY_DISTANCE * longer_side(
-            surface
+        is_distinct = xp.linalg.norm(
+            second_minimum.x[:2] - unknowns[:2], axis=0
+        ) > _MIN_DISTANCE_OF_MINIMA * longer_side(surface)
+        second_minimum_excess = xp.where(
+            is_distinct & has_second_start & is_inside & second_is_inside, xp.abs(second_cost - value), xp.inf
         )
-        rival_excess = xp.where(
-            is_distinct & has_second_start & is_inside & second_is_inside, xp.abs(second_value - value), xp.inf
-        )
-        lowest_value = xp.minimum(value, second_value)
+        lowest_cost = xp.minimum(value, second_cost)
         # If one of the two minima is outside the outline, the minimum inside is selected. A position on the outline may
         # still have a lower cost.
         second_is_better = xp.where(
-            second_is_inside == is_inside, second_value < value, second_is_inside & xp.isfinite(second_value)
+            second_is_inside == is_inside, second_cost < value, second_is_inside & xp.isfinite(second_cost)
         )
         unknowns = xp.where(second_is_better, second_minimum.x, unknowns)
         converged = xp.where(second_is_better, second_minimum.converged, converged)
         value, is_inside = (
-            xp.where(second_is_better, second_value, value),
+            xp.where(second_is_better, second_cost, value),
             xp.where(second_is_better, second_is_inside, is_inside),
         )
     # Minima outside the outline are replaced by the best position on the outline. A minimum inside is also compared
     # with the best position on the outline, if the other minimum is outside and has a lower cost.
-    try_outline = xp.isfinite(value) & (~is_inside | (lowest_value < value))
+    try_outline = xp.isfinite(value) & (~is_inside | (lowest_cost < value))
     undefined_sides = xp.full((2, 2, value.size), xp.nan)
 
     def move_to_outline(_):
-        outline_minimum, side = _minimise_on_outline(objective, ~try_outline)
-        is_moved = try_outline & (~is_inside | (outline_minimum.value < value))
+        outline_minimum, outline_side = _minimise_on_outline(objective, ~try_outline)
+        is_outline_better = try_outline & (~is_inside | (outline_minimum.value < value))
         return (
-            xp.where(is_moved, outline_minimum.x, unknowns),
-            xp.where(try_outline, xp.where(is_moved, outline_minimum.value, value) - lowest_value, 0.0),
-            xp.where(is_moved, outline_minimum.converged, converged),
-            xp.where(is_moved, side, undefined_sides),
+            xp.where(is_outline_better, outline_minimum.x, unknowns),
+            xp.where(try_outline, xp.where(is_outline_better, outline_minimum.value, value) - lowest_cost, 0.0),
+            xp.where(is_outline_better, outline_minimum.converged, converged),
+            xp.where(is_outline_better, outline_side, undefined_sides),
         )
 
-    def keep_inside(_):
+    def keep_minimum_inside(_):
         return unknowns, xp.zeros_like(value), converged, undefined_sides
 
-    any_on_outline = xp.any(try_outline)
+    needs_outline_search = xp.any(try_outline)
     minima = (
-        (move_to_outline(None) if any_on_outline else keep_inside(None))
+        (move_to_outline(None) if needs_outline_search else keep_minimum_inside(None))
         if xp is np
-        else jax.lax.cond(any_on_outline, move_to_outline, keep_inside, None)
+        else jax.lax.cond(needs_outline_search, move_to_outline, keep_minimum_inside, None)
     )
-    unknowns, excess_cost, converged, side = minima
-    return unknowns, excess_cost, rival_excess, converged, side
+    unknowns, excess_cost, converged, outline_side = minima
+    return unknowns, excess_cost, second_minimum_excess, converged, outline_side
 
 
-def _minimise_in_plane(objective, start, skip, *, max_steps: int | None = None) -> Minimum:
+def _minimise_in_plane(objective, start, is_skipped, *, max_steps: int | None = None) -> Minimum:
     """Minimise the objective within the bounding box of the outline, extended by its longer side in all directions. A
     step is at most a quarter of the longer side, and a factor of ten in strength.
 
@@ -287,7 +289,7 @@ def _minimise_in_plane(objective, start, skip, *, max_steps: int | None = None) 
         upper=xp.concatenate([high + skin_size, infinite_bounds])[:, None],
         largest_step=xp.concatenate([xp.full(2, skin_size / 4), xp.full_like(infinite_bounds, 2.3)])[:, None],
         tolerance=_TOLERANCE,
-        skip=skip,
+        skip=is_skipped,
     )
 
 
@@ -300,9 +302,9 @@ def _expand_exactly(objective, x) -> tuple[Array, Array, Array]:
     return value, gradient, namespace(hessian).where(definite_small(hessian), hessian, model)
 
 
-def _minimise_on_outline(objective, skip) -> tuple[Minimum, Array]:
+def _minimise_on_outline(objective, is_skipped) -> tuple[Minimum, Array]:
     """Find the best position on the outline: the best of many candidates, refined along its side of the outline. Frames
-    in the mask `skip` (F,) are left out. Also returns the start and end of the side (2, 2, F).
+    in the mask `is_skipped` (F,) are left out. Also returns the start and end of the side (2, 2, F).
     """
     start, end = outline_sides(objective.microphone_array.surface)
     xp = namespace(objective, start)
@@ -310,7 +312,7 @@ def _minimise_on_outline(objective, skip) -> tuple[Minimum, Array]:
     # Candidate positions are equally spaced along the outline. Each candidate is specified by a side and a fraction of
     # the side's length.
     arc_lengths = xp.concatenate([xp.zeros(1), xp.cumsum(length)])
-    candidate_arc_lengths = arc_lengths[-1] * (xp.arange(_OUTLINE_CANDIDATES) + 0.5) / _OUTLINE_CANDIDATES
+    candidate_arc_lengths = arc_lengths[-1] * (xp.arange(_NUM_OUTLINE_CANDIDATES) + 0.5) / _NUM_OUTLINE_CANDIDATES
     side_indices = xp.clip(xp.searchsorted(arc_lengths, candidate_arc_lengths, side="right") - 1, 0, length.size - 1)
     side_fractions = (candidate_arc_lengths - arc_lengths[side_indices]) / length[side_indices]
     chart = start[:, side_indices] + side_fractions * (end - start)[:, side_indices]
@@ -342,7 +344,7 @@ def _minimise_on_outline(objective, skip) -> tuple[Minimum, Array]:
         upper=xp.array([1.0] + num_strengths * [xp.inf])[:, None],
         largest_step=xp.array([0.5] + num_strengths * [2.3])[:, None],
         tolerance=_TOLERANCE,
-        skip=skip,
+        skip=is_skipped,
     )
     side_ends = origin + directions
     is_in_corner = (minimum.x[0] <= 0) | (minimum.x[0] >= 1)
@@ -378,8 +380,8 @@ def differentiable_minima(objective, unknowns, side, skin_size):
     projector = set_at(xp.zeros_like(hessian) + xp.eye(len(minimum))[:, :, None], np.s_[:2, :2], tangent_projector)
     gradient = xp.einsum("klf,lf->kf", projector, gradient)
     projected_hessian = xp.einsum("klf,lmf,mnf->knf", projector, hessian, projector)
-    trace = xp.maximum(xp.einsum("kkf->f", projected_hessian), 1e-300)
-    hessian = projected_hessian + (xp.eye(len(minimum))[:, :, None] - projector) * trace
+    hessian_trace = xp.maximum(xp.einsum("kkf->f", projected_hessian), 1e-300)
+    hessian = projected_hessian + (xp.eye(len(minimum))[:, :, None] - projector) * hessian_trace
     step = solve_small(hessian, gradient)
     usable = xp.all(xp.isfinite(step), axis=0) & (xp.max(xp.abs(step[:2]), axis=0) < 1e-3 * skin_size)
     return minimum - xp.where(usable, step, 0.0)

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from jeit.acoustic.microphones import MicrophoneArray, check_array
 from jeit.acoustic.surface import to_three_dimensions
 from jeit_solvers import inverse_small, symmetric_small
-from jeit_solvers.engines import computed_once, either_engine, namespace, slopes
+from jeit_solvers.engines import computed_once, namespace, numpy_or_compiled, slopes
 from jeit_solvers.module import Module
 
 
@@ -53,8 +53,8 @@ class Likelihood(Module):
         """Negative log-likelihood (F,) of each frame, up to a constant."""
         mean, variance = self.microphone_array.expected(unknowns)
         xp = namespace(self, mean)
-        terms = 0.5 * (self.level - mean) ** 2 / variance + 0.5 * xp.log(variance)
-        return xp.sum(xp.where(self.use, terms, 0.0), axis=0)
+        likelihood_terms = 0.5 * (self.level - mean) ** 2 / variance + 0.5 * xp.log(variance)
+        return xp.sum(xp.where(self.use, likelihood_terms, 0.0), axis=0)
 
     def misfit(self, unknowns: Float[Array, "n F"]) -> Float[Array, " F"]:
         """Misfit Σ (y − m)² / v (F,) between levels y and expected levels m of variance v. If the model is correct, the
@@ -161,7 +161,7 @@ def cramer_rao(
     return _bound_covariance(microphone_array, position, strength, used_microphones)
 
 
-@either_engine
+@numpy_or_compiled
 def _bound_covariance(microphone_array: MicrophoneArray, position, strength, used_microphones) -> Float[Array, "N d d"]:
     xp = namespace(microphone_array, position, strength, used_microphones)
     position = xp.asarray(position, float)

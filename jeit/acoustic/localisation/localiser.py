@@ -23,10 +23,10 @@ from jeit.acoustic.surface import bounding_box, longer_side, to_three_dimensions
 from jeit.arguments import check_name
 from jeit_solvers import inverse_small
 from jeit_solvers.engines import (
-    either_engine,
     evaluate_in_numpy,
     has_values,
     namespace,
+    numpy_or_compiled,
     on_device,
     on_host,
     scan,
@@ -41,7 +41,7 @@ _NUM_COARSE_PIXELS = 400
 # grid, and with maps.
 _MAX_CHUNK_FRAMES, _MAX_MAP_FRAMES = 1024, 32
 # Minimum relative error of the decay models that is assumed when the objective is evaluated on a grid of positions.
-_SCREENING_ERROR = 0.2
+_MIN_SCREENING_RELATIVE_ERROR = 0.2
 
 
 class SourceEstimate(Module):
@@ -110,9 +110,9 @@ class Localiser(Module):
         check_array(microphone_array)
         check_name("method", method, METHODS)
         low, high = bounding_box(on_host(microphone_array.surface))
-        box_sides = np.asarray(high - low)
-        spacing = np.sqrt(np.prod(box_sides) / _NUM_COARSE_PIXELS)
-        counts = [max(3, round(side / spacing)) for side in box_sides]
+        bounding_box_lengths = np.asarray(high - low)
+        spacing = np.sqrt(np.prod(bounding_box_lengths) / _NUM_COARSE_PIXELS)
+        counts = [max(3, round(side / spacing)) for side in bounding_box_lengths]
         coarse_grid = Pixels.create(microphone_array.surface, *counts)
         if map_shape is None:
             return cls(microphone_array, coarse_grid, None, None, method, compiled)
@@ -190,7 +190,7 @@ def _apply_in_chunks(function, max_frames: int, *arrays):
     return jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:])[:num_frames], results)
 
 
-@either_engine
+@numpy_or_compiled
 def _compute_features(objective, microphone_array: MicrophoneArray, chart) -> Array:
     return objective.features(microphone_array, chart)
 
@@ -221,7 +221,7 @@ def _starting_positions(localiser: Localiser, power, use):
     constant_array = eqx.tree_at(
         lambda tree: tree.noise.relative,
         constant_array,
-        namespace(constant_array).maximum(constant_array.noise.relative, _SCREENING_ERROR),
+        namespace(constant_array).maximum(constant_array.noise.relative, _MIN_SCREENING_RELATIVE_ERROR),
     )
 
     def screen_chunk(power, use):

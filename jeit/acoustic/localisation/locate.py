@@ -29,31 +29,31 @@ from jeit_solvers.engines import as_array, on_host
 
 # Default standard deviation of the changes of the microphones' gains since the calibration, as a fraction of the
 # intensities.
-GAIN_DRIFT = 0.1
+GAIN_DRIFT_DEVIATION = 0.1
 # Probability that a silent frame is detected as a touch, and probability that a frame with one source is classified as
 # a misfit.
-_FALSE_ALARM, _FALSE_MISFIT = 1e-6, 1e-4
+_DETECTION_FALSE_ALARM_PROBABILITY, _FALSE_MISFIT_PROBABILITY = 1e-6, 1e-4
 # Detection threshold of touches in standard deviations of the noise, if the distribution of the noise is unknown.
-_ALARM_DEVIATIONS = 6.0
+_DETECTION_DEVIATIONS_OF_NOISE = 6.0
 # Thresholds of differences of −2 log-likelihood: a frame is "outside" if a position beyond the outline is better by
 # more than 9 (three standard deviations).
-_MIN_OUTSIDE_EXCESS = 9.0
+_MIN_OUTSIDE_LIKELIHOOD_GAIN = 9.0
 # A frame is "ambiguous" if its second valley is worse by less than 4 (two standard deviations).
-_MAX_AMBIGUOUS_DIFFERENCE = 4.0
+_MAX_AMBIGUOUS_LIKELIHOOD_DIFFERENCE = 4.0
 # Thresholds for accepting two sources whose misfit is statistically significant: maximum ratio of the misfit of two
 # sources to that of one source, and maximum misfit per degree of freedom. Minimum ratio of the strengths of two
 # sources, since errors of the decay models look like a weak second source.
 _MAX_MISFIT_RATIO, _MAX_MISFIT, _MIN_STRENGTH_RATIO = 0.2, 10.0, 0.05
 # Changes of the setup are searched for if one source on the skin fails to explain more than this fraction of the frames
 # with a touch.
-_MAX_UNEXPLAINED = 0.25
+_MAX_UNEXPLAINED_FRAMES = 0.25
 # Minimum fraction of the frames that one or two sources must explain if the gains have not changed.
-_MIN_EXPLAINED = 0.9
+_MIN_EXPLAINED_FRAMES = 0.9
 # Minimum ratio of the intensity of a touch to the highest intensity of the recording, if no noise floor is known (−60
 # dB).
-_DYNAMIC_RANGE = 1e-6
+_MIN_RELATIVE_INTENSITY = 1e-6
 # Maximum plausible ratio of the strength of touches to that of the calibration taps, or its inverse (40 dB).
-_MAX_STRENGTH_RATIO = 1e4
+_MAX_PLAUSIBLE_STRENGTH_RATIO = 1e4
 
 
 def locate(
@@ -64,7 +64,7 @@ def locate(
     map_shape: tuple[int, int] | None = None,
     intensity: IntensitySettings | None = None,
     silence: Recording | None = None,
-    gain_drift: float = GAIN_DRIFT,
+    gain_drift: float = GAIN_DRIFT_DEVIATION,
     compiled: bool | None = None,
 ) -> Locations:
     """Locate the touch in each frame of a recording.
@@ -101,8 +101,8 @@ def locate(
     microphone_array, use, faults = microphones_in_use(intensities, calibration)
     has_touch = use.any(axis=1) & _detected_frames(intensities, microphone_array.noise, use)
     has_enough_readings = use.sum(axis=1) >= 3
-    is_processed = has_touch & has_enough_readings
-    compiled = int(is_processed.sum()) > MAX_NUMPY_FRAMES if compiled is None else compiled
+    is_located = has_touch & has_enough_readings
+    compiled = int(is_located.sum()) > MAX_NUMPY_FRAMES if compiled is None else compiled
     num_frames, dimension = len(intensities.times), calibration.microphone_array.microphones.shape[1]
     status = np.where(has_touch, LocationStatus.TOUCH, LocationStatus.NO_TOUCH).astype(object)
     status[~has_enough_readings] = LocationStatus.UNUSABLE
@@ -116,12 +116,12 @@ def locate(
         "second_strength": np.full(num_frames, np.nan),
     }
     notes = list(intensities.notes)
-    if is_processed.any():
+    if is_located.any():
         settings = _Settings(method, map_shape, gain_drift, compiled)
-        frames_in_use = intensities.power[is_processed], use[is_processed]
-        status[is_processed], frame_results, changes = _locate_frames(microphone_array, *frames_in_use, settings)
+        frames_in_use = intensities.power[is_located], use[is_located]
+        status[is_located], frame_results, changes = _locate_frames(microphone_array, *frames_in_use, settings)
         for key, values in frame_results.items():
-            result[key][is_processed] = values
+            result[key][is_located] = values
         result["covariance"] *= calibration.widening
         _limit_uncertainty(status, result, float(longer_side(on_host(microphone_array.surface))))
         notes += [*_gain_note(changes), *_setup_notes(status, intensities, use, microphone_array)]
@@ -172,23 +172,25 @@ def _locate_frames(
         # consistency loss.
         likelihood_estimate, _ = locate_most_likely(array)
         is_default_method = settings.method == "likelihood" and settings.map_shape is None
-        selected_estimate = (
+        more_likely_estimate = (
             likelihood_estimate if is_default_method else estimate(array, settings.method, settings.map_shape)
         )
-        result = {key: np.array(getattr(selected_estimate, key)) for key in ("position", "covariance", "strength")}
+        result = {key: np.array(getattr(more_likely_estimate, key)) for key in ("position", "covariance", "strength")}
         result |= {key: np.array(getattr(likelihood_estimate, key)) for key in ("misfit", "freedom")}
         result |= {"second": np.full_like(result["position"], np.nan), "second_strength": np.full(num_frames, np.nan)}
         if settings.method == "likelihood":
-            result["covariance"] = covariance_with_gains(microphone_array, power, use, selected_estimate, changes)
-        status = _initial_status(likelihood_estimate, selected_estimate)
+            result["covariance"] = covariance_with_gains(microphone_array, power, use, more_likely_estimate, changes)
+        status = _initial_status(likelihood_estimate, more_likely_estimate)
         _fit_two_sources(status, result, power, use, array, compiled)
         excess_cost = np.asarray(likelihood_estimate.excess)
-        status[(status == LocationStatus.MISFIT) & (excess_cost > _MIN_OUTSIDE_EXCESS)] = LocationStatus.OUTSIDE
+        status[(status == LocationStatus.MISFIT) & (excess_cost > _MIN_OUTSIDE_LIKELIHOOD_GAIN)] = (
+            LocationStatus.OUTSIDE
+        )
         return status, result
 
     for changes in possible_changes:
         status, result = locate_after_changes(changes)
-        if np.mean(status != LocationStatus.MISFIT) > _MIN_EXPLAINED:
+        if np.mean(status != LocationStatus.MISFIT) > _MIN_EXPLAINED_FRAMES:
             return status, result, changes
     return *locate_after_changes(last_changes), last_changes
 
@@ -198,12 +200,12 @@ def _initial_status(most_likely: SourceEstimate, estimate: SourceEstimate) -> np
     estimates, which determine the status; `estimate`: estimates of the selected method."""
     misfit, degrees_of_freedom = np.asarray(most_likely.misfit), np.asarray(most_likely.freedom)
     excess_cost = np.asarray(most_likely.excess)
-    has_rival = np.asarray(most_likely.rival) < _MAX_AMBIGUOUS_DIFFERENCE
+    has_rival = np.asarray(most_likely.rival) < _MAX_AMBIGUOUS_LIKELIHOOD_DIFFERENCE
     status = np.where(has_rival, LocationStatus.AMBIGUOUS, LocationStatus.TOUCH).astype(object)
     status[_exceeds_noise(misfit, degrees_of_freedom)] = LocationStatus.MISFIT
     # A frame is "outside" if a source beyond the outline explains its intensities, and does so clearly better than any
     # source inside. One source beyond the outline does not explain the intensities of two sources.
-    status[(excess_cost > _MIN_OUTSIDE_EXCESS) & ~_exceeds_noise(misfit - excess_cost, degrees_of_freedom)] = (
+    status[(excess_cost > _MIN_OUTSIDE_LIKELIHOOD_GAIN) & ~_exceeds_noise(misfit - excess_cost, degrees_of_freedom)] = (
         LocationStatus.OUTSIDE
     )
     status[~np.isfinite(np.asarray(estimate.position)).all(axis=1)] = LocationStatus.UNUSABLE
@@ -212,7 +214,7 @@ def _initial_status(most_likely: SourceEstimate, estimate: SourceEstimate) -> np
 
 def _exceeds_noise(misfit: np.ndarray, degrees_of_freedom: np.ndarray) -> np.ndarray:
     """Mask (F,) of the frames whose misfit noise alone does not explain."""
-    return (degrees_of_freedom > 0) & (chdtrc(np.maximum(degrees_of_freedom, 1), misfit) < _FALSE_MISFIT)
+    return (degrees_of_freedom > 0) & (chdtrc(np.maximum(degrees_of_freedom, 1), misfit) < _FALSE_MISFIT_PROBABILITY)
 
 
 def _fit_two_sources(
@@ -268,8 +270,8 @@ def _limit_uncertainty(status: np.ndarray, result: dict[str, np.ndarray], skin_s
     deviation[is_finite] = np.sqrt(np.abs(np.linalg.eigvalsh(result["covariance"][is_finite])).max(axis=1))
     is_uncertain = has_position & (status == LocationStatus.TOUCH) & (~is_finite | (deviation > skin_size / 4))
     status[is_uncertain] = LocationStatus.AMBIGUOUS
-    exceeds_skin = has_position & (~is_finite | (deviation > skin_size))
-    result["covariance"][exceeds_skin] = (skin_size / 2) ** 2 * np.eye(result["covariance"].shape[1])
+    deviation_exceeds_skin = has_position & (~is_finite | (deviation > skin_size))
+    result["covariance"][deviation_exceeds_skin] = (skin_size / 2) ** 2 * np.eye(result["covariance"].shape[1])
 
 
 def _gain_note(changes: GainChanges) -> list[str]:
@@ -277,10 +279,10 @@ def _gain_note(changes: GainChanges) -> list[str]:
     factor = np.exp(changes.logarithm)
     if (factor == 1).all():
         return []
-    most_changed = int(np.abs(changes.logarithm).argmax())
+    most_changed_microphone = int(np.abs(changes.logarithm).argmax())
     return [
         "gains have changed since the calibration, and the places are corrected for it: most that of microphone "
-        f"{most_changed}, by {100 * (factor[most_changed] - 1):+.0f} % of its intensity."
+        f"{most_changed_microphone}, by {100 * (factor[most_changed_microphone] - 1):+.0f} % of its intensity."
     ]
 
 
@@ -292,7 +294,7 @@ def _setup_notes(
     notes = []
     has_touch = ~np.isin(status, [LocationStatus.NO_TOUCH, LocationStatus.UNUSABLE])
     is_unexplained = np.isin(status, [LocationStatus.MISFIT, LocationStatus.OUTSIDE, LocationStatus.TWO_TOUCHES])
-    if is_unexplained.sum() > _MAX_UNEXPLAINED * has_touch.sum():
+    if is_unexplained.sum() > _MAX_UNEXPLAINED_FRAMES * has_touch.sum():
         exchanged, altered_microphones = find_setup_changes(
             microphone_array, intensities.power[has_touch], use[has_touch]
         )
@@ -309,7 +311,7 @@ def _setup_notes(
         if (
             not exchanged
             and not altered_microphones
-            and (status == LocationStatus.MISFIT).sum() > 2 * _MAX_UNEXPLAINED * has_touch.sum()
+            and (status == LocationStatus.MISFIT).sum() > 2 * _MAX_UNEXPLAINED_FRAMES * has_touch.sum()
         ):
             notes.append("most touches fit no single source: is this the calibration of this array?")
     return notes
@@ -318,14 +320,14 @@ def _setup_notes(
 def _unit_note(strength: np.ndarray, intensities: Intensities, use: np.ndarray, calibration: Calibration) -> list[str]:
     """Return a note if the intensities differ by orders of magnitude from the intensities of the calibration, which
     suggests a different gain or unit."""
-    question = "do the recording and the taps have the same gain and unit?"
+    gain_and_unit_question = "do the recording and the taps have the same gain and unit?"
     if np.isfinite(strength).any():
         median_strength = float(np.nanmedian(strength))
         ratio = median_strength / np.clip(
             median_strength, *(calibration.strengths or (median_strength, median_strength))
         )
-        if max(ratio, 1 / ratio) > _MAX_STRENGTH_RATIO:
-            return [f"touches are {ratio:.3g} times as strong as the calibration's taps: {question}"]
+        if max(ratio, 1 / ratio) > _MAX_PLAUSIBLE_STRENGTH_RATIO:
+            return [f"touches are {ratio:.3g} times as strong as the calibration's taps: {gain_and_unit_question}"]
         return []
     # Without a touch and without a known noise floor, the intensities are compared with the noise of the calibration.
     deviation = np.asarray(calibration.microphone_array.noise.deviation)
@@ -335,8 +337,12 @@ def _unit_note(strength: np.ndarray, intensities: Intensities, use: np.ndarray, 
     ratio = float(
         np.median(np.where(use, np.abs(intensities.power), 0.0).max(axis=0)[has_noise] / deviation[has_noise])
     )
-    is_quiet = ratio < 1 / _MAX_STRENGTH_RATIO
-    return [f"the sound is {ratio:.3g} times as loud as the calibration's noise: {question}"] if is_quiet else []
+    is_quiet = ratio < 1 / _MAX_PLAUSIBLE_STRENGTH_RATIO
+    return (
+        [f"the sound is {ratio:.3g} times as loud as the calibration's noise: {gain_and_unit_question}"]
+        if is_quiet
+        else []
+    )
 
 
 def microphones_in_use(
@@ -393,11 +399,13 @@ def _detected_frames(intensities: Intensities, noise: IntensityNoise, use: np.nd
     power = np.where(use, intensities.power, -np.inf)
     if np.any(intensities.floor > 0) and np.isfinite(intensities.freedom):
         threshold = intensities.floor * (
-            chdtri(intensities.freedom, _FALSE_ALARM / use.shape[1]) / intensities.freedom - 1
+            chdtri(intensities.freedom, _DETECTION_FALSE_ALARM_PROBABILITY / use.shape[1]) / intensities.freedom - 1
         )
     else:
         max_power = power.max(initial=0.0)
-        threshold = np.maximum(_ALARM_DEVIATIONS * np.asarray(noise.deviation), _DYNAMIC_RANGE * max_power)
+        threshold = np.maximum(
+            _DETECTION_DEVIATIONS_OF_NOISE * np.asarray(noise.deviation), _MIN_RELATIVE_INTENSITY * max_power
+        )
     return np.asarray((power > threshold).any(axis=1))
 
 

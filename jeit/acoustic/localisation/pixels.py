@@ -59,24 +59,24 @@ def find_two_lowest_minima(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[A
     best_rows = xp.argmin(xp.min(fill_outside(rasters, is_inside), axis=2), axis=1)
     row_values = fill_outside(xp.take_along_axis(rasters, best_rows[:, None, None], axis=1)[:, 0], is_inside[best_rows])
     best_pixels = best_rows * columns + xp.argmin(row_values, axis=1)
-    best_chart = pixels.chart[:, best_pixels]
+    best_chart_positions = pixels.chart[:, best_pixels]
     if rows * columns > _MAX_VALLEY_PIXELS:  # fine rasters have spurious local minima
-        return best_chart, best_chart, xp.zeros(best_pixels.shape, bool)
+        return best_chart_positions, best_chart_positions, xp.zeros(best_pixels.shape, bool)
     rasters = fill_outside(rasters, is_inside)
     values = rasters.reshape(len(best_pixels), -1)
     padded_rasters = xp.pad(rasters, ((0, 0), (1, 1), (1, 1)), constant_values=xp.inf)
-    neighbours = [
+    neighbour_values = [
         padded_rasters[:, i : i + rows, j : j + columns] for i in range(3) for j in range(3) if (i, j) != (1, 1)
     ]
-    is_minimum = xp.isfinite(rasters)
-    for neighbour in neighbours:
-        is_minimum &= rasters <= neighbour
-    is_minimum = set_at(is_minimum.reshape(values.shape), (xp.arange(len(best_pixels)), best_pixels), False)
-    other_minima = xp.where(is_minimum, values, xp.inf)
+    is_local_minimum = xp.isfinite(rasters)
+    for neighbour in neighbour_values:
+        is_local_minimum &= rasters <= neighbour
+    is_local_minimum = set_at(is_local_minimum.reshape(values.shape), (xp.arange(len(best_pixels)), best_pixels), False)
+    other_minima = xp.where(is_local_minimum, values, xp.inf)
     second_pixels = xp.argmin(other_minima, axis=1)
     best_values, second_values = xp.min(values, axis=1), xp.min(other_minima, axis=1)
     return (
-        best_chart,
+        best_chart_positions,
         pixels.chart[:, second_pixels],
         second_values < _SECOND_VALLEY_FACTOR * best_values + _SECOND_VALLEY_OFFSET,
     )
@@ -116,17 +116,19 @@ def map_brightness(
         raise ValueError(f"share must be between 0 and 1; it is {share}.")
     flat_maps = np.where(np.isnan(values), np.inf, values).reshape(len(values), -1)
     minimum = flat_maps.min(axis=1, keepdims=True)
-    has_minimum = np.isfinite(minimum)
-    minimum = np.where(has_minimum, minimum, 0.0)
+    has_finite_minimum = np.isfinite(minimum)
+    minimum = np.where(has_finite_minimum, minimum, 0.0)
     scale = 1.0
     if method == "consistency":
-        rank = max(1, int(share * np.isfinite(flat_maps).sum(axis=1).max(initial=1)))
+        rank_of_darkest = max(1, int(share * np.isfinite(flat_maps).sum(axis=1).max(initial=1)))
         scale = (
-            np.partition(flat_maps, min(rank, flat_maps.shape[1] - 1), axis=1)[:, [min(rank, flat_maps.shape[1] - 1)]]
+            np.partition(flat_maps, min(rank_of_darkest, flat_maps.shape[1] - 1), axis=1)[
+                :, [min(rank_of_darkest, flat_maps.shape[1] - 1)]
+            ]
             - minimum
         )
         scale = np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)
-    return np.where(has_minimum, np.exp(-(flat_maps - minimum) / scale), 0.0).reshape(values.shape)
+    return np.where(has_finite_minimum, np.exp(-(flat_maps - minimum) / scale), 0.0).reshape(values.shape)
 
 
 def overlay_images(
@@ -177,6 +179,6 @@ def last_overlay_image(
     A long recording can be processed in parts: the image of the whole recording is the maximum of the images of its
     parts.
     """
-    age = np.maximum(time - np.asarray(times, float), 0.0)
-    weight = np.exp(-age / time_constant)
+    time_since_frame = np.maximum(time - np.asarray(times, float), 0.0)
+    weight = np.exp(-time_since_frame / time_constant)
     return np.max(np.nan_to_num(np.asarray(images, float)) * weight[:, None, None], axis=0)

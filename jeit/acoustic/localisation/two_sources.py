@@ -141,15 +141,17 @@ def _best_pairs(power, use, response, pixels: Pixels, microphone_array: Micropho
     scale = xp.max(xp.where(use, power, 0.0))
     weight = weight * scale**2
     scaled_power = xp.where(use, power, 0.0) / scale
-    gram = (weight[:, None] * response).T @ response
-    moment = (weight * scaled_power) @ response
-    diagonal = xp.diag(gram)
-    determinant = diagonal[:, None] * diagonal - gram**2
-    first_strengths = (diagonal * moment[:, None] - gram * moment) / determinant
+    gram_matrix = (weight[:, None] * response).T @ response
+    weighted_moment = (weight * scaled_power) @ response
+    diagonal = xp.diag(gram_matrix)
+    determinant = diagonal[:, None] * diagonal - gram_matrix**2
+    first_strengths = (diagonal * weighted_moment[:, None] - gram_matrix * weighted_moment) / determinant
     second_strengths = first_strengths.T
     is_valid = (first_strengths > 0) & (second_strengths > 0) & (determinant > 1e-9 * diagonal[:, None] * diagonal)
     is_valid = is_valid & pixels.inside[:, None] & pixels.inside
-    residual_decrease = xp.where(is_valid, first_strengths * moment[:, None] + second_strengths * moment, -xp.inf)
+    residual_decrease = xp.where(
+        is_valid, first_strengths * weighted_moment[:, None] + second_strengths * weighted_moment, -xp.inf
+    )
     chart = pixels.chart
     distances = xp.linalg.norm(chart[:, :, None] - chart[:, None], axis=0)
     is_neighbour = distances < 1.6 * xp.sort(distances[0])[1]

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from jeit.acoustic.plots.surface_view import ESTIMATE_COLOUR, AnySurface, create_view, draw_legend, draw_surface
 from jeit.arguments import check_kind, check_name
-from jeit.plot.axes import axes_or_new, draw_horizontal_grid, soften_axes
+from jeit.plot.axes import draw_horizontal_grid, get_or_create_axes, style_graph_axes
 from jeit.plot.colours import DARK_GREY, SERIES_COLOURS, SERIES_MARKERS
 
 _STATISTICS = {
@@ -62,7 +62,7 @@ def plot_position_errors(
         )
     has_estimate = np.isfinite(estimated_points).all(axis=1)
     error = 1e3 * np.linalg.norm(np.asarray(found, float) - np.asarray(true, float), axis=1)[has_estimate]
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     handles = draw_surface(ax, view)
     ax.add_collection(
         LineCollection(
@@ -138,8 +138,10 @@ def plot_error_curve(
     """
     x = np.asarray(values, float)
     if x.ndim != 1 or not x.size or not np.isfinite(x).all() or (logarithmic and not (x > 0).all()):
-        positive = "positive " if logarithmic else ""
-        raise ValueError(f"values has shape {x.shape}; give (K,) finite {positive}numbers, one for each row of errors.")
+        positive_prefix = "positive " if logarithmic else ""
+        raise ValueError(
+            f"values has shape {x.shape}; give (K,) finite {positive_prefix}numbers, one for each row of errors."
+        )
     check_kind("errors", errors, Mapping, "{name: errors}")
     if not 1 <= len(errors) <= len(SERIES_COLOURS):
         raise ValueError(f"errors has {len(errors)} methods; give 1 to {len(SERIES_COLOURS)}, {{name: errors}}.")
@@ -147,7 +149,7 @@ def plot_error_curve(
     error_rows = {name: _errors_in_millimetres(array, f"errors['{name}']", x.size) for name, array in errors.items()}
     bound_values = None if bound is None else _STATISTICS[statistic](_errors_in_millimetres(bound, "bound", x.size))
     sort_order = np.argsort(x)
-    ax = axes_or_new(ax, (5.8, 4.2))
+    ax = get_or_create_axes(ax, (5.8, 4.2))
     ax.set_yscale("log")
     for (name, rows), colour, marker in zip(error_rows.items(), SERIES_COLOURS, SERIES_MARKERS, strict=False):
         line_style = {"color": colour, "marker": marker, "markersize": 5, "linewidth": 1.8, "zorder": 3}
@@ -180,7 +182,7 @@ def _mark_axes(ax: Axes, x: np.ndarray, logarithmic: bool) -> None:
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     ax.yaxis.set_minor_formatter(NullFormatter())
-    soften_axes(ax)
+    style_graph_axes(ax)
     draw_horizontal_grid(ax)
 
 

@@ -27,16 +27,16 @@ from jeit.acoustic.plots.surface_view import (
     outline_path,
 )
 from jeit.arguments import check_kind, check_name
-from jeit.plot.axes import axes_or_new, soften_axes
-from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SEQUENTIAL, draw_colour_bar
+from jeit.plot.axes import get_or_create_axes, style_graph_axes
+from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SEQUENTIAL_COLOUR_MAP, draw_colour_bar
 from jeit_solvers.engines import on_host
 
 # Dynamic range in decibels of the circles that show the received intensities: the circle of a microphone this far below
 # the loudest microphone has the minimum size.
-_DYNAMIC_RANGE = 30.0
+_DYNAMIC_RANGE_DB = 30.0
 # Upper end of the colour scale above the minimum of the map: in standard deviations ("likelihood"), or decibels
 # ("consistency").
-_MAX_COLOUR_VALUES = {"likelihood": 15.0, "consistency": 40.0}
+_MAX_COLOUR_SCALE_VALUES = {"likelihood": 15.0, "consistency": 40.0}
 _MAP_LABELS = {
     "likelihood": "Standard deviations worse than the best place",
     "consistency": "Loss above the least (dB)",
@@ -112,10 +112,10 @@ def plot_loss_map(
     level = None if received is None else np.asarray(received, float)
     if level is not None and level.shape != (num_microphones,):
         raise ValueError(f"received has shape {level.shape}; give one for each of the {num_microphones} microphones.")
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     map_values = _above_minimum(pixels, method)
-    max_value = min(float(np.nanmax(map_values)), _MAX_COLOUR_VALUES[method]) or 1.0
-    colour_map = colormaps[SEQUENTIAL + "_r"].copy()
+    max_value = min(float(np.nanmax(map_values)), _MAX_COLOUR_SCALE_VALUES[method]) or 1.0
+    colour_map = colormaps[SEQUENTIAL_COLOUR_MAP + "_r"].copy()
     colour_map.colorbar_extend = "max" if np.nanmax(map_values) > max_value else "neither"  # pyright: ignore[reportAttributeAccessIssue]
     image = ax.imshow(
         map_values, extent=view.extent, origin="lower", interpolation="nearest", cmap=colour_map, clim=(0, max_value)
@@ -169,7 +169,7 @@ def _draw_levels(ax: Axes, microphones: np.ndarray, received_power: np.ndarray) 
     positive = np.isfinite(received_power) & (received_power > 0)
     max_power = received_power[positive].max(initial=1e-300)
     level = 10 * np.log10(np.where(positive, received_power, 1e-300) / max_power)
-    area = 8 + 150 * np.clip(1 + level / _DYNAMIC_RANGE, 0, 1)
+    area = 8 + 150 * np.clip(1 + level / _DYNAMIC_RANGE_DB, 0, 1)
     ax.scatter(
         *microphones.T, s=area, facecolor="white", edgecolor=MICROPHONE_COLOUR, linewidth=1.2, alpha=0.9, zorder=3
     )
@@ -226,7 +226,7 @@ def plot_receptive_fields(
         )
     columns = selected.size if selected.size <= 3 else int(np.ceil(np.sqrt(selected.size)))
     rows = -(-selected.size // columns)
-    ax = axes_or_new(ax, (max(4.8, min(11.0, 2.2 * columns)), max(3.6, min(9.0, 1.75 * rows))))
+    ax = get_or_create_axes(ax, (max(4.8, min(11.0, 2.2 * columns)), max(3.6, min(9.0, 1.75 * rows))))
     ax.set_axis_off()
     # The position of the title is fixed, since matplotlib would derive the position from all panels.
     ax.set_title(title or "", loc="left", y=1.0, pad=26)
@@ -320,8 +320,8 @@ def _draw_receptive_field(
         else {"color": DARK_GREY, "linewidth": 1.6}
     )
     # No curve is drawn for a microphone without positive intensities.
-    is_in_range = (distance <= fit.distance[:, microphone_index].max()) & is_positive.any()
-    panel.plot(1e3 * distance[is_in_range], curve[is_in_range], zorder=3, **style)
+    is_within_tap_distances = (distance <= fit.distance[:, microphone_index].max()) & is_positive.any()
+    panel.plot(1e3 * distance[is_within_tap_distances], curve[is_within_tap_distances], zorder=3, **style)
     if noise > 0:
         panel.axhline(noise, color=LIGHT_GREY, linewidth=1.0, linestyle=(0, (4, 3)), zorder=1)
     fontsize = 8.5 if columns <= 5 else 7
@@ -351,7 +351,7 @@ def _draw_receptive_field(
             color=DARK_GREY,
             **text_style,
         )
-    soften_axes(panel)
+    style_graph_axes(panel)
     panel.tick_params(length=2.5, labelsize=fontsize - 0.5, which="both")
     panel.xaxis.set_major_locator(MaxNLocator(4 if columns <= 5 else 3, steps=[1, 2, 5, 10], prune="upper"))
     panel.yaxis.set_major_locator(LogLocator(numticks=4))

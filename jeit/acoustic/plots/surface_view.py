@@ -110,7 +110,7 @@ def outline_path(view: View) -> Path:
     return Path.make_compound_path(*loops)
 
 
-def draw_surface(ax: Axes, view: View, *, microphones: bool = True, faint: bool = False) -> list[Line2D]:
+def draw_surface(ax: Axes, view: View, *, microphones: bool = True, is_faint: bool = False) -> list[Line2D]:
     """Draw the surface's outline, a scale bar and the microphones, with crosses for unusable microphones. Returns the
     legend entries."""
     ax.add_patch(
@@ -129,9 +129,11 @@ def draw_surface(ax: Axes, view: View, *, microphones: bool = True, faint: bool 
         return []
     handles = []
     style = {"marker": "o", "linestyle": "none", "markersize": 6.5, "zorder": 2.5, "label": "microphone"}
-    style |= {"markerfacecolor": "none", "markeredgewidth": 1.0} if faint else {"markeredgewidth": 0.8}
+    style |= {"markerfacecolor": "none", "markeredgewidth": 1.0} if is_faint else {"markeredgewidth": 0.8}
     style |= (
-        {"markeredgecolor": LIGHT_GREY} if faint else {"markerfacecolor": MICROPHONE_COLOUR, "markeredgecolor": "white"}
+        {"markeredgecolor": LIGHT_GREY}
+        if is_faint
+        else {"markerfacecolor": MICROPHONE_COLOUR, "markeredgecolor": "white"}
     )
     cross_style = {
         "marker": "x",

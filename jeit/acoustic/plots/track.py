@@ -17,7 +17,7 @@ from jeit.acoustic.localisation.locations import Locations, LocationStatus
 from jeit.acoustic.plots.surface_view import View, create_view, draw_ellipse, draw_legend, draw_surface, outline_path
 from jeit.acoustic.touch_tracks import Touch, Track
 from jeit.arguments import check_kind
-from jeit.plot.axes import axes_or_new
+from jeit.plot.axes import get_or_create_axes
 from jeit.plot.colours import DARK_GREY, LIGHT_GREY, draw_colour_bar
 
 _OVERLAY_COLOURS = LinearSegmentedColormap.from_list("glow", ["#ffffff", "#bccddf", "#6a8aae"])
@@ -31,9 +31,9 @@ _STATUS_MARKERS = {
 }
 # Distance of a touch's path from the mean of the path, in standard deviations, below which the touch is drawn as a
 # single position.
-_MIN_MOTION_DEVIATIONS = 4.0
+_MIN_PATH_DEVIATIONS = 4.0
 # Diameter of the path, as a fraction of the size of the surface, below which a touch is drawn as a single position.
-_MIN_MOTION_SHARE = 0.05
+_MIN_RELATIVE_PATH_DIAMETER = 0.05
 
 
 def plot_track(
@@ -91,12 +91,12 @@ def plot_track(
         view = view._replace(usable=view.usable & locations.used.any(axis=0))
     true_path = None if truth is None else view.chart(truth, "truth")
     path = view.chart(track.position, "track")
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     if image is not None:
         style: dict[str, Any] = {"interpolation": "bilinear", "cmap": _OVERLAY_COLOURS, "clim": (0, 1)}
         image_artist = ax.imshow(np.nan_to_num(image), extent=view.extent, origin="lower", **style)
         image_artist.set_clip_path(outline_path(view), ax.transData)
-    handles = draw_surface(ax, view, faint=True)
+    handles = draw_surface(ax, view, is_faint=True)
     ax.set_title(title or "")
     if true_path is not None:
         handles += ax.plot(
@@ -140,8 +140,8 @@ def _draw_touch(
     left, right, bottom, top = view.extent
     max_displacement = np.linalg.norm(positions - positions.mean(axis=0), axis=1).max()
     min_displacement = max(
-        _MIN_MOTION_DEVIATIONS * np.sqrt(np.linalg.eigvalsh(covariance)[-1]),
-        0.5 * _MIN_MOTION_SHARE * max(right - left, top - bottom),
+        _MIN_PATH_DEVIATIONS * np.sqrt(np.linalg.eigvalsh(covariance)[-1]),
+        0.5 * _MIN_RELATIVE_PATH_DIAMETER * max(right - left, top - bottom),
     )
     mark_style: dict[str, Any] = {
         "linestyle": "none",
@@ -175,15 +175,15 @@ def _draw_frames(ax: Axes, view: View, track: Track, locations: Locations, time_
     """Draw the position of each frame as a dot, with a ring if the track rejects the position, and with a marker if the
     status is not "touch". Returns the legend entries."""
     positions = view.chart(locations.position, "locations")
-    has_no_marker = locations.has_position & ~np.isin(locations.status, list(_STATUS_MARKERS))
-    is_accepted, is_rejected = has_no_marker & ~track.rejected, locations.has_position & track.rejected
+    is_drawn_as_dot = locations.has_position & ~np.isin(locations.status, list(_STATUS_MARKERS))
+    is_accepted, is_rejected = is_drawn_as_dot & ~track.rejected, locations.has_position & track.rejected
     handles = []
     dot_options = {"s": 7, "linewidths": 0, "alpha": 0.6, "zorder": 3.7}
     ax.scatter(*positions[is_accepted].T, color=time_colours.to_rgba(track.times[is_accepted]), **dot_options)
     if is_rejected.any():
         # If the frame has a marker for its status, the ring is drawn larger, around this marker.
         ring_options: dict[str, Any] = {
-            "s": np.where(has_no_marker, 16, 60)[is_rejected],
+            "s": np.where(is_drawn_as_dot, 16, 60)[is_rejected],
             "linewidths": 0.8,
             "facecolors": "none",
         }
@@ -202,17 +202,21 @@ def _draw_other_frames(
     """Draw the positions of frames with the status "outside", "misfit", "ambiguous" or "two touches"; for "two
     touches", both positions. Returns the legend entries."""
     handles = []
-    second = view.chart(locations.second, "locations.second")
+    second_positions = view.chart(locations.second, "locations.second")
     for status, marker in _STATUS_MARKERS.items():
         has_status = (locations.status == status) & locations.has_position
         if not has_status.any():
             continue
         marker_style = {"marker": marker, "s": 22, "linewidths": 0.8, "edgecolors": DARK_GREY, "zorder": 4.5}
-        has_second = has_status & np.isfinite(second).all(axis=1)
-        if has_second.any():
-            pairs = list(np.stack([positions, second], axis=1)[has_second])
+        has_second_position = has_status & np.isfinite(second_positions).all(axis=1)
+        if has_second_position.any():
+            pairs = list(np.stack([positions, second_positions], axis=1)[has_second_position])
             ax.add_collection(LineCollection(pairs, colors=LIGHT_GREY, linewidths=0.5, zorder=3))
-            ax.scatter(*second[has_second].T, color=time_colours.to_rgba(locations.times[has_second]), **marker_style)
+            ax.scatter(
+                *second_positions[has_second_position].T,
+                color=time_colours.to_rgba(locations.times[has_second_position]),
+                **marker_style,
+            )
         ax.scatter(*positions[has_status].T, color=time_colours.to_rgba(locations.times[has_status]), **marker_style)
         legend_style: dict[str, Any] = {
             "markersize": 5,

@@ -10,15 +10,15 @@ from jeit.mesh.topology import distance, is_inside_loops
 # Minimum sampling rate with which the vibrations of a touch can be recorded.
 MIN_RATE = 100.0  # Hz
 # Maximum plausible length of a skin. Larger coordinates are probably in millimetres instead of metres.
-MAX_EXTENT = 5.0  # m
+MAX_SKIN_LENGTH = 5.0  # m
 # Maximum distance of a tap outside the outline, as a fraction of the skin's length; distance in metres below which two
 # microphones coincide.
-_MAX_OUTSIDE_SHARE, _MIN_SPACING = 0.05, 1e-6  # of the length; m
+_MAX_RELATIVE_DISTANCE_OUTSIDE, _MIN_SPACING = 0.05, 1e-6  # of the length; m
 # Maximum magnitude of a coordinate in metres; squares of larger coordinates would lose precision.
 _MAX_COORDINATE = 1e9
 
 
-def choose_array(arrays: dict[str, np.ndarray], first_name: str, second_name: str) -> str:
+def alternative_array_name(arrays: dict[str, np.ndarray], first_name: str, second_name: str) -> str:
     """Return which of two alternative arrays a file contains: the name `first_name` or `second_name`. Raises
     `ValueError` if the file contains both arrays or neither."""
     if first_name in arrays and second_name in arrays:
@@ -34,7 +34,7 @@ def short_text(values: np.ndarray) -> str:
     return f"of shape {values.shape}" if values.size > 4 else str(values.tolist())
 
 
-def real_array_of(value, label: str, axes: str) -> np.ndarray:
+def convert_to_real_array(value, label: str, axes: str) -> np.ndarray:
     """Convert `value` to a real array with one axis for each of the names in `axes`, which are separated by commas.
 
     Arrays of float32 are not converted; other types are converted to float64. Raises `ValueError` for values that are
@@ -85,7 +85,7 @@ def check_full_scale(value) -> float | None:
 def check_coordinates(value, label: str, dimension: tuple[int, ...]) -> np.ndarray:
     """Convert `value` to an array (n, d) of n points in metres. `dimension`: the required (d,), where d is 2 or 3.
     Raises `ValueError` for other shapes, and for coordinates that are not finite."""
-    points = real_array_of(value, label, "points, 2 or 3").astype(float)
+    points = convert_to_real_array(value, label, "points, 2 or 3").astype(float)
     if points.shape[1] not in (2, 3) or points.shape[1:] != dimension:
         raise ValueError(
             f"{label} has shape {points.shape}; give one row of 2 or 3 coordinates each, as many for microphones, "
@@ -102,10 +102,10 @@ def check_extent(points: np.ndarray, label: str) -> None:
     """Raise `ValueError` if the extent of points (n, d) along an axis exceeds the maximum plausible length of a
     skin."""
     largest_side = np.ptp(points, axis=0).max()
-    if largest_side > MAX_EXTENT:
+    if largest_side > MAX_SKIN_LENGTH:
         raise ValueError(
             f"{label} spread over {largest_side:.4g}: are these metres? Divide millimetres by 1000; no side may be "
-            f"longer than {MAX_EXTENT:g} m."
+            f"longer than {MAX_SKIN_LENGTH:g} m."
         )
 
 
@@ -137,10 +137,10 @@ def check_taps(positions: np.ndarray, outline: np.ndarray) -> None:
     largest_side = np.ptp(outline, axis=0).max()
     indices_outside = np.flatnonzero(~is_inside_loops(positions, [outline]))
     distances = distance(positions[indices_outside], outline, np.roll(outline, -1, axis=0)).min(axis=1)
-    if indices_outside.size and distances.max() > _MAX_OUTSIDE_SHARE * largest_side:
+    if indices_outside.size and distances.max() > _MAX_RELATIVE_DISTANCE_OUTSIDE * largest_side:
         row = int(indices_outside[distances.argmax()])
         raise ValueError(
             f"positions: row {row}, {positions[row].tolist()}, is {1e3 * distances.max():.3g} mm outside the outline; "
-            f"taps must be on the skin, or within {1e3 * _MAX_OUTSIDE_SHARE * largest_side:.3g} mm of it. Correct the "
-            "place, or leave the tap out."
+            f"taps must be on the skin, or within {1e3 * _MAX_RELATIVE_DISTANCE_OUTSIDE * largest_side:.3g} mm of it. "
+            "Correct the place, or leave the tap out."
         )

@@ -15,20 +15,20 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 
 # Fault codes of samples, as returned by `sample_faults`. Descriptions of faults are in this order.
 SOUND, NOT_FINITE, STUCK, CLIPPING = range(4)
-_FAULT_WORDS = {NOT_FINITE: "NaN or infinite", STUCK: "stuck", CLIPPING: "clipping"}
+_FAULT_DESCRIPTIONS = {NOT_FINITE: "NaN or infinite", STUCK: "stuck", CLIPPING: "clipping"}
 
 # Minimum duration of a stretch of constant samples that counts as stuck: in seconds, and in samples.
-_STUCK_TIME, _STUCK_SAMPLES = 0.02, 64
+_MIN_STUCK_DURATION, _MIN_STUCK_SAMPLES = 0.02, 64
 # A constant stretch is silence, not a fault, if the signal elsewhere decays to a range of at most this many converter
 # steps, or at most this fraction of the channel's range.
-_REST_STEPS, _REST_RANGE = 3.0, 1e-4
+_MAX_SILENCE_CONVERTER_STEPS, _MAX_RELATIVE_SILENCE_RANGE = 3.0, 1e-4
 # Samples are at an end of the range if their distance from this end is at most the first fraction of the channel's
 # range, or, if the full scale is known, their distance from the full scale is at most the second fraction of the full
 # scale.
-_TOP_RANGE, _TOP_FULL_SCALE = 3e-4, 1e-3
+_RELATIVE_DISTANCE_FROM_TOP, _FULL_SCALE_DISTANCE_FROM_TOP = 3e-4, 1e-3
 # Minimum number of converted values at the top of a clipped peak, and minimum ratio of the fall beside the peak to the
 # fall of a parabola.
-_MIN_FLAT_VALUES, _MIN_FALL_RATIO = 3, 3.0
+_MIN_CLIPPED_PEAK_VALUES, _MIN_CLIPPED_PEAK_FALL_RATIO = 3, 3.0
 
 
 def sample_faults(
@@ -40,48 +40,48 @@ def sample_faults(
     The fault code is 0 (`SOUND`) for a good sample, otherwise `NOT_FINITE`, `STUCK` or `CLIPPING`. `rate`: sampling
     rate in Hz. `full_scale`: largest possible magnitude of a sample, or None if unknown.
     """
-    codes = np.zeros(samples.shape, np.uint8)
+    fault_codes = np.zeros(samples.shape, np.uint8)
     is_finite = np.isfinite(samples)
-    all_finite = bool(is_finite.all())
-    if not all_finite:
-        codes[~is_finite] = NOT_FINITE
+    has_only_finite_samples = bool(is_finite.all())
+    if not has_only_finite_samples:
+        fault_codes[~is_finite] = NOT_FINITE
         if not is_finite.any():
-            return codes, "dead: every sample is NaN or infinite"
+            return fault_codes, "dead: every sample is NaN or infinite"
         samples = np.where(is_finite, samples, np.nan)
     min_sample, max_sample = np.fmin.reduce(samples), np.fmax.reduce(samples)
     if min_sample == max_sample:
-        return codes, f"dead: every {'' if all_finite else 'finite '}sample is {min_sample:g}"
+        return fault_codes, f"dead: every {'' if has_only_finite_samples else 'finite '}sample is {min_sample:g}"
     is_stuck = _stuck_samples(samples, rate, float(max_sample - min_sample))
     # A channel that stays at one end of its range is stuck, and does not clip.
     moving_samples = samples if is_stuck is None else np.where(is_stuck, np.nan, samples)
     is_clipped = _clipped_samples(moving_samples, full_scale)
     if is_clipped is not None:
-        codes[is_clipped] = CLIPPING
+        fault_codes[is_clipped] = CLIPPING
     if is_stuck is not None:
-        codes[is_stuck] = STUCK
-    return codes, ""
+        fault_codes[is_stuck] = STUCK
+    return fault_codes, ""
 
 
 def window_faults(
-    codes: UInt8[np.ndarray, "*batch S"], dead_reason: str, length: int, hop: int
+    fault_codes: UInt8[np.ndarray, "*batch S"], dead_reason: str, length: int, hop: int
 ) -> tuple[Bool[np.ndarray, "*batch F"], str]:
     """Return the mask of the usable windows of one channel, and a description of the channel's faults ("" for none).
 
-    `codes`, `dead_reason`: as returned by `sample_faults`. Windows of `length` samples begin every `hop` samples along
-    the last axis. A window with at least one faulty sample is not usable.
+    `fault_codes`, `dead_reason`: as returned by `sample_faults`. Windows of `length` samples begin every `hop` samples
+    along the last axis. A window with at least one faulty sample is not usable.
     """
-    num_windows = 1 + (codes.shape[-1] - length) // hop
-    usable = np.ones((*codes.shape[:-1], num_windows), bool)
+    num_windows = 1 + (fault_codes.shape[-1] - length) // hop
+    usable = np.ones((*fault_codes.shape[:-1], num_windows), bool)
     if dead_reason:
         return np.zeros_like(usable), dead_reason
-    if not codes.any():
+    if not fault_codes.any():
         return usable, ""
-    starts = hop * np.arange(num_windows)
+    window_starts = hop * np.arange(num_windows)
     reasons = []
-    for code, fault_name in _FAULT_WORDS.items():
-        counts = np.cumsum(codes == code, axis=-1)
-        counts = np.concatenate([np.zeros((*codes.shape[:-1], 1), int), counts], axis=-1)
-        is_faulty = counts[..., starts + length] > counts[..., starts]
+    for code, fault_name in _FAULT_DESCRIPTIONS.items():
+        counts = np.cumsum(fault_codes == code, axis=-1)
+        counts = np.concatenate([np.zeros((*fault_codes.shape[:-1], 1), int), counts], axis=-1)
+        is_faulty = counts[..., window_starts + length] > counts[..., window_starts]
         if is_faulty.any():
             usable &= ~is_faulty
             reasons.append(f"{fault_name} in {_format_share(is_faulty)} windows")
@@ -127,9 +127,9 @@ def _format_share(mask: np.ndarray) -> str:
     return f"all {mask.size}" if mask.all() else f"{int(mask.sum())} of {mask.size}"
 
 
-def _true_runs(flags: Bool[np.ndarray, " S"]) -> Shaped[np.ndarray, "2 R"]:
-    """Start and end indices (2, R) of the R runs of True in `flags`; the end is exclusive."""
-    change = np.flatnonzero(np.diff(flags, prepend=False, append=False))
+def _true_runs(mask: Bool[np.ndarray, " S"]) -> Shaped[np.ndarray, "2 R"]:
+    """Start and end indices (2, R) of the R runs of True in `mask`; the end is exclusive."""
+    change = np.flatnonzero(np.diff(mask, prepend=False, append=False))
     return np.stack([change[::2], change[1::2]])
 
 
@@ -142,7 +142,7 @@ def _converter_step(samples: np.ndarray) -> float:
 def _stuck_samples(samples: np.ndarray, rate: float, sample_range: float) -> Bool[np.ndarray, " S"] | None:
     """Mask of the stuck samples, those in long constant stretches; None if no sample is stuck, or if the signal also
     comes to rest elsewhere. `sample_range`: difference between the largest and smallest sample."""
-    min_length = max(_STUCK_SAMPLES, round(_STUCK_TIME * rate))
+    min_length = max(_MIN_STUCK_SAMPLES, round(_MIN_STUCK_DURATION * rate))
     # A stuck stretch covers at least two whole blocks. Stretches are searched for only if a block is constant, which
     # saves time.
     block = min_length // 4
@@ -152,18 +152,20 @@ def _stuck_samples(samples: np.ndarray, rate: float, sample_range: float) -> Boo
         return None
     # Each flag stands for a pair of equal successive samples, so a run of n flags is a stretch of n + 1 samples.
     run_starts, run_ends = _true_runs(samples[1:] == samples[:-1])
-    is_long = run_ends - run_starts + 1 >= min_length
-    if not is_long.any():
+    is_long_run = run_ends - run_starts + 1 >= min_length
+    if not is_long_run.any():
         return None
     is_stuck = np.zeros(samples.shape, bool)
-    for first_flag, last_flag in zip(run_starts[is_long], run_ends[is_long], strict=True):
+    for first_flag, last_flag in zip(run_starts[is_long_run], run_ends[is_long_run], strict=True):
         is_stuck[first_flag : last_flag + 1] = True
     # Silence can be constant too: with a coarse converter, or in a simulation without noise. The sound then fades into
     # silence, so that some other blocks are almost constant. In a stuck channel with noise, no other block is almost
     # constant.
-    is_moving = ~is_stuck[: blocks.size].reshape(blocks.shape).any(axis=1) & np.isfinite(block_ranges)
-    rest_range = max(_REST_STEPS * _converter_step(samples), _REST_RANGE * sample_range)
-    return None if is_moving.any() and block_ranges[is_moving].min() <= rest_range else is_stuck
+    is_moving_block = ~is_stuck[: blocks.size].reshape(blocks.shape).any(axis=1) & np.isfinite(block_ranges)
+    max_resting_range = max(
+        _MAX_SILENCE_CONVERTER_STEPS * _converter_step(samples), _MAX_RELATIVE_SILENCE_RANGE * sample_range
+    )
+    return None if is_moving_block.any() and block_ranges[is_moving_block].min() <= max_resting_range else is_stuck
 
 
 def _clipped_samples(samples: np.ndarray, full_scale: float | None) -> Bool[np.ndarray, " S"] | None:
@@ -173,18 +175,18 @@ def _clipped_samples(samples: np.ndarray, full_scale: float | None) -> Bool[np.n
     is_clipped = None
     step = samples_per_value = 0.0
     for sign, peak in ((1.0, max_sample), (-1.0, -min_sample)):
-        heights = [_TOP_RANGE * (max_sample - min_sample)]
-        if full_scale is not None and peak >= (1 - _TOP_FULL_SCALE) * full_scale:
-            heights.append(peak - (1 - _TOP_FULL_SCALE) * full_scale)
+        ranges_below_top = [_RELATIVE_DISTANCE_FROM_TOP * (max_sample - min_sample)]
+        if full_scale is not None and peak >= (1 - _FULL_SCALE_DISTANCE_FROM_TOP) * full_scale:
+            ranges_below_top.append(peak - (1 - _FULL_SCALE_DISTANCE_FROM_TOP) * full_scale)
         distance_below_top = peak - sign * samples
         # Most channels need no further test, since they have too few samples near the end of the range to be clipped.
-        if np.count_nonzero(distance_below_top <= max(heights)) < _MIN_FLAT_VALUES:
+        if np.count_nonzero(distance_below_top <= max(ranges_below_top)) < _MIN_CLIPPED_PEAK_VALUES:
             continue
         if not samples_per_value:
             step, samples_per_value = _converter_step(samples), _samples_per_value(samples)
-        for height in heights:
-            is_near_top = distance_below_top <= height + step
-            if _has_clipped_peak(distance_below_top, is_near_top, height + 2 * step, samples_per_value):
+        for range_below_top in ranges_below_top:
+            is_near_top = distance_below_top <= range_below_top + step
+            if _has_clipped_peak(distance_below_top, is_near_top, range_below_top + 2 * step, samples_per_value):
                 is_clipped = is_near_top if is_clipped is None else is_clipped | is_near_top
     return is_clipped
 
@@ -202,7 +204,7 @@ def _has_clipped_peak(
     """
     run_starts, run_ends = _true_runs(is_near_top)
     values_per_run = (run_ends - run_starts) / samples_per_value
-    for run_index in np.flatnonzero(values_per_run >= _MIN_FLAT_VALUES):
+    for run_index in np.flatnonzero(values_per_run >= _MIN_CLIPPED_PEAK_VALUES):
         num_values, run_start, run_end = values_per_run[run_index], run_starts[run_index], run_ends[run_index]
         num_values_beyond = max(1, int(num_values) // 2)
         num_samples_beyond = int(num_values_beyond * samples_per_value)
@@ -213,7 +215,7 @@ def _has_clipped_peak(
         smallest_fall = min(np.fmax.reduce(side) if side.size else np.inf for side in sides)
         if (
             smallest_fall
-            > _MIN_FALL_RATIO * height * ((num_values - 1 + 2 * num_values_beyond) / (num_values - 1)) ** 2
+            > _MIN_CLIPPED_PEAK_FALL_RATIO * height * ((num_values - 1 + 2 * num_values_beyond) / (num_values - 1)) ** 2
         ):
             return True
     return False

@@ -31,7 +31,7 @@ from jeit.arguments import check_kind
 from jeit_solvers.module import Module
 
 # Minimum number of frequency bins in the frequency band.
-_MIN_BINS = 4.0
+_MIN_BAND_BINS = 4.0
 # Number of samples Fourier-transformed at a time: 2 MiB, so that samples and transforms fit into the processor's cache.
 _MAX_CHUNK_SAMPLES = 2**18
 
@@ -62,12 +62,12 @@ def window_grid(settings, rate: float, num_samples: int | None, name: str) -> Wi
             f"{name}: the band {settings.low:g} to {settings.high:g} Hz reaches beyond half the rate of {rate:g} Hz; "
             f"set high to {rate / 2:g} Hz or less."
         )
-    bins = (settings.high - settings.low) * length / rate
-    if bins < _MIN_BINS:
+    num_band_bins = (settings.high - settings.low) * length / rate
+    if num_band_bins < _MIN_BAND_BINS:
         raise ValueError(
             f"{name}: a window of {settings.window:g} s resolves frequencies {1 / settings.window:.3g} Hz apart: too "
             f"few in the band {settings.low:g} to {settings.high:g} Hz. Set window to "
-            f"{_MIN_BINS / (settings.high - settings.low):.2g} s or more, or widen the band."
+            f"{_MIN_BAND_BINS / (settings.high - settings.low):.2g} s or more, or widen the band."
         )
     if num_samples is not None and num_samples < length:
         raise ValueError(
@@ -99,11 +99,11 @@ def band_power(samples: np.ndarray, grid: WindowGrid) -> np.ndarray:
     last_bin = grid.first + len(grid.weights)
     chunk_size = max(1, _MAX_CHUNK_SAMPLES // (num_microphones * grid.length))
     taper_spectrum = np.fft.rfft(grid.taper)[grid.first : last_bin]
-    buffer = np.empty(num_microphones * min(chunk_size, num_windows) * grid.length)
+    tapered_buffer = np.empty(num_microphones * min(chunk_size, num_windows) * grid.length)
     for start in range(0, num_windows, chunk_size):
         chunk = windows[:, start : start + chunk_size]
-        tapered = np.multiply(chunk, grid.taper, out=buffer[: chunk.size].reshape(chunk.shape))
-        spectrum = np.asarray(scipy.fft.rfft(tapered, workers=2))[..., grid.first : last_bin]
+        tapered_windows = np.multiply(chunk, grid.taper, out=tapered_buffer[: chunk.size].reshape(chunk.shape))
+        spectrum = np.asarray(scipy.fft.rfft(tapered_windows, workers=2))[..., grid.first : last_bin]
         if grid.first < 2:
             # In bins from 2 on, the transform of the Hann window is zero, and the mean of the window has no effect.
             spectrum = spectrum - chunk.mean(axis=-1)[..., None] * taper_spectrum
@@ -111,9 +111,9 @@ def band_power(samples: np.ndarray, grid: WindowGrid) -> np.ndarray:
     return power
 
 
-def _overlap_trace(grid: WindowGrid, lag: int) -> float:
-    """Compute tr(A_0 A_lag) for the band-power matrices A of two windows `lag` samples apart. The trace is half the
-    covariance of the powers in the two windows for white noise of variance 1.
+def _overlap_trace(grid: WindowGrid, lag_in_samples: int) -> float:
+    """Compute tr(A_0 A_lag) for the band-power matrices A of two windows `lag_in_samples` samples apart. The trace is
+    half the covariance of the powers in the two windows for white noise of variance 1.
 
     With g(d) = Σ_k W_k cos(2πkd/N), which has the period N, A_nm = w_n w_m g(n - m). The trace is therefore Σ_d g(d)²
     r(d), where r is the autocorrelation of u_n = w_n w_(n+lag) over the overlap of the windows. No N × N matrix has to
@@ -125,7 +125,9 @@ def _overlap_trace(grid: WindowGrid, lag: int) -> float:
     weights[1 : (grid.length + 1) // 2] /= 2
     squared = (grid.length * np.fft.irfft(weights, grid.length)) ** 2
     taper_product = np.zeros(grid.length)
-    taper_product[: grid.length - lag] = grid.taper[: grid.length - lag] * grid.taper[lag:]
+    taper_product[: grid.length - lag_in_samples] = (
+        grid.taper[: grid.length - lag_in_samples] * grid.taper[lag_in_samples:]
+    )
     correlation = np.fft.irfft(np.abs(np.fft.rfft(taper_product)) ** 2, grid.length)
     return float((squared * correlation).sum())
 
@@ -147,7 +149,7 @@ def noise_correlation(grid: WindowGrid, num_windows: int) -> Float[np.ndarray, "
 
 
 # A tap is audible in a window if the loudness of the window is at least this fraction of the tap's maximum loudness.
-_AUDIBLE_SHARE = 0.5
+_MIN_RELATIVE_TAP_LOUDNESS = 0.5
 
 
 class IntensitySettings(Module):
@@ -307,8 +309,8 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     for m in range(samples.shape[1]):
         # All taps of a microphone are tested for faults together, since range, converter step and silence are
         # properties of the channel.
-        codes, dead_reason = sample_faults(samples[:, m].ravel(), rate, taps.full_scale)
-        mask, reason = window_faults(codes.reshape(-1, samples.shape[-1]), dead_reason, grid.length, grid.hop)
+        fault_codes, dead_reason = sample_faults(samples[:, m].ravel(), rate, taps.full_scale)
+        mask, reason = window_faults(fault_codes.reshape(-1, samples.shape[-1]), dead_reason, grid.length, grid.hop)
         usable_masks.append(mask)
         faults.append(reason)
     usable = np.stack(usable_masks, axis=-1)
@@ -321,7 +323,7 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     is_alive = usable.any(axis=(0, 1))
     positive_floor = np.maximum(floor, max(1e-9 * power.max(), np.finfo(float).tiny))
     loudness = np.where(is_alive, power / positive_floor - floor / positive_floor, 0).sum(axis=-1)
-    is_audible = loudness >= _AUDIBLE_SHARE * loudness.max(axis=1, keepdims=True)
+    is_audible = loudness >= _MIN_RELATIVE_TAP_LOUDNESS * loudness.max(axis=1, keepdims=True)
     # The loudest window of a tap is always included, even if no window is above the noise floor.
     is_audible |= loudness == loudness.max(axis=1, keepdims=True)
     mean = np.einsum("tf,tfm->tm", is_audible, power) / is_audible.sum(axis=1)[:, None]
@@ -367,17 +369,17 @@ def noise_floor(
     num_usable = usable.sum(axis=0)
     sorted_power = np.sort(np.where(usable, power, np.inf), axis=0)
     # Rank of the median power of the quietest `share` of the windows.
-    rank = np.clip(np.floor(0.5 * share * num_usable).astype(int), 0, max(len(power) - 1, 0))
-    floor = np.take_along_axis(sorted_power, rank[None], axis=0)[0] if len(power) else np.zeros(power.shape[1])
+    floor_rank = np.clip(np.floor(0.5 * share * num_usable).astype(int), 0, max(len(power) - 1, 0))
+    floor = np.take_along_axis(sorted_power, floor_rank[None], axis=0)[0] if len(power) else np.zeros(power.shape[1])
     floor = np.where(num_usable > 0, floor, 0.0)
     if np.isinf(degrees_of_freedom):
         return floor
-    half_freedom = degrees_of_freedom / 2
+    half_degrees_of_freedom = degrees_of_freedom / 2
     # Quantiles of χ²_ν / ν, and the mean of χ²_ν / ν below the cut-off c: ∫_0^c y p(y) dy is the distribution function
     # of χ² with ν + 2 degrees of freedom, at ν c.
-    floor = floor / (gammaincinv(half_freedom, 0.5 * share) / half_freedom)
-    cutoff = gammaincinv(half_freedom, 0.9) / half_freedom
-    mean_below_cutoff = gammainc(half_freedom + 1, half_freedom * cutoff) / 0.9
+    floor = floor / (gammaincinv(half_degrees_of_freedom, 0.5 * share) / half_degrees_of_freedom)
+    cutoff = gammaincinv(half_degrees_of_freedom, 0.9) / half_degrees_of_freedom
+    mean_below_cutoff = gammainc(half_degrees_of_freedom + 1, half_degrees_of_freedom * cutoff) / 0.9
     for _ in range(50):
         is_quiet = usable & (power <= cutoff * floor)
         mean = np.where(is_quiet, power, 0).sum(axis=0) / np.maximum(is_quiet.sum(axis=0), 1) / mean_below_cutoff

@@ -16,27 +16,27 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from jeit.acoustic.signal._arrays import (
+    alternative_array_name,
     check_coordinates,
     check_extent,
     check_full_scale,
     check_microphones,
     check_taps,
-    choose_array,
-    real_array_of,
+    convert_to_real_array,
     real_number,
     sampling_rate,
     short_text,
 )
 from jeit.acoustic.signal.faults import intensity_faults
 from jeit.acoustic.signal.sound_file import read_sound
-from jeit.files import npz_arrays, require_arrays, written_whole
+from jeit.files import atomically_written_file, npz_arrays, require_arrays
 from jeit.mesh.topology import check_loop
 from jeit_solvers.module import Module
 
 # Error message for files of an unknown format.
 _UNKNOWN_FORMAT = "neither an NPZ nor a sound file"
 # Maximum magnitude of a sample in any unit; squares of larger samples would overflow in single precision.
-_MAX_SAMPLE = 1e15
+_MAX_SAMPLE_MAGNITUDE = 1e15
 
 
 class Recording(Module):
@@ -68,8 +68,8 @@ class Recording(Module):
     ):
         """Raises `ValueError` for samples that are not real, have a shape other than (M, S) or look transposed, and for
         an implausible sampling rate."""
-        array = real_array_of(samples, "samples", "microphones, samples")
-        is_too_large = np.abs(array) > _MAX_SAMPLE if array.dtype.kind == "f" else np.zeros(0, bool)
+        array = convert_to_real_array(samples, "samples", "microphones, samples")
+        is_too_large = np.abs(array) > _MAX_SAMPLE_MAGNITUDE if array.dtype.kind == "f" else np.zeros(0, bool)
         self.samples = np.where(is_too_large, np.inf, array) if is_too_large.any() else array
         num_microphones, num_samples = self.samples.shape
         if num_microphones > num_samples:
@@ -134,8 +134,8 @@ class Intensities(Module):
         do not increase.
         """
         self.times, self.power = (
-            real_array_of(times, "times", "windows"),
-            real_array_of(power, "intensity", "windows, microphones"),
+            convert_to_real_array(times, "times", "windows"),
+            convert_to_real_array(power, "intensity", "windows, microphones"),
         )
         shape, num_windows = self.power.shape, len(self.times)
         if shape[0] != num_windows:
@@ -145,7 +145,7 @@ class Intensities(Module):
             )
         if not np.isfinite(self.times).all() or (np.diff(self.times) <= 0).any():
             raise ValueError("times must be finite and increasing, in seconds: the middle of each window.")
-        self.floor = np.zeros(shape[1]) if floor is None else real_array_of(floor, "floor", "microphones")
+        self.floor = np.zeros(shape[1]) if floor is None else convert_to_real_array(floor, "floor", "microphones")
         if self.floor.shape != shape[1:] or not (np.isfinite(self.floor) & (self.floor >= 0)).all():
             raise ValueError(
                 f"floor must be finite and not negative, one for each of the {shape[1]} microphones; it is "
@@ -233,16 +233,20 @@ class Taps(Module):
             ("positions", self.positions),
         ):
             check_extent(np.concatenate([self.outline, points]), label)
-        is_plane = self.outline.shape[1] == 2
-        check_microphones(self.microphones, self.outline if is_plane else np.vstack([self.outline, self.positions]))
-        if is_plane:
+        is_plane_outline = self.outline.shape[1] == 2
+        check_microphones(
+            self.microphones, self.outline if is_plane_outline else np.vstack([self.outline, self.positions])
+        )
+        if is_plane_outline:
             check_taps(self.positions, self.outline)
         if (power is None) == (samples is None):
             given_arrays = "neither" if power is None else "both"
             raise ValueError(f"taps need either intensity or samples with their rate; {given_arrays} were given.")
         expected_shape = (len(self.positions), len(self.microphones))
-        self.power = None if power is None else real_array_of(power, "intensity", "taps, microphones")
-        self.samples = None if samples is None else real_array_of(samples, "samples", "taps, microphones, samples")
+        self.power = None if power is None else convert_to_real_array(power, "intensity", "taps, microphones")
+        self.samples = (
+            None if samples is None else convert_to_real_array(samples, "samples", "taps, microphones, samples")
+        )
         label, values = ("intensity", self.power) if self.samples is None else ("samples", self.samples)
         assert values is not None
         if values.shape[:2] != expected_shape:
@@ -288,18 +292,18 @@ def read_recording(path: str | Path) -> Recording | Intensities:
         if sound is not None:
             samples, rate, full_scale = sound
             return Recording(samples, rate, full_scale=full_scale, name=path.stem)
-        optional = ("floor", "freedom", "overlap")
+        optional_keys = ("floor", "freedom", "overlap")
         arrays = npz_arrays(
-            path, "samples", "rate", "full_scale", "intensity", "times", *optional, otherwise=_UNKNOWN_FORMAT
+            path, "samples", "rate", "full_scale", "intensity", "times", *optional_keys, otherwise=_UNKNOWN_FORMAT
         )
-        array_name = choose_array(arrays, "intensity", "samples")
+        array_name = alternative_array_name(arrays, "intensity", "samples")
         if array_name == "samples":
             if arrays["samples"].ndim == 3:
                 raise ValueError("samples has three axes, as a file of taps has: read that with read_taps.")
             require_arrays(arrays, "rate")
             return Recording(arrays["samples"], arrays["rate"], full_scale=arrays.get("full_scale"), name=path.stem)
         require_arrays(arrays, "times")
-        optional_arrays = {key: arrays[key] for key in optional if key in arrays}
+        optional_arrays = {key: arrays[key] for key in optional_keys if key in arrays}
         return Intensities(arrays["times"], arrays["intensity"], **optional_arrays, name=path.stem)
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from None
@@ -330,7 +334,7 @@ def read_taps(path: str | Path) -> Taps:
         keys = (*geometry, "intensity", "samples", "rate", "full_scale")
         arrays = npz_arrays(path, *keys, otherwise=_UNKNOWN_FORMAT)
         require_arrays(arrays, *geometry)
-        array_name = choose_array(arrays, "intensity", "samples")
+        array_name = alternative_array_name(arrays, "intensity", "samples")
         arguments = {"power" if array_name == "intensity" else "samples": arrays[array_name]}
         if array_name == "samples":
             require_arrays(arrays, "rate")
@@ -383,5 +387,5 @@ def write_taps(path: str | Path, taps: Taps) -> None:
 
 
 def _write_npz(path: str | Path, **arrays) -> None:
-    with written_whole(path) as file:
+    with atomically_written_file(path) as file:
         np.savez(file, allow_pickle=False, **{key: value for key, value in arrays.items() if value is not None})

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import scipy.io.wavfile
 
-from jeit.arguments.extras import optional
+from jeit.arguments.extras import import_optional
 from jeit.files import check_memory, error_text, read_as
 
 # Bytes of memory needed per byte of a sound file with eight bits per sample.
-_MEMORY_FACTOR = 16
+_MEMORY_PER_FILE_BYTE = 16
 # First bytes of the formats read by `soundfile`: FLAC, Ogg, AIFF, CAF, AU, Wave64, VOC, MP3 with a tag.
-_SOUNDFILE_STARTS = (b"fLaC", b"OggS", b"FORM", b"caff", b".snd", b"riff", b"Creative", b"ID3")
+_SOUNDFILE_SIGNATURES = (b"fLaC", b"OggS", b"FORM", b"caff", b".snd", b"riff", b"Creative", b"ID3")
 # Bytes that identify formats which `soundfile` does not read: MP4 (from the fifth byte on); WebM, WMA and AMR.
 _MP4, _UNREADABLE_STARTS = b"ftyp", (b"\x1aE\xdf\xa3", b"0&\xb2u", b"#!AMR")
 
@@ -28,12 +28,12 @@ def read_sound(path: Path) -> tuple[np.ndarray, float, float | None] | None:
     magnitude of any float exceeds 1, the full scale is None (unknown). Raises `ValueError` for broken files, for
     formats that cannot be read, and if `soundfile` is needed but not installed.
     """
-    check_memory(path.name, _MEMORY_FACTOR * path.stat().st_size)
+    check_memory(path.name, _MEMORY_PER_FILE_BYTE * path.stat().st_size)
     with path.open("rb") as file:
         start = file.read(8)
     if start.startswith((b"RIFF", b"RIFX", b"RF64")):
         return _read_wav(path)
-    if start.startswith(_SOUNDFILE_STARTS) or _is_mp3(start):
+    if start.startswith(_SOUNDFILE_SIGNATURES) or _is_mp3(start):
         return _read_with_soundfile(path)
     if start[4:] == _MP4 or start.startswith(_UNREADABLE_STARTS):
         raise ValueError(
@@ -77,7 +77,7 @@ def _read_wav(path: Path) -> tuple[np.ndarray, float, float | None]:
 
 def _read_with_soundfile(path: Path) -> tuple[np.ndarray, float, float | None]:
     try:
-        soundfile: Any = optional("soundfile", "a format that is not plain WAV", "Or convert it to plain WAV.")
+        soundfile: Any = import_optional("soundfile", "a format that is not plain WAV", "Or convert it to plain WAV.")
     except ImportError as error:
         raise ValueError(str(error)) from None  # the caller may read further files
     error_message = "not a sound file that soundfile reads"

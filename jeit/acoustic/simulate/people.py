@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.acoustic.simulate.sound import (
-    FIRST_ONSET,
-    HOP,
+    FIRST_BURST_TIME,
+    SOURCE_POSITION_INTERVAL,
     Burst,
     SimulatedSound,
     block_times,
@@ -23,14 +23,14 @@ from jeit.acoustic.simulate.sound import (
 )
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
 from jeit.acoustic.simulate.touch_sounds import NOMINAL_SPEED
-from jeit.acoustic.simulate.wind_sound import TURBULENCE, simulate_room_sound, simulate_wind
+from jeit.acoustic.simulate.wind_sound import KOLMOGOROV_EXPONENT, simulate_room_sound, simulate_wind
 from jeit.arguments import check_key, check_kind, check_name, describe
 from jeit.arguments.checks import check_positive
 from jeit_solvers.module import Module
 
 # Standard deviation of the logarithm of a trait between the clips of one person; and standard deviation of the trait
 # `slope` itself between people. The standard deviation of `slope` between the clips of one person is half as large.
-WITHIN_PERSON_SPREAD, SLOPE_SPREAD = 0.25, 0.3
+WITHIN_PERSON_LOG_DEVIATION, SPECTRAL_SLOPE_DEVIATION = 0.25, 0.3
 
 
 @dataclass(frozen=True)
@@ -50,26 +50,26 @@ SOUND_MANNERS: dict[str, dict[str, TraitDistribution]] = {
         "strength": TraitDistribution(2.0, 0.4),
         "length": TraitDistribution(0.08, 0.25),
         "interval": TraitDistribution(0.3, 0.3),
-        "slope": TraitDistribution(1.5, SLOPE_SPREAD),
+        "slope": TraitDistribution(1.5, SPECTRAL_SLOPE_DEVIATION),
     },
     "tickle": {
         "strength": TraitDistribution(0.7, 0.4),
         "length": TraitDistribution(0.04, 0.25),
         "interval": TraitDistribution(1 / 15, 0.3),
         "radius": TraitDistribution(0.01, 0.3),
-        "slope": TraitDistribution(1.0, SLOPE_SPREAD),
+        "slope": TraitDistribution(1.0, SPECTRAL_SLOPE_DEVIATION),
     },
     "stroke": {
         "strength": TraitDistribution(1.0, 0.4),
         "speed": TraitDistribution(0.1, 0.35),
         "path": TraitDistribution(0.12, 0.35),
-        "slope": TraitDistribution(0.7, SLOPE_SPREAD),
+        "slope": TraitDistribution(0.7, SPECTRAL_SLOPE_DEVIATION),
     },
     "wind": {
         "strength": TraitDistribution(1.0, 0.4),
         "radius": TraitDistribution(0.03, 0.3),
         "gusts": TraitDistribution(0.15, 0.4),
-        "slope": TraitDistribution(TURBULENCE, SLOPE_SPREAD),
+        "slope": TraitDistribution(KOLMOGOROV_EXPONENT, SPECTRAL_SLOPE_DEVIATION),
     },
     "none": {},
 }
@@ -81,7 +81,7 @@ MODALITIES = tuple(SOUND_MANNERS)
 
 # Standard deviations between the taps of one clip: of the logarithm of the strength, and of the logarithm of the
 # interval between taps; and maximum distance in metres of a pat from the mean position of the pats.
-_STRENGTH_SPREAD, _RHYTHM_SPREAD, _PAT_RADIUS = 0.25, 0.12, 4e-3
+_TAP_STRENGTH_LOG_DEVIATION, _TAP_INTERVAL_LOG_DEVIATION, _PAT_RADIUS = 0.25, 0.12, 4e-3
 # Minimum distance of the centre of a touch from the edge of the skin, in metres.
 _EDGE_MARGIN = 0.02
 # Minimum speed of a stroking hand at a turn, divided by the hand's mean speed.
@@ -150,9 +150,9 @@ class SoundingPerson(Module):
         traits = {}
         for name, median in self.medians[modality].items():
             if name == "slope":
-                traits[name] = max(median + SLOPE_SPREAD / 2 * rng.normal(), 0.1)
+                traits[name] = max(median + SPECTRAL_SLOPE_DEVIATION / 2 * rng.normal(), 0.1)
             else:
-                traits[name] = float(median * np.exp(WITHIN_PERSON_SPREAD * rng.normal()))
+                traits[name] = float(median * np.exp(WITHIN_PERSON_LOG_DEVIATION * rng.normal()))
         # The touch is simulated with its own spectral slope in place of the skin's slope. The microphones' noise
         # depends on the skin's slope, and is therefore not added here.
         sloped_skin = eqx.tree_at(lambda tree: tree.spectral_slope, skin, traits.pop("slope"))
@@ -166,18 +166,20 @@ def _simulate_taps(
     burst = Burst(traits["strength"], max(traits["length"], _MIN_BURST_LENGTH))
     interval, radius = traits["interval"], traits.get("radius", _PAT_RADIUS)
     num_taps = int(np.ceil(2 * duration / interval)) + 2
-    intervals = interval * np.exp(_RHYTHM_SPREAD * rng.normal(size=num_taps))
+    tap_intervals = interval * np.exp(_TAP_INTERVAL_LOG_DEVIATION * rng.normal(size=num_taps))
     # The recording begins at a random phase of the rhythm.
-    onsets = FIRST_ONSET - rng.uniform(0, interval) + np.cumsum(intervals) - intervals[0]
+    onsets = FIRST_BURST_TIME - rng.uniform(0, interval) + np.cumsum(tap_intervals) - tap_intervals[0]
     onsets = onsets[(onsets > -burst.length) & (onsets < duration)]
-    strengths = burst.strength * np.exp(_STRENGTH_SPREAD * rng.normal(size=len(onsets)))
+    strengths = burst.strength * np.exp(_TAP_STRENGTH_LOG_DEVIATION * rng.normal(size=len(onsets)))
     times = sample_times(skin, duration)
     distances = radius * np.sqrt(rng.uniform(size=len(onsets)))
     angle = rng.uniform(0, 2 * np.pi, len(onsets))
     tap_positions = _clip_to_skin(
         skin, _random_position(rng, skin) + np.stack([distances * np.cos(angle), distances * np.sin(angle)], axis=-1)
     )
-    blocks = np.maximum(np.searchsorted(onsets, block_times(skin, len(times)) + HOP, side="right") - 1, 0)
+    blocks = np.maximum(
+        np.searchsorted(onsets, block_times(skin, len(times)) + SOURCE_POSITION_INTERVAL, side="right") - 1, 0
+    )
     return simulate_recording(skin, key, tap_positions[blocks], burst.envelope(times, onsets, strengths), False)
 
 
@@ -186,12 +188,16 @@ def _simulate_stroke(
 ) -> SimulatedSound:
     """Simulate a stroke back and forth along a straight path, slower at the turns."""
     angle, phase = rng.uniform(0, 2 * np.pi, 2)
-    half_path = traits["path"] / 2 * np.array([np.cos(angle), np.sin(angle)])
+    half_displacement = traits["path"] / 2 * np.array([np.cos(angle), np.sin(angle)])
     max_coordinates = np.array([skin.layer.width, skin.layer.height]) / 2 - _EDGE_MARGIN
-    half_path = half_path * min(1.0, float(np.min(max_coordinates / np.maximum(np.abs(half_path), 1e-9))))
-    length = 2 * float(np.linalg.norm(half_path))
+    half_displacement = half_displacement * min(
+        1.0, float(np.min(max_coordinates / np.maximum(np.abs(half_displacement), 1e-9)))
+    )
+    length = 2 * float(np.linalg.norm(half_displacement))
     path_centre = np.clip(
-        _random_position(rng, skin), -(max_coordinates - np.abs(half_path)), max_coordinates - np.abs(half_path)
+        _random_position(rng, skin),
+        -(max_coordinates - np.abs(half_displacement)),
+        max_coordinates - np.abs(half_displacement),
     )
     times = sample_times(skin, duration)
     # The mean speed of a sinusoidal motion of peak-to-peak length L and angular frequency w is L w / π.
@@ -202,7 +208,7 @@ def _simulate_stroke(
     )
     block_centres = block_times(skin, len(times))
     positions = _clip_to_skin(
-        skin, path_centre + np.sin(angular_frequency * block_centres + phase)[:, None] * half_path
+        skin, path_centre + np.sin(angular_frequency * block_centres + phase)[:, None] * half_displacement
     )
     return simulate_recording(skin, key, positions, traits["strength"] * np.sqrt(speed / NOMINAL_SPEED), False)
 
@@ -249,7 +255,7 @@ def _numpy_generator(key: Array) -> np.random.Generator:
 
 # Mean level of the room's sound relative to the microphones' noise, and its standard deviation between clips, in
 # decibels.
-_ROOM_LEVEL, _ROOM_SPREAD = -6.0, 4.0
+_MEAN_ROOM_LEVEL_DB, _ROOM_LEVEL_DEVIATION_DB = -6.0, 4.0
 
 
 @dataclass(frozen=True)
@@ -337,6 +343,6 @@ def _generate_clips(key, skin, people, num_clips_per_label, modalities, duration
     for clip_index, (person, modality) in enumerate(labels):
         touch_key, noise_key, room_key, level_key = jax.random.split(jax.random.fold_in(key, clip_index), 4)
         touch = people[person].touch(touch_key, modality, skin, duration=duration)
-        level = _ROOM_LEVEL + _ROOM_SPREAD * float(jax.random.normal(level_key))
+        level = _MEAN_ROOM_LEVEL_DB + _ROOM_LEVEL_DEVIATION_DB * float(jax.random.normal(level_key))
         room_samples = simulate_room_sound(skin, room_key, level_db=level, duration=duration).samples
         yield SoundClip(touch, microphone_noise(skin, noise_key, num_samples) + room_samples, modality, person)

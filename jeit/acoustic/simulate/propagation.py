@@ -10,15 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from jeit.acoustic.simulate.sounding_skin import NUM_SLOTS, SLOT_TIME, SoundingSkin
+from jeit.acoustic.simulate.sounding_skin import MULTIPLEXER_INTERVAL, NUM_MULTIPLEXER_CHANNELS, SoundingSkin
 
 
 def band_filter(skin: SoundingSkin, frequencies: Float[Array, " F"]) -> Float[Array, " F"]:
     """Power response (F,) of the analogue filters at `frequencies` (F,) in Hz: 1 in the band, 1/2 at the limits of the
     band, and 0 more than half an octave outside."""
-    octaves = jnp.log2(jnp.maximum(frequencies, 1e-9))
+    log2_frequencies = jnp.log2(jnp.maximum(frequencies, 1e-9))
     low, high = jnp.log2(skin.readout.band[0]), jnp.log2(skin.readout.band[1])
-    rising_edge, falling_edge = jnp.clip(octaves - low + 0.5, 0, 1), jnp.clip(high - octaves + 0.5, 0, 1)
+    rising_edge, falling_edge = (
+        jnp.clip(log2_frequencies - low + 0.5, 0, 1),
+        jnp.clip(high - log2_frequencies + 0.5, 0, 1),
+    )
     return (jnp.sin(jnp.pi / 2 * rising_edge) * jnp.sin(jnp.pi / 2 * falling_edge)) ** 2
 
 
@@ -68,10 +71,18 @@ def transfer(skin: SoundingSkin, frequencies: Float[Array, " F"], position: Floa
     # Microphone i is connected to slot i mod 4 of multiplexer i div 4. The slot read 25 µs earlier may have no
     # microphone.
     microphone_index = np.arange(skin.num_microphones)
-    previous_index = microphone_index - microphone_index % NUM_SLOTS + (microphone_index - 1) % NUM_SLOTS
-    has_previous = previous_index < skin.num_microphones
-    crosstalk = jnp.where(has_previous[:, None], received_amplitude[np.where(has_previous, previous_index, 0)], 0)
-    received_amplitude += skin.readout.coupling * crosstalk * jnp.exp(-2j * jnp.pi * frequencies * SLOT_TIME)
+    previous_index = (
+        microphone_index
+        - microphone_index % NUM_MULTIPLEXER_CHANNELS
+        + (microphone_index - 1) % NUM_MULTIPLEXER_CHANNELS
+    )
+    has_previous_channel = previous_index < skin.num_microphones
+    previous_channel_amplitude = jnp.where(
+        has_previous_channel[:, None], received_amplitude[np.where(has_previous_channel, previous_index, 0)], 0
+    )
+    received_amplitude += (
+        skin.readout.coupling * previous_channel_amplitude * jnp.exp(-2j * jnp.pi * frequencies * MULTIPLEXER_INTERVAL)
+    )
     return received_amplitude * jnp.exp(2j * jnp.pi * frequencies * skin.stagger[:, None])
 
 
@@ -91,8 +102,8 @@ def expected_power(skin: SoundingSkin, positions) -> Float[np.ndarray, "P M"]:
 
 
 @jax.jit
-def _expected_power(skin, points, frequencies, step):
-    density = source_density(skin, frequencies) * step
+def _expected_power(skin, points, frequencies, frequency_step):
+    density = source_density(skin, frequencies) * frequency_step
     return jax.lax.map(lambda point: jnp.abs(transfer(skin, frequencies, point)) ** 2 @ density, points)
 
 
@@ -113,5 +124,5 @@ def _nominal_power(skin, length):
 
 def noise_power(skin: SoundingSkin) -> Float[np.ndarray, " M"]:
     """Mean square (M,) of the noise of each microphone, which lies in the frequency band; see `MicrophoneModel`."""
-    nominal = nominal_power(skin, skin.microphone_model.reach) * 10 ** (-skin.microphone_model.snr_db / 10)
-    return nominal * np.asarray(skin.noise_factor)
+    nominal_noise_power = nominal_power(skin, skin.microphone_model.reach) * 10 ** (-skin.microphone_model.snr_db / 10)
+    return nominal_noise_power * np.asarray(skin.noise_factor)

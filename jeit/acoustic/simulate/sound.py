@@ -28,21 +28,21 @@ from jeit_solvers.module import Module
 
 # Duration in seconds for which the zero-phase filter of the source rings before and after a burst: about the inverse of
 # the filter's lowest frequency.
-RINGING_TIME = 0.05
+FILTER_RINGING_DURATION = 0.05
 # Time in seconds at which the first burst of a recording begins, which leaves room for the ringing of the filter.
-FIRST_ONSET = 0.02
+FIRST_BURST_TIME = 0.02
 # Time in seconds between the positions of a moving source. The source is at rest during each Hann-weighted block of two
 # hops; blocks overlap by half, and their weights sum to one. In 10 ms, a fast stroke of 0.5 m/s moves by 5 mm, much
 # less than the distance over which the received power changes.
-HOP = 0.01
+SOURCE_POSITION_INTERVAL = 0.01
 
 
-def bin_frequencies(skin: SoundingSkin, num_samples: int, bins: int) -> Array:
-    """Frequencies (bins,) in Hz of the lowest `bins` bins of a Fourier transform of `num_samples` samples."""
-    return jnp.arange(bins) * (skin.rate / num_samples)
+def bin_frequencies(skin: SoundingSkin, num_samples: int, num_bins: int) -> Array:
+    """Frequencies (bins,) in Hz of the lowest `num_bins` bins of a Fourier transform of `num_samples` samples."""
+    return jnp.arange(num_bins) * (skin.rate / num_samples)
 
 
-def num_filled_bins(skin: SoundingSkin, num_samples: int, *, blur: float = 0.0) -> int:
+def num_bins_of_source(skin: SoundingSkin, num_samples: int, *, blur: float = 0.0) -> int:
     """Number of bins of a real Fourier transform of `num_samples` samples up to half an octave above the band plus
     `blur` in Hz. The sound has zero amplitude in the remaining bins."""
     return min(int((np.sqrt(2) * skin.readout.band[1] + blur) * num_samples / skin.rate) + 1, num_samples // 2)
@@ -54,24 +54,26 @@ def transform_size(count: int, padding: float, rate: float) -> int:
     return 2 * int(np.asarray(next_fast_len((min_size + 1) // 2)))
 
 
-def source_spectrum(skin: SoundingSkin, key: Array, envelope: Array, num_samples: int, bins: int) -> Array:
+def source_spectrum(skin: SoundingSkin, key: Array, envelope: Array, num_samples: int, num_bins: int) -> Array:
     """Fourier transform (bins,) of the sound of a source: white noise multiplied by `envelope`, and filtered to the
     spectral density of a source.
 
     Real white noise of variance 1 has the density 2 / rate at positive frequencies.
     """
-    white = jnp.fft.rfft(jax.random.normal(key, envelope.shape) * envelope, num_samples)[:bins]
-    return white * jnp.sqrt(source_density(skin, bin_frequencies(skin, num_samples, bins)) * skin.rate / 2)
+    white_noise_spectrum = jnp.fft.rfft(jax.random.normal(key, envelope.shape) * envelope, num_samples)[:num_bins]
+    return white_noise_spectrum * jnp.sqrt(
+        source_density(skin, bin_frequencies(skin, num_samples, num_bins)) * skin.rate / 2
+    )
 
 
-def noise_spectrum(skin: SoundingSkin, key: Array, level: Array, num_samples: int, bins: int) -> Array:
+def noise_spectrum(skin: SoundingSkin, key: Array, level: Array, num_samples: int, num_bins: int) -> Array:
     """Fourier transform (M, bins) of the noise of M microphones with mean square `level` (M,) and a flat spectrum in
     the band.
 
     In a real signal of `num_samples` samples, bin k > 0 with variance v_k contributes 2 v_k / size² to the mean square,
     where size is `num_samples`.
     """
-    shape = band_filter(skin, bin_frequencies(skin, num_samples, bins))
+    shape = band_filter(skin, bin_frequencies(skin, num_samples, num_bins))
     variance = level[:, None] * shape / jnp.sum(shape) * num_samples**2 / 2
     draws = jax.random.normal(key, (2, *variance.shape))
     return jnp.sqrt(variance / 2) * (draws[0] + 1j * draws[1])
@@ -86,8 +88,8 @@ def microphone_noise(skin: SoundingSkin, key: Array, count: int) -> Float[np.nda
     """Simulate `count` samples of noise of each microphone, (M, S) with S = `count`."""
     # Noise synthesised from a spectrum is periodic with period `size`. More samples than needed are generated, so that
     # the last samples are independent of the first.
-    size = transform_size(count, RINGING_TIME, skin.rate)
-    return np.asarray(_noise_samples(skin, key, noise_power(skin), count, size, num_filled_bins(skin, size)))
+    size = transform_size(count, FILTER_RINGING_DURATION, skin.rate)
+    return np.asarray(_noise_samples(skin, key, noise_power(skin), count, size, num_bins_of_source(skin, size)))
 
 
 def sample_times(skin: SoundingSkin, duration: float) -> Float[np.ndarray, " S"]:
@@ -119,10 +121,10 @@ class Burst(Module):
     def check_fits(self, duration: float) -> None:
         """Raises `ValueError` if a recording of `duration` seconds is too short for one burst."""
         check_positive("duration", duration)
-        if duration < FIRST_ONSET + self.length:
+        if duration < FIRST_BURST_TIME + self.length:
             raise ValueError(
-                f"duration: a burst of {self.length:g} s that begins at {FIRST_ONSET:g} s does not fit in {duration:g} "
-                f"s. Give at least {FIRST_ONSET + self.length:g} s, or a shorter length."
+                f"duration: a burst of {self.length:g} s that begins at {FIRST_BURST_TIME:g} s does not fit in "
+                f"{duration:g} s. Give at least {FIRST_BURST_TIME + self.length:g} s, or a shorter length."
             )
 
     def envelope(
@@ -228,8 +230,8 @@ def simulate_recording(
     source_key, noise_key = jax.random.split(key)
     num_samples, block_centres = len(envelope), block_times(skin, len(envelope))
     positions = np.broadcast_to(positions, (len(block_centres), 2))
-    transform_length = transform_size(num_samples, RINGING_TIME, skin.rate)
-    block_length = transform_size(2 * round(HOP * skin.rate), skin.layer.longest_delay, skin.rate)
+    transform_length = transform_size(num_samples, FILTER_RINGING_DURATION, skin.rate)
+    block_length = transform_size(2 * round(SOURCE_POSITION_INTERVAL * skin.rate), skin.layer.longest_delay, skin.rate)
     samples = np.asarray(
         _moving_source_samples(
             skin,
@@ -238,7 +240,7 @@ def simulate_recording(
             envelope,
             transform_length,
             block_length,
-            num_filled_bins(skin, block_length, blur=4 / HOP),
+            num_bins_of_source(skin, block_length, blur=4 / SOURCE_POSITION_INTERVAL),
         )
     )
     if noise:
@@ -256,22 +258,22 @@ def simulate_recording(
 
 def block_times(skin: SoundingSkin, count: int) -> np.ndarray:
     """Middles of the blocks of time that cover `count` samples, in seconds: 0, one hop, two hops, …"""
-    return HOP * np.arange(int(np.ceil(count / round(HOP * skin.rate))) + 1)
+    return SOURCE_POSITION_INTERVAL * np.arange(int(np.ceil(count / round(SOURCE_POSITION_INTERVAL * skin.rate))) + 1)
 
 
 @partial(jax.jit, static_argnums=(4, 5, 6))
 def _moving_source_samples(skin, key, positions, envelope, num_samples, block_length, num_bins):
-    num_recorded, hop = envelope.shape[0], round(HOP * skin.rate)
-    sound = jnp.fft.irfft(source_spectrum(skin, key, envelope, num_samples, num_samples // 2 + 1), num_samples)[
-        :num_recorded
-    ]
-    sound = jnp.pad(sound, (hop, positions.shape[0] * hop + hop - num_recorded))
+    num_recorded, hop = envelope.shape[0], round(SOURCE_POSITION_INTERVAL * skin.rate)
+    source_samples = jnp.fft.irfft(
+        source_spectrum(skin, key, envelope, num_samples, num_samples // 2 + 1), num_samples
+    )[:num_recorded]
+    source_samples = jnp.pad(source_samples, (hop, positions.shape[0] * hop + hop - num_recorded))
     window = jnp.sin(jnp.pi * jnp.arange(2 * hop) / (2 * hop)) ** 2
     frequencies = bin_frequencies(skin, block_length, num_bins)
 
     def add_block(output, item):
         block_index, position = item
-        block_sound = jax.lax.dynamic_slice(sound, (block_index * hop,), (2 * hop,)) * window
+        block_sound = jax.lax.dynamic_slice(source_samples, (block_index * hop,), (2 * hop,)) * window
         spectrum = jnp.fft.rfft(block_sound, block_length)[:num_bins] * transfer(skin, frequencies, position)
         output_block = jax.lax.dynamic_slice(output, (0, block_index * hop), (output.shape[0], block_length))
         return jax.lax.dynamic_update_slice(

@@ -24,8 +24,8 @@ from jeit_solvers.module import Module
 
 # Time between two slots of a multiplexer in seconds, and number of slots per multiplexer. Eight 4:1 multiplexers switch
 # simultaneously every 25 µs, so each microphone is sampled every 100 µs (Park 2022, text S3).
-SLOT_TIME = 25e-6
-NUM_SLOTS = 4
+MULTIPLEXER_INTERVAL = 25e-6
+NUM_MULTIPLEXER_CHANNELS = 4
 
 
 class MicrophoneModel(Module):
@@ -92,7 +92,7 @@ class Readout(Module):
     @property
     def rate(self) -> float:
         """Sampling rate of each microphone in Hz."""
-        return 1 / (NUM_SLOTS * SLOT_TIME) if self.multiplexed else 1 / SLOT_TIME
+        return 1 / (NUM_MULTIPLEXER_CHANNELS * MULTIPLEXER_INTERVAL) if self.multiplexed else 1 / MULTIPLEXER_INTERVAL
 
     @property
     def coupling(self):
@@ -101,7 +101,7 @@ class Readout(Module):
 
     def stagger(self, number: int) -> np.ndarray:
         """Sampling delay (M,) of each of `number` microphones relative to the first, in seconds."""
-        return SLOT_TIME * (np.arange(number) % NUM_SLOTS) * self.multiplexed
+        return MULTIPLEXER_INTERVAL * (np.arange(number) % NUM_MULTIPLEXER_CHANNELS) * self.multiplexed
 
 
 def microphone_grid(number: int, *, width: float = 0.2, height: float = 0.2) -> np.ndarray:
@@ -176,10 +176,14 @@ class Elastomer(Module):
         """
         # The limit of the dispersion for n → 1 is a logarithm, which the formula with this value of n approximates
         # closely enough.
-        exponent = jnp.where(jnp.abs(self.attenuation_exponent - 1) < 1e-6, 1 + 1e-6, self.attenuation_exponent)
+        attenuation_exponent = jnp.where(
+            jnp.abs(self.attenuation_exponent - 1) < 1e-6, 1 + 1e-6, self.attenuation_exponent
+        )
         relative = frequencies / self.attenuation_frequency
-        dispersion = self.attenuation * jnp.tan(jnp.pi / 2 * exponent) * (relative**exponent - relative)
-        return 2 * jnp.pi * frequencies / self.wave_speed + dispersion
+        dispersion_term = (
+            self.attenuation * jnp.tan(jnp.pi / 2 * attenuation_exponent) * (relative**attenuation_exponent - relative)
+        )
+        return 2 * jnp.pi * frequencies / self.wave_speed + dispersion_term
 
 
 class ElastomerLayer(Module):

@@ -17,11 +17,11 @@ from numpy.typing import ArrayLike
 
 from jeit.acoustic.simulate.propagation import noise_power, transfer
 from jeit.acoustic.simulate.sound import (
+    FILTER_RINGING_DURATION,
     FIRM_BURST,
-    FIRST_ONSET,
-    HOP,
+    FIRST_BURST_TIME,
     LIGHT_BURST,
-    RINGING_TIME,
+    SOURCE_POSITION_INTERVAL,
     VIBRATOR_BURST,
     Burst,
     SimulatedSound,
@@ -29,7 +29,7 @@ from jeit.acoustic.simulate.sound import (
     block_times,
     check_burst,
     noise_spectrum,
-    num_filled_bins,
+    num_bins_of_source,
     sample_times,
     simulate_recording,
     source_spectrum,
@@ -85,7 +85,7 @@ def simulate_tap(
     if repeats < 1:
         raise ValueError(f"repeats: give at least one tap, not {repeats}.")
     check_burst(burst, duration)
-    onsets = FIRST_ONSET + np.arange(repeats) / frequency
+    onsets = FIRST_BURST_TIME + np.arange(repeats) / frequency
     times = sample_times(skin, max(duration, onsets[-1] + burst.length + 0.03))
     envelope = burst.envelope(times, onsets, np.full(repeats, burst.strength))
     return simulate_recording(skin, key, _check_position(skin, position), envelope, noise)
@@ -172,10 +172,10 @@ def simulate_tickle(
     check_positive("taps_per_second", taps_per_second)
     check_burst(burst, duration)
     times = sample_times(skin, duration)
-    num_taps = max(1, int((duration - FIRST_ONSET - burst.length) * taps_per_second))
+    num_taps = max(1, int((duration - FIRST_BURST_TIME - burst.length) * taps_per_second))
     position_key, jitter_key, strength_key, sound_key = jax.random.split(key, 4)
     onsets = (
-        FIRST_ONSET
+        FIRST_BURST_TIME
         + (np.arange(num_taps) + 0.25 * np.asarray(jax.random.uniform(jitter_key, (num_taps,)))) / taps_per_second
     )
     strengths = burst.strength * np.exp(0.3 * np.asarray(jax.random.normal(strength_key, (num_taps,))))
@@ -187,7 +187,9 @@ def simulate_tickle(
     half_size = np.array([skin.layer.width, skin.layer.height]) / 2
     tap_positions = np.clip(centre + offsets, -half_size, half_size)
     # The source moves to the position of a tap at the onset of that tap.
-    blocks = np.maximum(np.searchsorted(onsets, block_times(skin, len(times)) + HOP, side="right") - 1, 0)
+    blocks = np.maximum(
+        np.searchsorted(onsets, block_times(skin, len(times)) + SOURCE_POSITION_INTERVAL, side="right") - 1, 0
+    )
     return simulate_recording(skin, sound_key, tap_positions[blocks], burst.envelope(times, onsets, strengths), noise)
 
 
@@ -238,10 +240,10 @@ def simulate_stroke(
             "path: its length is zero, and a finger at rest makes no sound; give a longer path, or simulate a tap."
         )
     # The stroke fades in and out over 20 ms.
-    fade = np.sin(np.pi / 2 * np.clip(np.minimum(times, duration - times) / 0.02, 0, 1))
+    fade_amplitude = np.sin(np.pi / 2 * np.clip(np.minimum(times, duration - times) / 0.02, 0, 1))
     block_centres = block_times(skin, len(times))
     positions = np.stack([np.interp(block_centres, times, axis) for axis in path_positions.T], axis=-1)
-    return simulate_recording(skin, key, positions, strength * np.sqrt(speed / NOMINAL_SPEED) * fade, noise)
+    return simulate_recording(skin, key, positions, strength * np.sqrt(speed / NOMINAL_SPEED) * fade_amplitude, noise)
 
 
 def _position_on_polyline(skin: SoundingSkin, corners, duration: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -317,8 +319,8 @@ def simulate_calibration_taps(
     strengths = burst.strength * np.exp(
         strength_spread * np.asarray(jax.random.normal(strength_key, (len(tap_positions), repeats)))
     )
-    envelope = burst.envelope(times, np.array([FIRST_ONSET]), np.array([1.0]))
-    size = transform_size(len(times), skin.layer.longest_delay + RINGING_TIME, skin.rate)
+    envelope = burst.envelope(times, np.array([FIRST_BURST_TIME]), np.array([1.0]))
+    size = transform_size(len(times), skin.layer.longest_delay + FILTER_RINGING_DURATION, skin.rate)
     samples = np.empty((len(tap_positions), repeats, skin.num_microphones, len(times)))
     level = noise_power(skin) if noise else None
     keys = jax.random.split(tap_key, len(tap_positions))
@@ -335,7 +337,7 @@ def simulate_calibration_taps(
             envelope,
             level,
             size,
-            num_filled_bins(skin, size),
+            num_bins_of_source(skin, size),
         )
         if progress is not None:
             progress(f"{chunk[-1] + 1} of {len(tap_positions)} places")

@@ -10,12 +10,12 @@ from numpy.typing import ArrayLike
 
 from jeit.acoustic.simulate.propagation import band_filter, noise_power, transfer
 from jeit.acoustic.simulate.sound import (
-    RINGING_TIME,
+    FILTER_RINGING_DURATION,
     SimulatedSound,
     bin_frequencies,
     block_times,
     microphone_noise,
-    num_filled_bins,
+    num_bins_of_source,
     sample_times,
     transform_size,
 )
@@ -26,7 +26,7 @@ from jeit.arguments.checks import check_not_negative, check_positive
 # computed. The power, which is smooth, is interpolated between these frequencies.
 _NUM_EDDIES, _NUM_FREQUENCIES = 64, 160
 # Exponent of Kolmogorov's law of turbulence: the energy density is proportional to frequency to minus this power.
-TURBULENCE = 5 / 3
+KOLMOGOROV_EXPONENT = 5 / 3
 
 
 def simulate_wind(
@@ -38,7 +38,7 @@ def simulate_wind(
     radius: float = 0.03,
     gusts: float = 0.15,
     gust_time: float = 0.2,
-    slope: float = TURBULENCE,
+    slope: float = KOLMOGOROV_EXPONENT,
     duration: float = 1.0,
     noise: bool = True,
 ) -> SimulatedSound:
@@ -156,16 +156,18 @@ def _spectral_density(skin: SoundingSkin, slope: float, received_power: ArrayLik
     return np.asarray(received_power) * shape / np.trapezoid(shape, grid)
 
 
-def _coloured_noise(skin: SoundingSkin, key: Array, density: Float[np.ndarray, "M G"], count: int) -> np.ndarray:
+def _coloured_noise(
+    skin: SoundingSkin, key: Array, spectral_density: Float[np.ndarray, "M G"], count: int
+) -> np.ndarray:
     """Simulate `count` samples (M, S) of independent noises at M microphones, with the power spectral densities
-    `density`."""
-    size = transform_size(count, RINGING_TIME, skin.rate)
-    bins = num_filled_bins(skin, size)
+    `spectral_density`."""
+    size = transform_size(count, FILTER_RINGING_DURATION, skin.rate)
+    bins = num_bins_of_source(skin, size)
     frequencies = np.asarray(bin_frequencies(skin, size, bins))
     grid = _frequency_grid(skin)
     # In a real signal of `size` samples, bin k > 0 with variance v_k contributes 2 v_k / size² to the mean square.
-    variance = np.stack([np.interp(frequencies, grid, row, left=0.0, right=0.0) for row in density])
-    draws = np.asarray(jax.random.normal(key, (2, len(density), bins)))
+    variance = np.stack([np.interp(frequencies, grid, row, left=0.0, right=0.0) for row in spectral_density])
+    draws = np.asarray(jax.random.normal(key, (2, len(spectral_density), bins)))
     spectrum = np.sqrt(variance * skin.rate * size / 4) * (draws[0] + 1j * draws[1])
     return np.fft.irfft(spectrum, size)[:, :count]
 

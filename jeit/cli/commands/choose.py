@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from jeit.cli.options import (
-    AsIs,
-    Contact,
-    Data,
-    Description,
-    Format,
-    Frame,
-    Key,
-    Nodes,
-    Quiet,
-    Reference,
-    ReferenceFrames,
-    ReferenceKey,
+    AsIsOption,
+    ContactOption,
+    DataArgument,
+    DescriptionOption,
+    FormatOption,
+    FrameOption,
+    KeyOption,
+    NodesOption,
+    QuietOption,
+    ReferenceArgument,
+    ReferenceFramesOption,
+    ReferenceKeyOption,
+    convert_to_number_if_possible,
     make_folder,
-    naming_options,
-    number_or_name,
+    naming_options_in_errors,
     read_pair,
 )
 
@@ -32,32 +32,32 @@ if TYPE_CHECKING:
 
 
 def choose(
-    data: Data,
+    data: DataArgument,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for choice.png and choice.json.", show_default=False)
     ],
-    reference: Reference = None,
-    reference_frames: ReferenceFrames = None,
+    reference: ReferenceArgument = None,
+    reference_frames: ReferenceFramesOption = None,
     rule: Annotated[
         list[str] | None,
         typer.Option(
             help="Only this rule: gcv, l-curve, discrepancy, noise-figure or best-resolution; may be given repeatedly."
         ),
     ] = None,
-    key: Key = None,
-    reference_key: ReferenceKey = None,
-    format: Format = None,
-    description: Description = None,
+    key: KeyOption = None,
+    reference_key: ReferenceKeyOption = None,
+    format: FormatOption = None,
+    description: DescriptionOption = None,
     prior: Annotated[str | None, typer.Option(help="tikhonov, laplace, noser, gaussian (default) or matern.")] = None,
-    contact: Contact = None,
-    num_points: Nodes = None,
-    frame: Frame = None,
-    as_is: AsIs = False,
-    quiet: Quiet = False,
+    contact: ContactOption = None,
+    num_points: NodesOption = None,
+    frame: FrameOption = None,
+    as_is: AsIsOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Compare the rules that choose the regularisation hyperparameter of DATA's image; writes choice.png and
     choice.json."""
-    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.cli.console import Steps, plain_console, print_written_files
     from jeit.imaging import ImagingSettings, compare_on_data
     from jeit.report import write_choice
 
@@ -70,19 +70,19 @@ def choose(
         measurement, reference_measurement = read_pair(
             data, reference, reference_frames, format, description, (key, reference_key)
         )
-        frame_selector = None if frame is None else number_or_name(frame, int)
-        with naming_options({"rules": "--rule"}):
+        frame_selector = None if frame is None else convert_to_number_if_possible(frame, int)
+        with naming_options_in_errors({"rules": "--rule"}):
             result = compare_on_data(
                 measurement, reference_measurement, settings, rules=rule or None, frame=frame_selector, progress=step
             )
         step("write")
         write_choice(result, output)
     if not quiet:
-        show(console, result)
-        say_written(console, output / "choice.png", "choice.json")
+        print_comparison_of_rules(console, result)
+        print_written_files(console, output / "choice.png", "choice.json")
 
 
-def show(console, result: "ComparedRules") -> None:
+def print_comparison_of_rules(console, result: "ComparedRules") -> None:
     """Print a row for every rule, with the chosen hyperparameter and the reason to doubt the choice, if any."""
     from rich.table import Table
 

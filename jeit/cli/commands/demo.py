@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from jeit.cli.options import Quiet, make_folder, naming_options
+from jeit.cli.options import QuietOption, make_folder, naming_options_in_errors
 
 
 def demo(
@@ -18,14 +18,14 @@ def demo(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the picture and the report.")] = Path(
         "jeit-demo"
     ),
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Simulate a press on a skin (diameter 100 mm, 16 electrodes), image it, and compare image and truth. Needs no
     data."""
     import jax
     import numpy as np
 
-    from jeit.cli.console import Steps, name_value_table, plain_console, say_written
+    from jeit.cli.console import Steps, name_value_table, plain_console, print_written_files
     from jeit.data.round_skin import RoundSkin, simulate_press
     from jeit.imaging import image_difference
     from jeit.report import write_image
@@ -35,7 +35,7 @@ def demo(
     skin = RoundSkin()
     with Steps(console, quiet=quiet) as step:
         step("simulate a press")
-        with naming_options({"position": "--x and --y"}):
+        with naming_options_in_errors({"position": "--x and --y"}):
             pressed, reference = simulate_press(skin, jax.random.key(seed), (x, y), noise=noise)
         result = image_difference(pressed, reference, progress=step)
         step("write")
@@ -54,4 +54,4 @@ def demo(
     console.print()
     console.print(name_value_table("A simulated press", rows))
     console.print()
-    say_written(console, output / "image.png", "image.npz", "report.json")
+    print_written_files(console, output / "image.png", "image.npz", "report.json")

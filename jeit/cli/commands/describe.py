@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from jeit.cli.options import Data, Key, Quiet, Reference, ReferenceKey, make_folder, naming_options
+from jeit.cli.options import (
+    DataArgument,
+    KeyOption,
+    QuietOption,
+    ReferenceArgument,
+    ReferenceKeyOption,
+    make_folder,
+    naming_options_in_errors,
+)
 
 if TYPE_CHECKING:
     from jeit.imaging.describe import Findings
@@ -27,14 +35,14 @@ _SHAPES = {
 _DESCRIPTION_FILE = "description.toml"
 _WRITTEN_FILES = (_DESCRIPTION_FILE, "image.png", "image.npz", "report.json", "image.vtu")
 # Maximum number of explanations that are listed.
-_MAX_LISTED = 5
+_MAX_LISTED_EXPLANATIONS = 5
 
 
 def describe(
-    data: Data,
-    reference: Reference = None,
-    key: Key = None,
-    reference_key: ReferenceKey = None,
+    data: DataArgument,
+    reference: ReferenceArgument = None,
+    key: KeyOption = None,
+    reference_key: ReferenceKeyOption = None,
     shape: Annotated[
         str | None,
         typer.Option(
@@ -56,7 +64,7 @@ def describe(
     output: Annotated[
         Path, typer.Option("--output", "-o", help=f"Folder for {_DESCRIPTION_FILE} and the first image.")
     ] = Path("."),
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Find out how the voltages in a file without a description may be arranged: electrodes, protocol, channels, signs,
     frames.
@@ -66,11 +74,11 @@ def describe(
     `jeit.imaging.find_description`.
     """
     from jeit.arguments import check_name
-    from jeit.cli.commands.reconstruct import show
-    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.cli.commands.reconstruct import print_imaging_result
+    from jeit.cli.console import Steps, plain_console, print_written_files
     from jeit.data import read
     from jeit.data.frame_checks import assess
-    from jeit.files.atomic_write import written_whole
+    from jeit.files.atomic_write import atomically_written_file
     from jeit.imaging import image_difference
     from jeit.imaging.describe import find_description
     from jeit.report import write_image
@@ -93,16 +101,16 @@ def describe(
     if target.exists():
         raise ValueError(f"--output: {target} exists already; move it, or give another folder.")
     console = plain_console()
-    stated_values = {name: value for name, value in known_values.items() if value is not None}
+    given_values = {name: value for name, value in known_values.items() if value is not None}
     option_names = {"key": "--key", "number": "--electrodes", "width": "--width", "height": "--height"}
-    with Steps(console, quiet=quiet) as step, naming_options(option_names), _naming_sizes():
+    with Steps(console, quiet=quiet) as step, naming_options_in_errors(option_names), _naming_size_options_in_errors():
         findings = find_description(
             data,
             geometry,
             electrode_table,
             reference=reference,
             keys=(key, reference_key),
-            known=stated_values,
+            known=given_values,
             current=current,
             progress=step,
         )
@@ -116,7 +124,7 @@ def describe(
             f"undecided: {findings.candidates[0].name}, or {other_names} explain the voltages as well. Decide by "
             "--electrodes, --protocol or --order."
         )
-    with written_whole(target) as file:
+    with atomically_written_file(target) as file:
         file.write(findings.text.encode())
     if reference is None and reference_key is None:
         frames = findings.candidates[0].frames
@@ -141,12 +149,12 @@ def describe(
         step("write the first image")
         write_image(result, output)
     if not quiet:
-        show(console, result)
-        say_written(console, target, *_WRITTEN_FILES[1 : 4 + (result.mesh.dimension == 3)])
+        print_imaging_result(console, result)
+        print_written_files(console, target, *_WRITTEN_FILES[1 : 4 + (result.mesh.dimension == 3)])
 
 
 @contextmanager
-def _naming_sizes() -> Iterator[None]:
+def _naming_size_options_in_errors() -> Iterator[None]:
     """Context manager that names the options --shape, --width and --height in error messages about bodies and
     electrodes."""
     try:
@@ -176,7 +184,9 @@ def _body_tables(shape: str, width: float | None, height: float | None) -> tuple
         numbers = []
     size_names, layout = _SHAPES.get(name, ((), ""))
     if not numbers or len(numbers) != len(size_names):
-        options = ", ".join(f"{shape_name}:{','.join(sizes).upper()}" for shape_name, (sizes, _) in _SHAPES.items())
+        options = ", ".join(
+            f"{shape_name}:{','.join(body_sizes).upper()}" for shape_name, (body_sizes, _) in _SHAPES.items()
+        )
         raise ValueError(f"--shape: give one of {options}, in metres; it is {shape[:40]!r}.")
     geometry = {"shape": name, **dict(zip(size_names, numbers, strict=True))}
     electrode_width = float(_value_or_prompt(width, "Width of an electrode in metres, such as 0.01"))
@@ -200,7 +210,7 @@ def _print_findings(console, data: Path, findings: "Findings") -> None:
     from jeit.cli.console import name_value_table
 
     rows = []
-    for candidate in findings.candidates[:_MAX_LISTED]:
+    for candidate in findings.candidates[:_MAX_LISTED_EXPLANATIONS]:
         evidence = [counted(candidate.frames, "frame")]
         evidence += [] if candidate.reciprocity is None else [f"reciprocity broken by {percent(candidate.reciprocity)}"]
         evidence += [f"frames of the empty body differ by {percent(candidate.spread)}"] if candidate.spread else []

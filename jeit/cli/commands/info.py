@@ -7,11 +7,11 @@ from typing import Annotated, Any
 
 import typer
 
-from jeit.cli.options import Description, Format, Key, read_file
+from jeit.cli.options import DescriptionOption, FormatOption, KeyOption, read_file
 
 # For each outline, the name of the upright solid with this outline as its base, and the keys of the solid's sizes in a
 # description if they differ from those of the outline.
-_SOLIDS = {
+_SOLID_NAMES_AND_SIZE_KEYS = {
     "rectangle": ("box", {"height": "depth", "thickness": "height"}),
     "disk": ("cylinder", {"thickness": "height"}),
 }
@@ -19,14 +19,14 @@ _SOLIDS = {
 
 def info(
     data: Annotated[Path, typer.Argument(help="Measured file.", show_default=False)],
-    key: Key = None,
-    format: Format = None,
-    description: Description = None,
+    key: KeyOption = None,
+    format: FormatOption = None,
+    description: DescriptionOption = None,
 ) -> None:
     """Print what DATA contains: frames, electrodes, protocol, noise, assumptions, and masked voltages."""
     from jeit.arguments import counted, percent
     from jeit.cli.console import format_with_unit, name_value_table, plain_console
-    from jeit.data.frame_checks import MOST_IMPOSSIBLE_SIGNS
+    from jeit.data.frame_checks import MAX_IMPOSSIBLE_SIGN_SHARE
     from jeit.report import report_measurement
 
     measurement = read_file("DATA", data, format, description, key=key)
@@ -48,7 +48,7 @@ def info(
         ("noise", noise_text or "not known"),
         ("impossible signs", percent(report["impossible_signs"])),
     ]
-    if (report["impossible_signs"] or 0) > MOST_IMPOSSIBLE_SIGNS:
+    if (report["impossible_signs"] or 0) > MAX_IMPOSSIBLE_SIGN_SHARE:
         rows.append(("doubt", "so many impossible signs are those of noise: frames with them are not imaged"))
     rows.append(("wiring", report["wiring"] or "not known: the file does not say where electrodes are"))
     rows += [("note", note) for note in report["notes"]]
@@ -63,7 +63,7 @@ def _body_text(body: dict[str, Any]) -> str:
         return f"mesh, {body['dimension']}-D, {counted(body['points'], 'node')}"
     names = {key: key for key in ("radius", "width", "height", "thickness")}
     shape = body["shape"]
-    if "thickness" in body and shape in _SOLIDS:
-        shape, renamed_keys = _SOLIDS[shape]
+    if "thickness" in body and shape in _SOLID_NAMES_AND_SIZE_KEYS:
+        shape, renamed_keys = _SOLID_NAMES_AND_SIZE_KEYS[shape]
         names |= renamed_keys
     return ", ".join([shape, *(f"{name} {1e3 * body[key]:g} mm" for key, name in names.items() if key in body)])

@@ -9,22 +9,22 @@ import typer
 
 from jeit.cli.applications import check_method, image_by_network
 from jeit.cli.options import (
-    NETWORK,
-    AsIs,
-    Contact,
-    Data,
-    Description,
-    Format,
-    Frame,
-    Key,
-    Model,
-    Nodes,
-    Quiet,
-    Reference,
-    ReferenceFrames,
-    ReferenceKey,
+    NETWORK_METHOD,
+    AsIsOption,
+    ContactOption,
+    DataArgument,
+    DescriptionOption,
+    FormatOption,
+    FrameOption,
+    KeyOption,
+    ModelOption,
+    NodesOption,
+    QuietOption,
+    ReferenceArgument,
+    ReferenceFramesOption,
+    ReferenceKeyOption,
+    convert_to_number_if_possible,
     make_folder,
-    number_or_name,
     read_pair,
 )
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 def reconstruct(
-    data: Data,
+    data: DataArgument,
     output: Annotated[
         Path,
         typer.Option(
@@ -44,12 +44,12 @@ def reconstruct(
             show_default=False,
         ),
     ],
-    reference: Reference = None,
-    reference_frames: ReferenceFrames = None,
-    key: Key = None,
-    reference_key: ReferenceKey = None,
-    format: Format = None,
-    description: Description = None,
+    reference: ReferenceArgument = None,
+    reference_frames: ReferenceFramesOption = None,
+    key: KeyOption = None,
+    reference_key: ReferenceKeyOption = None,
+    format: FormatOption = None,
+    description: DescriptionOption = None,
     method: Annotated[
         str | None,
         typer.Option(
@@ -75,7 +75,7 @@ def reconstruct(
             metavar="VALUE|RULE",
         ),
     ] = None,
-    contact: Contact = None,
+    contact: ContactOption = None,
     segment: Annotated[
         bool,
         typer.Option(
@@ -90,11 +90,11 @@ def reconstruct(
             "height; either (default)."
         ),
     ] = None,
-    num_points: Nodes = None,
-    frame: Frame = None,
-    as_is: AsIs = False,
-    model: Model = None,
-    quiet: Quiet = False,
+    num_points: NodesOption = None,
+    frame: FrameOption = None,
+    as_is: AsIsOption = False,
+    model: ModelOption = None,
+    quiet: QuietOption = False,
 ) -> None:
     """Image the change from REFERENCE to DATA; writes image.png, image.npz, report.json; for solids image.vtu.
 
@@ -102,8 +102,8 @@ def reconstruct(
 
     In Python: `jeit.image_difference` and `jeit.report.write_image`; `jeit.reconstruct` makes absolute images.
     """
-    if method == NETWORK or model is not None:
-        unused = {
+    if method == NETWORK_METHOD or model is not None:
+        unused_options = {
             "prior": prior,
             "hyperparameter": hyperparameter,
             "contact": contact,
@@ -115,18 +115,18 @@ def reconstruct(
             "key": key,
             "reference-key": reference_key,
         }
-        frame_selector = None if frame is None else number_or_name(frame, int)
+        frame_selector = None if frame is None else convert_to_number_if_possible(frame, int)
         image_by_network(
             model,
             (data, reference, format, description),
             output,
             method=method,
             frame=frame_selector,
-            unused_options=unused,
+            unused_options=unused_options,
             quiet=quiet,
         )
         return
-    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.cli.console import Steps, plain_console, print_written_files
     from jeit.imaging import METHODS, ImagingSettings, image_difference
     from jeit.imaging.method import AUTO
     from jeit.report import write_image
@@ -136,7 +136,7 @@ def reconstruct(
         "segment": segment,
         "method": method,
         "prior": prior,
-        "hyperparameter": None if hyperparameter is None else number_or_name(hyperparameter),
+        "hyperparameter": None if hyperparameter is None else convert_to_number_if_possible(hyperparameter),
         "contact": contact,
         "bodies": bodies,
         "num_points": num_points,
@@ -155,21 +155,21 @@ def reconstruct(
         measurement, reference_measurement = read_pair(
             data, reference, reference_frames, format, description, (key, reference_key)
         )
-        frame_number = None if frame is None else number_or_name(frame, int)
+        frame_number = None if frame is None else convert_to_number_if_possible(frame, int)
         result = image_difference(measurement, reference_measurement, settings, frame=frame_number, progress=step)
         step("write")
         write_image(result, output)
     if not quiet:
-        show(console, result, frame_given=frame is not None)
+        print_imaging_result(console, result, frame_given=frame is not None)
         solid_files = ("image.vtu",) if result.mesh.dimension == 3 else ()
-        say_written(console, output / "image.png", "image.npz", "report.json", *solid_files)
+        print_written_files(console, output / "image.png", "image.npz", "report.json", *solid_files)
 
 
 # Fraction of the difference between frame and reference above which rounding of the voltages is reported.
-_MIN_ROUNDING = 2e-3
+_MIN_REPORTED_ROUNDING_ERROR = 2e-3
 
 
-def show(console, result: "ImagedDifference", *, frame_given: bool = False) -> None:
+def print_imaging_result(console, result: "ImagedDifference", *, frame_given: bool = False) -> None:
     """Print the result of imaging; `frame_given`: whether the user selected the frame."""
     import numpy as np
 
@@ -198,7 +198,7 @@ def show(console, result: "ImagedDifference", *, frame_given: bool = False) -> N
         ("method", f"{result.settings.method}, hyperparameter {choice_text}"),
         ("mesh", f"{counted(result.mesh.num_points, 'node')}, {counted(result.mesh.num_cells, 'cell')}"),
     ]
-    if result.quality.rounding > _MIN_ROUNDING:
+    if result.quality.rounding > _MIN_REPORTED_ROUNDING_ERROR:
         rows.insert(3, ("rounding", f"{percent(result.quality.rounding)} of the difference: voltages have few digits"))
     if calibration.note:
         rows.insert(1, ("note", calibration.note))
@@ -243,7 +243,7 @@ def bodies_text(shapes: "ShapeReconstruction", dimension: int) -> str:
     from jeit.inverse.shapes import Ellipsoid
 
     noun = "surface" if dimension == 3 else "outline"
-    ghosts_text = f"; {counted(len(shapes.doubtful), 'ghost')} left out" if shapes.doubtful else ""
+    left_out_bodies_text = f"; {counted(len(shapes.doubtful), 'ghost')} left out" if shapes.doubtful else ""
     num_undetermined_contrasts = sum(not body.contrast_is_determined for body in shapes.bodies)
     num_columns = sum(isinstance(body, Ellipsoid) and body.column for body in shapes.bodies)
     columns_text = f", {counted(num_columns, 'column')} through the whole height" if num_columns else ""
@@ -254,9 +254,9 @@ def bodies_text(shapes: "ShapeReconstruction", dimension: int) -> str:
     )
     shares_material = any(isinstance(body, Ellipsoid) and body.alike for body in shapes.bodies)
     material_text = ", as of one material: the data do not contradict it" if shares_material else ""
-    drift_text = f"the background has drifted by {percent(shapes.drift)}"
+    background_drift_text = f"the background has drifted by {percent(shapes.drift)}"
     fitted_text = f"{counted(len(shapes.bodies), noun)} fitted{columns_text}"
-    return f"{fitted_text}{material_text}{ghosts_text}{assumed_text}; {drift_text}"
+    return f"{fitted_text}{material_text}{left_out_bodies_text}{assumed_text}; {background_drift_text}"
 
 
 def _frame_text(result: "ImagedDifference", frame_given: bool) -> str:

@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from jeit.cli.options import (
-    AsIs,
-    Contact,
-    Data,
-    Description,
-    Format,
-    Key,
-    Nodes,
-    Quiet,
-    ReferenceFrames,
-    ReferenceKey,
+    AsIsOption,
+    ContactOption,
+    DataArgument,
+    DescriptionOption,
+    FormatOption,
+    KeyOption,
+    NodesOption,
+    QuietOption,
+    ReferenceFramesOption,
+    ReferenceKeyOption,
+    convert_to_number_if_possible,
     make_folder,
-    naming_options,
-    number_or_name,
+    naming_options_in_errors,
     read_pair,
 )
 
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from jeit.mesh import Mesh
 
 # Maximum number of refused frames that are printed.
-_MAX_NAMED = 8
+_MAX_PRINTED_FRAMES = 8
 
 
 def series(
-    data: Data,
+    data: DataArgument,
     output: Annotated[
         Path,
         typer.Option(
@@ -47,7 +47,7 @@ def series(
             help="Measured file of the undisturbed body; DATA's frame 'reference', or its mean, unless given."
         ),
     ] = None,
-    reference_frames: ReferenceFrames = None,
+    reference_frames: ReferenceFramesOption = None,
     frequency: Annotated[
         list[str] | None,
         typer.Option(
@@ -67,20 +67,20 @@ def series(
     rate: Annotated[
         float | None, typer.Option(help="Frames in a second, where neither DATA nor its description says so.")
     ] = None,
-    key: Key = None,
-    reference_key: ReferenceKey = None,
-    format: Format = None,
-    description: Description = None,
+    key: KeyOption = None,
+    reference_key: ReferenceKeyOption = None,
+    format: FormatOption = None,
+    description: DescriptionOption = None,
     hyperparameter: Annotated[
         str | None, typer.Option(help="A number, or the rule that chooses it (default noise-figure).")
     ] = None,
-    contact: Contact = None,
-    num_points: Nodes = None,
+    contact: ContactOption = None,
+    num_points: NodesOption = None,
     film: Annotated[
         str, typer.Option(help="Film's name: .gif, or .mp4 where ffmpeg is installed; none for none (default).")
     ] = "none",
-    as_is: AsIs = False,
-    quiet: Quiet = False,
+    as_is: AsIsOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Image all frames of DATA against one reference, linearly and at once, and analyse the changes over time.
 
@@ -92,14 +92,14 @@ def series(
     import numpy as np
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps, format_with_unit, plain_console, say_written
+    from jeit.cli.console import Steps, format_with_unit, plain_console, print_written_files
     from jeit.image import oscillation
     from jeit.imaging import ImagingSettings, image_sequence
     from jeit.report import write_series
     from jeit.report.series import SERIES_FILES, check_film
 
     setting_values = {
-        "hyperparameter": None if hyperparameter is None else number_or_name(hyperparameter),
+        "hyperparameter": None if hyperparameter is None else convert_to_number_if_possible(hyperparameter),
         "contact": contact,
         "num_points": num_points,
         "as_is": as_is,
@@ -108,7 +108,7 @@ def series(
         "one-step", **{name: value for name, value in setting_values.items() if value is not None}
     )
     film_name = None if film == "none" else film
-    with naming_options({"film": "--film"}):
+    with naming_options_in_errors({"film": "--film"}):
         films = () if film_name is None else (check_film(film_name),)
     bands = [_parse_band(band_text) for band_text in frequency or ()]
     parsed_regions = {region_text: _parse_region(region_text) for region_text in region or ()}
@@ -119,9 +119,9 @@ def series(
         measured, reference_measurement = read_pair(
             data, reference, reference_frames, format, description, (key, reference_key)
         )
-        with naming_options({"rate": "--rate"}):
+        with naming_options_in_errors({"rate": "--rate"}):
             measured = measured if rate is None else measured.at_rate(rate)
-        with naming_options({"frequency": "--frequency"}):
+        with naming_options_in_errors({"frequency": "--frequency"}):
             if measured.times is None and bands:
                 raise ValueError(f"frequency: '{measured.name}' says no times; give --rate, in frames a second.")
             if measured.times is not None:
@@ -129,19 +129,21 @@ def series(
                     oscillation(np.zeros((measured.num_frames, 1)), measured.times, band)
         regions = {text: partial(_region_mask, text, parsed) for text, parsed in parsed_regions.items()}
         sequence = image_sequence(measured, reference_measurement, settings, regions=regions, progress=step)
-        with naming_options({"frequency": "--frequency"}):
+        with naming_options_in_errors({"frequency": "--frequency"}):
             oscillations = [oscillation(sequence.series.changes, sequence.series.times, band) for band in bands]
         step("write")
         report = write_series(sequence, output, regions=sequence.regions, oscillations=oscillations, film=film_name)
     if quiet:
         return
     frames, unit = counted(report["frames"], "frame"), report["unit"]
-    rate_text = "" if report["frame_rate"] is None else f", {report['frame_rate']:.4g} a second"
-    untimed = "" if measured.times is not None else "; no times are known (--rate gives them), frames are numbered"
-    console.print(f"\n{frames}{rate_text}, {report['refused']} refused{untimed}")
-    for number, reason in sorted(sequence.reasons.items())[:_MAX_NAMED]:
+    frame_rate_text = "" if report["frame_rate"] is None else f", {report['frame_rate']:.4g} a second"
+    missing_times_text = (
+        "" if measured.times is not None else "; no times are known (--rate gives them), frames are numbered"
+    )
+    console.print(f"\n{frames}{frame_rate_text}, {report['refused']} refused{missing_times_text}")
+    for number, reason in sorted(sequence.reasons.items())[:_MAX_PRINTED_FRAMES]:
         console.print(f"  frame {number}: refused. {reason}", soft_wrap=True, markup=False)
-    if (num_more := len(sequence.reasons) - _MAX_NAMED) > 0:
+    if (num_more := len(sequence.reasons) - _MAX_PRINTED_FRAMES) > 0:
         console.print(f"  {num_more} more are in report.json.")
     for note in dict.fromkeys(
         (*sequence.prepared.measurement.notes, *(() if reference_measurement is None else reference_measurement.notes))
@@ -154,7 +156,7 @@ def series(
         for name, component in entry["regions"].items():
             sizes = f"{format_with_unit(component['amplitude'], unit)} ± {format_with_unit(component['noise'], unit)}"
             console.print(f"  {name}: amplitude {sizes}, phase {component['phase_degrees']:.0f}°", markup=False)
-    say_written(console, output / "series.png", "series.npz", "regions.csv", "report.json", *films)
+    print_written_files(console, output / "series.png", "series.npz", "regions.csv", "report.json", *films)
 
 
 def _parse_band(text: str) -> "float | tuple[float, float]":

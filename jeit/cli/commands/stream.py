@@ -10,19 +10,19 @@ import typer
 
 from jeit.cli.applications import check_method, image_by_network
 from jeit.cli.options import (
-    NETWORK,
-    AsIs,
-    Contact,
-    Description,
-    Format,
-    Key,
-    Model,
-    Quiet,
-    ReferenceFrames,
-    ReferenceKey,
+    NETWORK_METHOD,
+    AsIsOption,
+    ContactOption,
+    DescriptionOption,
+    FormatOption,
+    KeyOption,
+    ModelOption,
+    QuietOption,
+    ReferenceFramesOption,
+    ReferenceKeyOption,
+    convert_to_number_if_possible,
     make_folder,
-    naming_options,
-    number_or_name,
+    naming_options_in_errors,
     read_file,
     read_pair,
     reference_of_frames,
@@ -49,11 +49,11 @@ def stream(
             show_default=False,
         ),
     ] = None,
-    reference_frames: ReferenceFrames = None,
-    key: Key = None,
-    reference_key: ReferenceKey = None,
-    format: Format = None,
-    description: Description = None,
+    reference_frames: ReferenceFramesOption = None,
+    key: KeyOption = None,
+    reference_key: ReferenceKeyOption = None,
+    format: FormatOption = None,
+    description: DescriptionOption = None,
     method: Annotated[
         str | None,
         typer.Option(
@@ -72,9 +72,9 @@ def stream(
             help="Frames over which an image changes: smooths in time (Kalman). 0 (default): every frame alone."
         ),
     ] = None,
-    contact: Contact = None,
+    contact: ContactOption = None,
     num_points: Annotated[int | None, typer.Option(help="Nodes of the mesh, about (default 1200).")] = None,
-    as_is: AsIs = False,
+    as_is: AsIsOption = False,
     film: Annotated[
         str,
         typer.Option(help="Film's name: .gif, or .mp4 where ffmpeg is installed (default film.gif); none for none."),
@@ -85,8 +85,8 @@ def stream(
             help="Frames in a second: times in place of numbers, and the film's pace (default: what DATA says, or 10)."
         ),
     ] = None,
-    model: Model = None,
-    quiet: Quiet = False,
+    model: ModelOption = None,
+    quiet: QuietOption = False,
 ) -> None:
     """Image every frame of DATA as it arrives; faulty frames are refused with a reason, and the stream continues.
     If the voltages look as if electrodes on the edge of a sheet had moved, images show the rest of the difference.
@@ -97,8 +97,8 @@ def stream(
     exit status is 1. With --method network, the indentation depth of a skin is imaged: frames.csv, depth.npz, depth.png
     and report.json.
     """
-    if method == NETWORK or model is not None:
-        unused = {
+    if method == NETWORK_METHOD or model is not None:
+        unused_options = {
             "hyperparameter": hyperparameter,
             "steps": steps,
             "memory": memory,
@@ -110,17 +110,17 @@ def stream(
             "reference-frames": reference_frames,
         }
         if reference is None:
-            raise ValueError(f"--reference is needed with --method {NETWORK}.")
+            raise ValueError(f"--reference is needed with --method {NETWORK_METHOD}.")
         setting_values = data if data == "-" else Path(data), reference, format, description
         image_by_network(
-            model, setting_values, output, method=method, unused_options=unused, quiet=quiet, streamed=True
+            model, setting_values, output, method=method, unused_options=unused_options, quiet=quiet, streamed=True
         )
         return
     import numpy as np
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps, format_with_unit, plain_console, say_written
-    from jeit.cli.streams import FrameCounter, Stopping
+    from jeit.cli.console import Steps, format_with_unit, plain_console, print_written_files
+    from jeit.cli.streams import FrameCounter, StreamStopper
     from jeit.data.formats.lines import LineParser, read_lines
     from jeit.data.screening import mask_spikes
     from jeit.imaging.doubts import doubts_of_data
@@ -136,16 +136,16 @@ def stream(
     setting_values = {
         "solver": method,
         "max_steps": steps,
-        "hyperparameter": None if hyperparameter is None else number_or_name(hyperparameter),
+        "hyperparameter": None if hyperparameter is None else convert_to_number_if_possible(hyperparameter),
         "memory": memory,
         "contact": contact,
         "num_points": num_points,
         "as_is": as_is,
     }
-    with naming_options({"solver": "--method", "max_steps": "--steps"}):
+    with naming_options_in_errors({"solver": "--method", "max_steps": "--steps"}):
         settings = StreamSettings(**{name: value for name, value in setting_values.items() if value is not None})
     film_name = None if film == "none" else film
-    with naming_options({"film": "--film"}):
+    with naming_options_in_errors({"film": "--film"}):
         films = () if film_name is None else (check_film(film_name),)
     if reference is None and (reference_frames is None or data == "-"):
         raise ValueError(
@@ -153,7 +153,7 @@ def stream(
             + ("." if data == "-" else ", or --reference-frames, the frames of DATA that are of it, such as 0-17.")
         )
     console = plain_console()
-    with Stopping() as stopping:
+    with StreamStopper() as stopping:
         make_folder(output, ("frames.csv", "images.npz", "frames.png", *films))
         with Steps(console, quiet=quiet) as step:
             step("read")
@@ -169,8 +169,10 @@ def stream(
                 measured = reference_measurement
             else:
                 keys = (key, reference_key)
-                measured, base = read_pair(Path(data), reference, reference_frames, format, description, keys)
-                reference_measurement = measured if base is None else base
+                measured, base_measurement = read_pair(
+                    Path(data), reference, reference_frames, format, description, keys
+                )
+                reference_measurement = measured if base_measurement is None else base_measurement
             imager, calibration = prepare_imager(reference_measurement, settings, measurement=measured, progress=step)
         if data == "-":
             frames, num_frames = (
@@ -187,7 +189,7 @@ def stream(
         base_frame = reference_measurement.mean_frame()
         for doubt in () if quiet else doubts_of_data(base_frame, base_frame, calibration):
             console.print(f"  doubt: {doubt}", soft_wrap=True, markup=False)
-        with naming_options({"rate": "--rate"}), Steps(console, quiet=quiet) as step:
+        with naming_options_in_errors({"rate": "--rate"}), Steps(console, quiet=quiet) as step:
             step("image")
             frame_counter = FrameCounter(step, num_frames)
 
@@ -203,7 +205,7 @@ def stream(
                     console.print(f"  doubt: from frame {number} on, {change.doubt}", soft_wrap=True, markup=False)
 
             drawing = stopping.drawing_reporter(PICTURES, step)
-            arriving_frames = stopping.until(frames)
+            arriving_frames = stopping.frames_until_signal(frames)
             images = (
                 stream_as_is(imager, arriving_frames)
                 if settings.as_is
@@ -234,4 +236,4 @@ def stream(
     console.print(f"\n{counted(written_stream.number, 'frame')}: {counts_text}; background {background}")
     median, upper_quantile = 1e3 * np.quantile(written_stream.latency, (0.5, 0.99))
     console.print(f"latency: median {median:.2f} ms, 99 % within {upper_quantile:.2f} ms")
-    say_written(console, output / "frames.csv", "images.npz", "frames.png", *films)
+    print_written_files(console, output / "frames.csv", "images.npz", "frames.png", *films)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from jeit.cli.options import Quiet, make_folder, naming_options
+from jeit.cli.options import QuietOption, make_folder, naming_options_in_errors
 
 
 def view(
@@ -32,7 +32,7 @@ def view(
     ] = None,
     axis: Annotated[str, typer.Option(help="Axis that the grid of slices is across: x, y or z.")] = "z",
     slices: Annotated[int, typer.Option(help="Slices in the grid.")] = 9,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """View IMAGE in a window if PyVista and a display are available, else write pictures to a folder 'view' beside it.
 
@@ -41,7 +41,7 @@ def view(
 
     In Python: `jeit.report.read_image` and `jeit.report.write_views`; `jeit.plot.view_solid` opens the window.
     """
-    from jeit.cli.console import plain_console, say_written
+    from jeit.cli.console import plain_console, print_written_files
     from jeit.plot.solid import interactive
     from jeit.plot.solid.scene import Camera
     from jeit.report import read_image, write_views
@@ -60,10 +60,10 @@ def view(
             console.print(f"  pictures, not a window: {reason}", highlight=False, markup=False)
     folder = image.parent / "view" if output is None else output
     make_folder(folder, VIEW_FILES)
-    with naming_options({"levels": "--level", "at": "--slices", "plane": "--plane-mm"}):
+    with naming_options_in_errors({"levels": "--level", "at": "--slices", "plane": "--plane-mm"}):
         names = write_views(saved, folder, camera=camera, levels=levels, planes=planes, axis=axis, slices=slices)
     if not quiet:
-        say_written(console, folder / names[0], *names[1:])
+        print_written_files(console, folder / names[0], *names[1:])
 
 
 def _plane(text: str):

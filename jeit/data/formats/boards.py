@@ -61,8 +61,8 @@ class Cn0565:
     def recognises(cls, path: Path) -> bool:
         """Whether a file contains a frame of a CN0565 kit near its start."""
         with path.open("rb") as file:
-            head = file.read(cls._HEAD_BYTES)
-        return any(len(words) >= cls._MIN_NUMBERS for words in cls._frames(head))
+            first_bytes = file.read(cls._HEAD_BYTES)
+        return any(len(words) >= cls._MIN_NUMBERS for words in cls._frames(first_bytes))
 
     @classmethod
     def read(
@@ -114,12 +114,12 @@ class Cn0565:
             )
         num_electrodes = next((count for count in cls._ELECTRODE_COUNTS if count * (count - 3) == num_voltages), None)
         if num_electrodes is None:
-            usual_counts = names_text(
+            usual_counts_text = names_text(
                 [f"{count * (count - 3)} ({count} electrodes)" for count in cls._ELECTRODE_COUNTS]
             )
             raise ValueError(
                 f"{path.name}: {num_voltages} voltages in a frame; with force and sense distance 1 they are "
-                f"{usual_counts}. Give a description with [protocol]: {cls._DISTANCE_HINT}."
+                f"{usual_counts_text}. Give a description with [protocol]: {cls._DISTANCE_HINT}."
             )
         table: dict[str, Any] = {
             "kind": "adjacent",
@@ -150,7 +150,7 @@ class Cn0565:
             )
         notes = []
         if len(frames) > 1 and lengths[-1] < frame_length:
-            notes.append(_cut_off_note(lengths[-1]))
+            notes.append(_truncation_note(lengths[-1]))
             del frames[-1]
         values = np.full((len(frames), frame_length), np.nan)
         for frame_index, frame in enumerate(frames):
@@ -213,12 +213,12 @@ class OpenEit:
         """Whether a file has the word "magnitudes" near its start, and frames whose length belongs to a protocol of the
         OpenEIT firmware."""
         with path.open("rb") as file:
-            head = file.read(cls._WORD_SEARCH_BYTES)
-            first_word = cls._FRAME_WORD.search(head)
+            first_bytes = file.read(cls._WORD_SEARCH_BYTES)
+            first_word = cls._FRAME_WORD.search(first_bytes)
             if first_word is None:
                 return False
-            head += file.read(cls._HEAD_BYTES - len(head))
-        return _usual_length([len(frame) for frame in cls.parse_frames(head)]) in cls._PROTOCOL_TABLES
+            first_bytes += file.read(cls._HEAD_BYTES - len(first_bytes))
+        return _usual_length([len(frame) for frame in cls.parse_frames(first_bytes)]) in cls._PROTOCOL_TABLES
 
     @classmethod
     def read(
@@ -263,7 +263,7 @@ class OpenEit:
             return False
         drives = (np.sign(np.asarray(protocol.channel_drive)) for protocol in (first_protocol, second_protocol))
         measurements = (np.asarray(protocol.channel_measurement) for protocol in (first_protocol, second_protocol))
-        return all((ours == theirs).all() for ours, theirs in (drives, measurements))
+        return all((first == second).all() for first, second in (drives, measurements))
 
     @classmethod
     def numbers(cls, path: Path) -> tuple[Float[np.ndarray, "F M"], tuple[str, ...]]:
@@ -280,12 +280,12 @@ class OpenEit:
         if not frames:
             raise ValueError(f"{path.name}: no frame begins with 'magnitudes:', as those of an OpenEIT device do.")
         if frame_length not in cls._PROTOCOL_TABLES:
-            known_counts = names_text(
+            known_counts_text = names_text(
                 [f"{channels} ({table['number']} electrodes)" for channels, table in cls._PROTOCOL_TABLES.items()]
             )
             raise ValueError(
-                f"{path.name}: most frames have {counted(frame_length, 'number')}; the firmware sends {known_counts}. "
-                "Read it as a table."
+                f"{path.name}: most frames have {counted(frame_length, 'number')}; the firmware sends "
+                f"{known_counts_text}. Read it as a table."
             )
         if other_frame_lengths := [
             number for number in cls._PROTOCOL_TABLES if number != frame_length and lengths.count(number) > 1
@@ -301,7 +301,7 @@ class OpenEit:
         if prefix:
             notes.append(f"{counted(len(prefix), 'character')} before the first 'magnitudes:' are left out.")
         if len(frames) > 1 and lengths[-1] < frame_length:
-            notes.append(_cut_off_note(lengths[-1]))
+            notes.append(_truncation_note(lengths[-1]))
             del frames[-1], lengths[-1]
         elif data[-1:].isdigit() and lengths[-1] == frame_length:
             frames[-1][-1] = np.nan
@@ -309,19 +309,19 @@ class OpenEit:
         # Frames between which the word "magnitudes" is lost appear as one long frame; its length shows the number of
         # lost frames, so that the indices of later frames do not change.
         frame_indices = np.cumsum([0, *(max(1, round(length / frame_length)) for length in lengths)])
-        is_complete = np.zeros(frame_indices[-1], bool)
-        is_complete[
+        is_complete_frame = np.zeros(frame_indices[-1], bool)
+        is_complete_frame[
             [
                 frame_index
                 for frame_index, length in zip(frame_indices[:-1], lengths, strict=True)
                 if length == frame_length
             ]
         ] = True
-        values = np.full((len(is_complete), frame_length), np.nan)
-        values[is_complete] = [frame for frame in frames if len(frame) == frame_length]
-        notes += _notes_on_damage(~is_complete)
+        values = np.full((len(is_complete_frame), frame_length), np.nan)
+        values[is_complete_frame] = [frame for frame in frames if len(frame) == frame_length]
+        notes += _notes_on_damage(~is_complete_frame)
         values = np.where(values == 0, np.nan, values)
-        if num_missing := int(np.isnan(values[is_complete]).sum()):
+        if num_missing := int(np.isnan(values[is_complete_frame]).sum()):
             notes.append(f"{counted(num_missing, 'reading')} of zero, as of an open circuit, or illegible: masked.")
         return values, tuple(notes)
 
@@ -369,7 +369,7 @@ def _usual_length(lengths: list[int]) -> int:
     return Counter(lengths[:-1] or lengths).most_common(1)[0][0] if lengths else 0
 
 
-def _cut_off_note(length: int) -> str:
+def _truncation_note(length: int) -> str:
     return f"the last frame is cut off after {counted(length, 'number')}, and left out."
 
 

@@ -196,12 +196,12 @@ class Goettingen:
         if path.suffix.lower() != ".get":
             return False
         with path.open("rb") as file:
-            head = file.read(cls._FRAME_BYTES)
-        if head.startswith(_DRAEGER_MARK) or len(head) < cls._FRAME_BYTES:
+            first_bytes = file.read(cls._FRAME_BYTES)
+        if first_bytes.startswith(_DRAEGER_MARK) or len(first_bytes) < cls._FRAME_BYTES:
             return True
-        if all(byte in cls._TEXT_BYTES for byte in head):
+        if all(byte in cls._TEXT_BYTES for byte in first_bytes):
             return False
-        first_frame = np.frombuffer(head, "<f4")
+        first_frame = np.frombuffer(first_bytes, "<f4")
         finite_values = first_frame[np.isfinite(first_frame)]
         return len(finite_values) > cls._MIN_FINITE_SHARE * len(first_frame) and bool(
             (np.abs(finite_values) < cls._MAX_VALUE).all()

@@ -22,7 +22,7 @@ from jeit.files import matlab
 from jeit.protocol import Protocol, from_channels
 
 DESCRIPTION = "EIDORS-style vectors (.mat with stim, meas, meas_stim, or any with a TOML description)"
-PATTERN = ("stim", "meas", "meas_stim")
+PATTERN_NAMES = ("stim", "meas", "meas_stim")
 # Usual names of homogeneous (reference) voltage vectors and of inhomogeneous voltage vectors.
 REFERENCE_NAMES = ("v_h", "vh")
 OBJECT_NAMES = ("v_i", "vi")
@@ -30,16 +30,16 @@ OBJECT_NAMES = ("v_i", "vi")
 
 def recognises(path: Path) -> bool:
     """Whether a file is a .mat file that contains stimulation and measurement patterns of EIDORS."""
-    return path.suffix.lower() == ".mat" and set(PATTERN) <= matlab.variable_names(path)
+    return path.suffix.lower() == ".mat" and set(PATTERN_NAMES) <= matlab.variable_names(path)
 
 
 def find_description(path: Path) -> Path | None:
     """The description beside a file: a TOML file of the same name, or `description.toml` in the same folder if the file
     contains no patterns; None if there is none."""
-    sibling, shared = path.with_suffix(".toml"), path.parent / "description.toml"
-    if sibling.is_file():
-        return sibling
-    return shared if shared.is_file() and not recognises(path) else None
+    sibling_path, folder_path = path.with_suffix(".toml"), path.parent / "description.toml"
+    if sibling_path.is_file():
+        return sibling_path
+    return folder_path if folder_path.is_file() and not recognises(path) else None
 
 
 def read(
@@ -68,7 +68,7 @@ def read(
     stored_patterns = (
         {}
         if sensor_description.protocol_section is not None or (description_source is None and like)
-        else matlab.load(path, *PATTERN)
+        else matlab.load(path, *PATTERN_NAMES)
     )
     protocols = sensor_description.protocols(path) or (
         [(_stored_protocol(stored_patterns, path), "")] if stored_patterns else []
@@ -112,17 +112,17 @@ def _keys(
         return (reference_names[0], object_names[0]), ("reference", "object"), ()
     if reference_names or object_names:
         return ((reference_names + object_names)[0],), (), ()
-    shapes = {name: shape for name, shape in shapes.items() if name not in PATTERN}
+    shapes = {name: shape for name, shape in shapes.items() if name not in PATTERN_NAMES}
     fitting_shapes = {
         name: shape for name, shape in shapes.items() if set(shape) & set(counts) or math.prod(shape) in counts
     }
     if len(fitting_shapes) == 1:
         (name,) = fitting_shapes
         return (name,), (), (f"the frames are those of {name!r}.",)
-    preamble = "as many numbers as a frame's are in" if fitting_shapes else "there are"
+    refusal_beginning = "as many numbers as a frame's are in" if fitting_shapes else "there are"
     usual_names = ", ".join(REFERENCE_NAMES + OBJECT_NAMES)
     raise ValueError(
-        f"{path.name}: none of {usual_names} is there; {preamble} {_shapes_text(fitting_shapes or shapes)}. "
+        f"{path.name}: none of {usual_names} is there; {refusal_beginning} {_shapes_text(fitting_shapes or shapes)}. "
         "Name the array of frames by key=, or by [data] keys in the description; --reference-key names that of the "
         "reference."
     )
@@ -137,14 +137,14 @@ def _shapes_text(shapes: dict[str, tuple[int, ...]]) -> str:
 
 
 def _stored_protocol(variables: dict, path: Path) -> Protocol:
-    missing_keys = [key for key in PATTERN if key not in variables]
+    missing_keys = [key for key in PATTERN_NAMES if key not in variables]
     if missing_keys:
         raise ValueError(
             f"{path.name} does not say what was driven and measured: '{missing_keys[0]}' is missing, and no "
             "description gives a [protocol]. Save stim (L, S), meas (M, L) and meas_stim (M) with the data, "
             "or write a description."
         )
-    stim, meas, stimulation_index = (matlab.numbers(variables, key, path) for key in PATTERN)
+    stim, meas, stimulation_index = (matlab.numbers(variables, key, path) for key in PATTERN_NAMES)
     stimulation_index = stimulation_index.ravel()
     if np.any(stimulation_index != np.round(stimulation_index)):
         raise ValueError(f"{path.name}: meas_stim must hold whole numbers, the drive of each measurement, from 1.")

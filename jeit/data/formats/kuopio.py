@@ -109,8 +109,8 @@ class Ktc2023:
 
         Raises `ValueError` for a file whose arrays have other shapes.
         """
-        suffix = "" if "Inj" in matlab.variable_names(path) else "ref"
-        keys = f"Inj{suffix}", f"Uel{suffix}", "Mpat"
+        variable_suffix = "" if "Inj" in matlab.variable_names(path) else "ref"
+        keys = f"Inj{variable_suffix}", f"Uel{variable_suffix}", "Mpat"
         variables = matlab.load(path, *keys)
         currents, voltages, differences = (matlab.numbers(variables, key, path) for key in keys)
         num_electrodes, num_drives = currents.shape

@@ -21,7 +21,7 @@ from jeit.data.formats.text import LineNumbers
 
 MAX_LINE_BYTES = 2**18
 """Maximum length of a line in bytes. Longer lines are truncated."""
-_LINE_ENDS = re.compile(rb"[\r\n]")
+_LINE_END_PATTERN = re.compile(rb"[\r\n]")
 # Some OpenEIT devices send no line ends, so a frame begins at the word "magnitudes".
 _FRAME_WORD = re.compile(rb"magnitudes\s{0,40}:", re.IGNORECASE)
 _COMMENT_PREFIXES = ("#", "%", "//")
@@ -30,9 +30,9 @@ _MAX_TEXT_LENGTH = 400
 # Maximum relative difference between the first number of a line and the reference; a larger difference shows that the
 # beginning of the line was lost. Maximum relative difference of a frame that is used to determine the factors from
 # numbers to volts.
-_MAX_DIFFERENCE = 0.5
+_MAX_FIRST_NUMBER_DIFFERENCE = 0.5
 # Maximum number of frames from which the factors are determined.
-_MAX_FACTOR_FRAMES = 20
+_MAX_FRAMES_FOR_FACTORS = 20
 
 
 class LineBuffer:
@@ -50,7 +50,7 @@ class LineBuffer:
         """Append a chunk of bytes to the buffer, and return the lines that are now complete, without line ends and
         empty lines."""
         lines = []
-        *complete_parts, incomplete_line = _LINE_ENDS.split(data)
+        *complete_parts, incomplete_line = _LINE_END_PATTERN.split(data)
         for part in complete_parts:
             self._append_data(part)
             lines += _split_at_words(self.take_incomplete_line())
@@ -108,14 +108,14 @@ class LineParser:
         self._channel_factors, self._num_factor_frames = np.ones(self.channels or 1), 0
         self._known_factors: np.ndarray | None = None
 
-    def begins_whole(self, values: np.ndarray) -> bool:
+    def starts_with_complete_number(self, values: np.ndarray) -> bool:
         """Whether the first number of a frame may be complete. If the connection began within a line, the first number
         may be a part of a number; it then differs much from the first number of the reference. True without a
         reference."""
         reference_frame = self._reference_frame()
         if values.shape != reference_frame.shape or not np.isfinite(reference_frame[0]):
             return True
-        return bool(abs(values[0] - reference_frame[0]) <= _MAX_DIFFERENCE * abs(reference_frame[0]))
+        return bool(abs(values[0] - reference_frame[0]) <= _MAX_FIRST_NUMBER_DIFFERENCE * abs(reference_frame[0]))
 
     @np.errstate(all="ignore")  # numbers that are not voltages may overflow
     def __call__(self, line: bytes) -> Float[np.ndarray, " M"] | str | None:
@@ -145,19 +145,19 @@ class LineParser:
     def _volts_per_number(self, row: np.ndarray, frame_word: str) -> Float[np.ndarray, " M"]:
         """Return the factor from number to volts of each channel. Each frame `row` determines the factors of the
         channels that the reader of files does not mask, until all factors are known."""
-        if self._num_factor_frames >= _MAX_FACTOR_FRAMES:
+        if self._num_factor_frames >= _MAX_FRAMES_FOR_FACTORS:
             return self._channel_factors
         self._num_factor_frames += 1
-        is_nonzero, volts = np.isfinite(row) & (row != 0), row
+        is_nonzero, voltages = np.isfinite(row) & (row != 0), row
         if not is_nonzero.any():
             return self._channel_factors
         try:
-            volts = self._read_volts(row, frame_word)
+            voltages = self._read_volts(row, frame_word)
         except (ValueError, OSError) as error:  # for example a full disk
             self.note = f"The numbers of a line are taken for volts, for as a file they cannot be read: {error}"
-            self._num_factor_frames = _MAX_FACTOR_FRAMES
-        factors = np.where(is_nonzero, volts / np.where(is_nonzero, row, 1.0), np.nan)
-        if self._resembles_reference(volts) or self._num_factor_frames >= _MAX_FACTOR_FRAMES:
+            self._num_factor_frames = _MAX_FRAMES_FOR_FACTORS
+        factors = np.where(is_nonzero, voltages / np.where(is_nonzero, row, 1.0), np.nan)
+        if self._resembles_reference(voltages) or self._num_factor_frames >= _MAX_FRAMES_FOR_FACTORS:
             self._known_factors = (
                 factors
                 if self._known_factors is None
@@ -165,7 +165,7 @@ class LineParser:
             )
             factors = self._known_factors
         if np.isfinite(factors).all() and self._known_factors is not None:
-            self._num_factor_frames = _MAX_FACTOR_FRAMES
+            self._num_factor_frames = _MAX_FRAMES_FOR_FACTORS
         self._channel_factors = self._fill_factors(factors, row)
         return self._channel_factors
 
@@ -191,20 +191,20 @@ class LineParser:
             )
             path.write_text(f"{frame_word}{cells}\n", "utf-8")
             measured = read(path, description=self.description, like=self.reference)
-        volts = np.real(np.asarray(measured.voltages))[0]
-        if volts.shape != row.shape:
-            raise ValueError(f"{len(volts)} channels are read of {len(row)} numbers.")
-        return volts
+        voltages = np.real(np.asarray(measured.voltages))[0]
+        if voltages.shape != row.shape:
+            raise ValueError(f"{len(voltages)} channels are read of {len(row)} numbers.")
+        return voltages
 
-    def _resembles_reference(self, volts: np.ndarray) -> bool:
+    def _resembles_reference(self, voltages: np.ndarray) -> bool:
         """Whether a frame resembles the reference. True without a reference."""
         if self.reference is None:
             return True
         reference_frame = self._reference_frame()
-        is_finite = np.isfinite(reference_frame) & np.isfinite(volts)
+        is_finite = np.isfinite(reference_frame) & np.isfinite(voltages)
         return bool(
-            np.linalg.norm((volts - reference_frame)[is_finite])
-            < _MAX_DIFFERENCE * np.linalg.norm(reference_frame[is_finite])
+            np.linalg.norm((voltages - reference_frame)[is_finite])
+            < _MAX_FIRST_NUMBER_DIFFERENCE * np.linalg.norm(reference_frame[is_finite])
         )
 
     def _reference_frame(self) -> Float[np.ndarray, " M"]:

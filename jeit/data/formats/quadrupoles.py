@@ -313,8 +313,8 @@ def _current_amplitude(
     if known_currents.size:
         return float(np.median(known_currents)), ()
     has_voltages = table.column("u") is not None or table.column("real") is not None
-    assumption = "is assumed" if has_voltages else "multiplies the resistances"
-    return _ASSUMED_CURRENT, (f"the file states no current: {1e3 * _ASSUMED_CURRENT:g} mA {assumption}.",)
+    assumption_text = "is assumed" if has_voltages else "multiplies the resistances"
+    return _ASSUMED_CURRENT, (f"the file states no current: {1e3 * _ASSUMED_CURRENT:g} mA {assumption_text}.",)
 
 
 def _channel_voltages(table: _QuadrupoleTable, amplitude: float) -> Inexact[np.ndarray, " R"]:
@@ -369,17 +369,22 @@ def _arrange_frames(
         drives, measurements = (
             np.asarray(patterns) for patterns in (like.protocol.channel_drive, like.protocol.channel_measurement)
         )
-        like_channels = np.stack(
+        electrodes_of_channels = np.stack(
             [find(patterns, axis=1) for patterns in (drives, measurements) for find in (np.argmax, np.argmin)], axis=1
         )
         channel_numbers = {tuple(channel): k for k, channel in enumerate(channels.tolist())}
-        channel_indices = np.array([channel_numbers.get(tuple(channel), -1) for channel in like_channels.tolist()])
+        channel_indices = np.array(
+            [channel_numbers.get(tuple(channel), -1) for channel in electrodes_of_channels.tolist()]
+        )
         if 2 * (channel_indices >= 0).sum() > len(channel_indices):
             num_excluded = len(channels) - int((channel_indices >= 0).sum())
             notes = (
                 (f"{counted(num_excluded, 'channel')} that '{like.name}' lacks are left out.",) if num_excluded else ()
             )
-            channels, frames = like_channels, np.where(channel_indices >= 0, frames[:, channel_indices], np.nan)
+            channels, frames = (
+                electrodes_of_channels,
+                np.where(channel_indices >= 0, frames[:, channel_indices], np.nan),
+            )
     return channels, frames, times, (*frame_notes, *notes)
 
 

@@ -20,7 +20,7 @@ from jeit.files import check_memory
 from jeit.protocol import Protocol, adjacent
 
 # Maximum bytes of memory per byte of the file: two copies of the numbers, each number twice as long as in the file.
-_MEMORY_FACTOR = 4
+_MEMORY_PER_FILE_BYTE = 4
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class Recording:
 
 
 def read_file_bytes(path: Path) -> bytes:
-    """Content of a file. Raises `TooLarge` if the file exceeds the memory limit."""
-    check_memory(path.name, _MEMORY_FACTOR * path.stat().st_size)
+    """Content of a file. Raises `FileTooLargeError` if the file exceeds the memory limit."""
+    check_memory(path.name, _MEMORY_PER_FILE_BYTE * path.stat().st_size)
     return path.read_bytes()
 
 

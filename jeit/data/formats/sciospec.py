@@ -74,7 +74,7 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
     return create_measurement(path, recording, sensor_description)
 
 
-def read_all(paths: Sequence[Path], description: str | Path | None = None) -> Measurement:
+def read_recordings(paths: Sequence[Path], description: str | Path | None = None) -> Measurement:
     """Read several Sciospec files of the same set-up and join their frames in the order of `paths`.
 
     If each file contains one frame, `[data] frame_rate` of a description determines the times; otherwise the times are
@@ -222,12 +222,12 @@ def _recording(
     with np.errstate(invalid="ignore", over="ignore"):
         voltages = np.einsum("kl,sfl->fsk", rows, potentials).reshape(len(header.frequencies), -1)
     name = f"{len(electrode_indices)} injections, {reading}, {len(electrode_numbers)} electrodes"
-    is_single = len(header.frequencies) == 1
+    is_single_frequency = len(header.frequencies) == 1
     return Recording(
         voltages,
         from_matrices(drive, rows, name=name),
-        times=_times(header.date) if is_single else None,
-        frame_names=() if is_single else tuple(f"{frequency:.6g} Hz" for frequency in header.frequencies),
+        times=_times(header.date) if is_single_frequency else None,
+        frame_names=() if is_single_frequency else tuple(f"{frequency:.6g} Hz" for frequency in header.frequencies),
         notes=tuple(notes),
     )
 

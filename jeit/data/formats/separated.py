@@ -18,11 +18,11 @@ from jaxtyping import Inexact, Int
 from jeit.arguments import counted
 
 # A separator occurs at least so many times in the first lines of a file.
-_MIN_REPEATED = 2
+_MIN_SEPARATOR_REPETITIONS = 2
 # A file is read if it has at least this many complete frames and at most this share of damaged ones.
-_MIN_COMPLETE, _MAX_DAMAGED = 2, 0.1
+_MIN_COMPLETE_FRAMES, _MAX_DAMAGED_FRAME_SHARE = 2, 0.1
 # Maximum number of characters of a separator in a note.
-_MAX_EXAMPLE = 20
+_MAX_SHOWN_SEPARATOR_LENGTH = 20
 
 
 def line_pattern(line: str) -> str:
@@ -35,12 +35,12 @@ def separator_patterns(lines: Sequence[str], holds_numbers: Callable[[str], bool
     them; none if no line holds numbers."""
     text_patterns = [line_pattern(line) for line in lines if not holds_numbers(line)]
     counts = Counter(pattern for pattern in text_patterns if pattern[:1].isalpha())
-    min_count = max(_MIN_REPEATED, 0.5 * max(counts.values(), default=0))
-    repeated = {pattern for pattern, count in counts.items() if count >= min_count}
-    return repeated if len(text_patterns) < len(lines) else set()
+    min_count = max(_MIN_SEPARATOR_REPETITIONS, 0.5 * max(counts.values(), default=0))
+    repeated_patterns = {pattern for pattern, count in counts.items() if count >= min_count}
+    return repeated_patterns if len(text_patterns) < len(lines) else set()
 
 
-class Parts(NamedTuple):
+class RepairedNumbers(NamedTuple):
     """Numbers of a file, with every damaged part replaced by NaN. **Fields**: `numbers`: all numbers; `lengths`: number
     of numbers in each line; `size`: number of numbers in a part; `note`: how many parts are damaged, empty if none
     is."""
@@ -79,21 +79,22 @@ class Separator(NamedTuple):
 
 @dataclass
 class Separators:
-    """The separators between the lines of numbers of a file. **Fields**: `found`: all separators; `unreadable`: lines
-    that contain anything but numbers, counted among the lines of numbers; `fault`: what the first of them contains."""
+    """The separators between the lines of numbers of a file. **Fields**: `found_separators`: all separators;
+    `unreadable`: lines that contain anything but numbers, counted among the lines of numbers; `fault`: what the first
+    of them contains."""
 
-    found: list[Separator] = field(default_factory=list)
+    found_separators: list[Separator] = field(default_factory=list)
     unreadable: list[int] = field(default_factory=list)
     fault: str = ""
 
     @property
     def examples(self) -> list[str]:
         """Text lines between the lines of numbers, shortened for messages."""
-        return [separator.text[:_MAX_EXAMPLE] for separator in self.found if separator.line]
+        return [separator.text[:_MAX_SHOWN_SEPARATOR_LENGTH] for separator in self.found_separators if separator.line]
 
     def complete(
         self, numbers: Inexact[np.ndarray, " n"], lengths: Int[np.ndarray, " lines"], counts: Sequence[int], name: str
-    ) -> Parts:
+    ) -> RepairedNumbers:
         """Replace damaged parts of the file `name` by NaN. Parts are what is between any two separators, or between
         those of one kind, if these are as far apart as one of the `counts`.
 
@@ -104,9 +105,9 @@ class Separators:
         number_ends = np.concatenate([[0], np.cumsum(lengths)])
         partitions = [
             _Partition.create(self._find_part_separators(kind), number_ends)
-            for kind in (None, *dict.fromkeys(line_pattern(separator.text) for separator in self.found))
+            for kind in (None, *dict.fromkeys(line_pattern(separator.text) for separator in self.found_separators))
         ]
-        parts, starts, sizes, size = next((part for part in partitions if part.size in counts), partitions[0])
+        parts_of_file, starts, sizes, size = next((part for part in partitions if part.size in counts), partitions[0])
         line_ends = [*starts[1:], len(lengths)]
         is_unreadable = np.zeros(len(sizes), bool)
         is_unreadable[np.searchsorted(starts, self.unreadable, side="right") - 1] = True
@@ -114,36 +115,40 @@ class Separators:
         is_damaged[-1] &= sizes[-1] > size or is_unreadable[-1]
         damaged_parts = np.flatnonzero(is_damaged)
         if not damaged_parts.size:
-            return Parts(numbers, lengths, size)
+            return RepairedNumbers(numbers, lengths, size)
         complete_parts = np.flatnonzero((sizes == size) & ~is_damaged)
         damage_note = (
             f"{len(damaged_parts)} of {counted(len(sizes), 'part')} between lines such as {self.examples[0]!r} lack "
-            f"numbers or contain something else, the first from line {parts[damaged_parts[0]].position} on"
+            f"numbers or contain something else, the first from line {parts_of_file[damaged_parts[0]].position} on"
         )
-        if len(complete_parts) < _MIN_COMPLETE or len(damaged_parts) > max(1, _MAX_DAMAGED * len(sizes)):
+        if len(complete_parts) < _MIN_COMPLETE_FRAMES or len(damaged_parts) > max(
+            1, _MAX_DAMAGED_FRAME_SHARE * len(sizes)
+        ):
             fault_hint = f" {self.fault}" if self.fault else ""
             raise ValueError(f"{name}: {damage_note}: too many to be left out.{fault_hint}")
         complete_lengths = lengths[starts[complete_parts[0]] : line_ends[complete_parts[0]]]
         number_parts, length_parts = [], []
-        for start, end, damage in zip(starts, line_ends, is_damaged, strict=True):
-            number_parts.append(np.full(size, np.nan) if damage else numbers[number_ends[start] : number_ends[end]])
-            length_parts.append(complete_lengths if damage else lengths[start:end])
+        for start, end, is_part_damaged in zip(starts, line_ends, is_damaged, strict=True):
+            number_parts.append(
+                np.full(size, np.nan) if is_part_damaged else numbers[number_ends[start] : number_ends[end]]
+            )
+            length_parts.append(complete_lengths if is_part_damaged else lengths[start:end])
         damage_note = f"{damage_note}: they are left empty (NaN)."
-        return Parts(np.concatenate(number_parts), np.concatenate(length_parts), size, damage_note)
+        return RepairedNumbers(np.concatenate(number_parts), np.concatenate(length_parts), size, damage_note)
 
     def _find_part_separators(self, kind: str | None) -> list[Separator]:
         """The separators that begin a part: those of one kind, or all. Different separators without numbers between
         them count as one; between equal ones, a part is empty."""
-        parts, last_kind = [Separator(0, 1, "")], ""
-        for separator in self.found:
+        parts, previous_kind = [Separator(0, 1, "")], ""
+        for separator in self.found_separators:
             separator_kind = line_pattern(separator.text)
             if kind not in (None, separator_kind):
                 continue
-            is_later = separator.line > parts[-1].line
-            if is_later or (separator.line and separator_kind == last_kind):
+            is_on_later_line = separator.line > parts[-1].line
+            if is_on_later_line or (separator.line and separator_kind == previous_kind):
                 parts.append(separator)
-            if is_later or not separator.line or not last_kind:
-                last_kind = separator_kind
+            if is_on_later_line or not separator.line or not previous_kind:
+                previous_kind = separator_kind
         return parts
 
 

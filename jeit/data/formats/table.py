@@ -15,7 +15,7 @@ from jeit.arguments import names_text
 from jeit.data.described_protocol import PROTOCOL_ARRAYS
 from jeit.data.description import Description, TableLayout, load_description
 from jeit.data.formats.text import (
-    Frames,
+    TableFrames,
     frames_in_table,
     frames_in_text,
     read_text,
@@ -37,7 +37,7 @@ _STORED_ARRAYS = (*PROTOCOL_ARRAYS, *_TEXT_ARRAYS)
 AXES = ("electrodes", "patterns", "frames")
 """Names of the axes of an array of voltages, in their default order; a description can state a different order."""
 # Maximum mean of the potentials of a current pattern, relative to the largest potential, that counts as zero.
-_MAX_RESIDUAL_MEAN = 0.01
+_MAX_RELATIVE_MEAN_POTENTIAL = 0.01
 
 
 def recognises(path: Path) -> bool:
@@ -110,12 +110,12 @@ def read(
     return replace(measurement, times=times)
 
 
-Protocols = Sequence[tuple[Protocol, str]]
+NamedProtocols = Sequence[tuple[Protocol, str]]
 """Candidate protocols, the described protocol first, each with the options that a description would have to state for
 it."""
 
 
-def channel_counts(protocols: Protocols) -> list[int]:
+def channel_counts(protocols: NamedProtocols) -> list[int]:
     """Numbers of channels of the candidate protocols; the first is the number of channels of the described protocol."""
     return [*dict.fromkeys(protocol.num_measurements for protocol, _ in protocols)]
 
@@ -123,8 +123,8 @@ def channel_counts(protocols: Protocols) -> list[int]:
 def create_measurement_of_frames(
     path: Path,
     sensor_description: Description,
-    file_frames: Frames,
-    protocols: Protocols,
+    file_frames: TableFrames,
+    protocols: NamedProtocols,
     mask: np.ndarray | None = None,
     like: Measurement | None = None,
 ) -> Measurement:
@@ -365,6 +365,8 @@ def subtract_mean(frames: Inexact[np.ndarray, "F M"], num_electrodes: int) -> tu
     mean_potentials = potentials.mean(axis=2, keepdims=True)
     mean_potentials = np.where(np.isfinite(mean_potentials), mean_potentials, 0)
     centred_potentials = potentials - mean_potentials
-    if not (np.abs(mean_potentials) > _MAX_RESIDUAL_MEAN * np.abs(centred_potentials).max(axis=2, keepdims=True)).any():
+    if not (
+        np.abs(mean_potentials) > _MAX_RELATIVE_MEAN_POTENTIAL * np.abs(centred_potentials).max(axis=2, keepdims=True)
+    ).any():
         return frames, 0.0
     return centred_potentials.reshape(frames.shape), float(np.abs(mean_potentials).max())

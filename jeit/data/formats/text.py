@@ -26,15 +26,15 @@ from jeit.data.formats.separated import Separator, Separators, line_pattern, sep
 from jeit.files import check_memory
 
 # Bytes of memory per byte of text: a number may take only two characters, and is stored twice, in eight bytes each.
-_MEMORY_FACTOR = 8
+_MEMORY_PER_FILE_BYTE = 8
 # Number of lines from which separators are detected, and maximum number of lines of a heading.
 _NUM_SAMPLE_LINES, _MAX_HEADING_LINES = 40, 100
 # A word before the numbers of a line; a word that is a line; the end of a number that is cut off.
-_LABEL = re.compile(r"\s{0,40}([A-Za-z_][\w ()/\[\].-]{0,60})[:=]\s{0,40}(?=[-+.\d])")
-_LONE_LABEL = re.compile(r"\s*[A-Za-z_][\w ]{0,60}:\s*")
-_CUT_NUMBER = re.compile(r"[-+]?(\d*[.,]?\d*([eE][-+]?)?|na?)")
-_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
-_COMPLEX = re.compile(r"\(?[-+]?[\d.]+(?:[eE][-+]?\d+)?[-+]{1,2}[\d.]+(?:[eE][-+]?\d+)?[ijIJ]\)?")
+_LINE_LABEL_PATTERN = re.compile(r"\s{0,40}([A-Za-z_][\w ()/\[\].-]{0,60})[:=]\s{0,40}(?=[-+.\d])")
+_LABEL_ONLY_LINE_PATTERN = re.compile(r"\s*[A-Za-z_][\w ]{0,60}:\s*")
+_TRUNCATED_NUMBER_PATTERN = re.compile(r"[-+]?(\d*[.,]?\d*([eE][-+]?)?|na?)")
+_DECIMAL_COMMA_PATTERN = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
+_COMPLEX_NUMBER_PATTERN = re.compile(r"\(?[-+]?[\d.]+(?:[eE][-+]?\d+)?[-+]{1,2}[\d.]+(?:[eE][-+]?\d+)?[ijIJ]\)?")
 # Minimum number of columns for which a first line 0, 1, 2, … counts as column numbers instead of a frame.
 _MIN_NUMBERED_COLUMNS = 8
 _COMMENT_MARKS = ("#", "%", "//")
@@ -43,7 +43,7 @@ _DELIMITER_HINT = (
 )
 
 # Integer times that increase by at least this step may be seconds or milliseconds.
-_MIN_MILLISECOND_STEP = 5
+_MIN_AMBIGUOUS_TIME_STEP = 5
 
 
 class Text(NamedTuple):
@@ -128,7 +128,7 @@ def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = 
     Raises `ValueError`, with the line, for a file that contains anything but numbers or that was cut off. Unreadable
     lines between separator lines are allowed, and refused later unless they can be left out.
     """
-    check_memory(path.name, _MEMORY_FACTOR * path.stat().st_size)
+    check_memory(path.name, _MEMORY_PER_FILE_BYTE * path.stat().st_size)
     num_skipped = skip_rows or 0
     lines = [line for _, line in islice(_content_lines(path, num_skipped), _MAX_HEADING_LINES + _NUM_SAMPLE_LINES)]
     number_format = (
@@ -143,8 +143,8 @@ def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = 
     for line_number, line in islice(_content_lines(path, num_skipped), num_heading, None):
         if separators.fault and not patterns:  # it is not in the last line, which may be cut off
             raise ValueError(separators.fault)
-        if line_pattern(line) in patterns or _LONE_LABEL.fullmatch(line):
-            separators.found.append(Separator(len(lengths), line_number, line.strip()))
+        if line_pattern(line) in patterns or _LABEL_ONLY_LINE_PATTERN.fullmatch(line):
+            separators.found_separators.append(Separator(len(lengths), line_number, line.strip()))
             continue
         cells = number_format.cells(line)
         row = _numbers_until_a_fault(cells)
@@ -152,14 +152,16 @@ def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = 
             message = _not_a_number_message(cells, number_format, is_first_line=not lengths)
             separators.fault = separators.fault or f"{path.name}, line {line_number}{message}"
             separators.unreadable.append(len(lengths))
-        if not lengths and (label_match := _LABEL.match(line)):
+        if not lengths and (label_match := _LINE_LABEL_PATTERN.match(line)):
             label = label_match[1].strip()
         values.extend([number.real for number in row])
         if imaginary or any(isinstance(number, complex) for number in row):
             imaginary.extend([0.0] * (len(values) - len(row) - len(imaginary)) + [number.imag for number in row])
         lengths.append(len(row))
     is_cut_off = separators.unreadable[-1:] == [len(lengths) - 1] and len(lengths) > 1
-    is_cut_off = is_cut_off and len(row) == len(cells) - 1 and _CUT_NUMBER.fullmatch(cells[-1]) is not None
+    is_cut_off = (
+        is_cut_off and len(row) == len(cells) - 1 and _TRUNCATED_NUMBER_PATTERN.fullmatch(cells[-1]) is not None
+    )
     if is_cut_off:
         separators.unreadable.pop()
     numbers = np.array(values) + 1j * np.array(imaginary) if imaginary else np.array(values)
@@ -214,7 +216,7 @@ def rectangle(text: Text, name: str) -> Inexact[np.ndarray, "R C"]:
 
 def _remove_label(line: str) -> str:
     """A line without the word before its numbers."""
-    match = _LABEL.match(line)
+    match = _LINE_LABEL_PATTERN.match(line)
     return line if match is None else line[match.end() :]
 
 
@@ -241,7 +243,7 @@ def _detect_format(lines: Sequence[str]) -> _NumberFormat:
 def _has_decimal_commas(number_format: _NumberFormat, lines: Sequence[str]) -> bool:
     """Whether commas are decimal points: in most cells that contain a comma, the comma is between two digits."""
     cells = [cell for line in lines for cell in _remove_label(line).split(number_format.delimiter) if "," in cell]
-    decimal_cells = [cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell.strip(' \t\r\n"'))]
+    decimal_cells = [cell for cell in cells if _DECIMAL_COMMA_PATTERN.fullmatch(cell.strip(' \t\r\n"'))]
     return len(decimal_cells) > 0.9 * len(cells)
 
 
@@ -304,7 +306,7 @@ def _number(cell: str) -> complex:
     try:
         return float(cell)
     except ValueError:
-        if not _COMPLEX.fullmatch(cell):
+        if not _COMPLEX_NUMBER_PATTERN.fullmatch(cell):
             raise
         return complex(cell.strip("()").replace("+-", "-").replace("i", "j").replace("I", "j"))
 
@@ -325,7 +327,7 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-class Frames(NamedTuple):
+class TableFrames(NamedTuple):
     """Frames read from a table. **Fields**: `table`: one frame per row; `times`: times of the rows in seconds, or None;
     `notes`: detected properties."""
 
@@ -334,7 +336,7 @@ class Frames(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def frames_in_text(text: Text, counts: Sequence[int], layout: TableLayout, name: str) -> Frames:
+def frames_in_text(text: Text, counts: Sequence[int], layout: TableLayout, name: str) -> TableFrames:
     """Return the frames of a text file. `counts`: numbers of channels that a frame may have; the first is the number of
     channels of the described protocol.
 
@@ -350,7 +352,7 @@ def frames_in_text(text: Text, counts: Sequence[int], layout: TableLayout, name:
             f"each frame is wrapped over lines: {counted(frame_length, 'number')} are a frame.",
             *_truncation_notes(num_excess_numbers),
         )
-        return Frames(
+        return TableFrames(
             text.values[: num_frames * frame_length].reshape(num_frames, frame_length), None, (*text.notes, *notes)
         )
     text = remove_cut_line(text)
@@ -363,9 +365,11 @@ def remove_cut_line(text: Text) -> Text:
     off."""
     if len(text.lengths) < 2 or text.lengths[-1] >= text.lengths[0]:
         return text
-    num_cut = int(text.lengths[-1])
-    values = text.values[: len(text.values) - num_cut]
-    return text._replace(values=values, lengths=text.lengths[:-1], notes=(*text.notes, *_truncation_notes(num_cut)))
+    num_removed_numbers = int(text.lengths[-1])
+    values = text.values[: len(text.values) - num_removed_numbers]
+    return text._replace(
+        values=values, lengths=text.lengths[:-1], notes=(*text.notes, *_truncation_notes(num_removed_numbers))
+    )
 
 
 def _wrapped_frames(text: Text, counts: Sequence[int]) -> tuple[int, int] | None:
@@ -399,26 +403,26 @@ def frames_in_table(
     layout: TableLayout,
     heading: Sequence[str] = (),
     default_axis: str = "rows",
-) -> Frames:
+) -> TableFrames:
     """Frames of a two-dimensional array. `counts`: see `frames_in_text`; `heading`: names of the columns;
     `default_axis`: "rows" or "columns", whichever are frames if the numbers of channels do not determine this."""
-    stated_axis = layout.frames_in
-    axes_fit = any(count <= length <= count + 1 for count in counts for length in table.shape)
-    if stated_axis is None and min(table.shape) > 1 and table.size in counts and not axes_fit:
+    described_axis = layout.frames_in
+    any_axis_fits = any(count <= length <= count + 1 for count in counts for length in table.shape)
+    if described_axis is None and min(table.shape) > 1 and table.size in counts and not any_axis_fits:
         drive_rows = table if len(table) >= table.shape[1] else table.T
-        return Frames(drive_rows.reshape(1, -1), None, ("its longer side is taken for the drives of one frame.",))
-    is_transposed = stated_axis == "columns" if stated_axis else _are_columns(table.shape, counts, default_axis)
+        return TableFrames(drive_rows.reshape(1, -1), None, ("its longer side is taken for the drives of one frame.",))
+    is_transposed = described_axis == "columns" if described_axis else _are_columns(table.shape, counts, default_axis)
     rows = table.T if is_transposed else table
     notes: tuple[str, ...] = ()
-    if stated_axis is None and is_transposed and default_axis == "rows":
+    if described_axis is None and is_transposed and default_axis == "rows":
         notes = ("frames are taken from its columns.",)
-    if stated_axis is None and not is_transposed and default_axis == "columns" and min(table.shape) > 1:
+    if described_axis is None and not is_transposed and default_axis == "columns" and min(table.shape) > 1:
         notes = ("frames are taken from its rows.",)
     times = None
     if rows.shape[1] - 1 in counts and rows.shape[1] not in counts and layout.time_column is not False:
         times, time_note = _times(np.real(rows[:, 0]), "" if is_transposed or not heading else heading[0])
         rows, notes = (rows[:, 1:], (*notes, time_note)) if time_note else (rows, notes)
-    return Frames(rows, times, notes)
+    return TableFrames(rows, times, notes)
 
 
 def _are_columns(shape: tuple[int, int], counts: Sequence[int], default_axis: str) -> bool:
@@ -426,9 +430,9 @@ def _are_columns(shape: tuple[int, int], counts: Sequence[int], default_axis: st
     decides."""
     for num_extra_columns in (0, 1):
         for count in counts:
-            axis_fits = [shape[1] == count + num_extra_columns, shape[0] == count + num_extra_columns]
-            if any(axis_fits):
-                return axis_fits[1] and (default_axis == "columns" or not axis_fits[0])
+            is_frame_length = [shape[1] == count + num_extra_columns, shape[0] == count + num_extra_columns]
+            if any(is_frame_length):
+                return is_frame_length[1] and (default_axis == "columns" or not is_frame_length[0])
     return default_axis == "columns"
 
 
@@ -439,7 +443,11 @@ def _times(column: Float[np.ndarray, " F"], column_name: str) -> tuple[Float[np.
         return None, ""
     if (column == column[0] + np.arange(len(column))).all():
         return None, "the first number of each frame counts frames, and is left out."
-    if not column_name and (column == np.round(column)).all() and np.median(np.diff(column)) >= _MIN_MILLISECOND_STEP:
+    if (
+        not column_name
+        and (column == np.round(column)).all()
+        and np.median(np.diff(column)) >= _MIN_AMBIGUOUS_TIME_STEP
+    ):
         step = float(np.median(np.diff(column)))
         return None, f"the first number of each frame rises by {step:g}; its unit is not known, and it is left out."
     unit = (

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from jeit.cli.options import Quiet, check_at_least, check_positive, check_within, make_folder, naming_options
+from jeit.cli.options import (
+    QuietOption,
+    check_at_least,
+    check_positive,
+    check_within,
+    make_folder,
+    naming_options_in_errors,
+)
 from jeit.design import defaults
 
 if TYPE_CHECKING:
@@ -20,7 +27,7 @@ if TYPE_CHECKING:
 
 layout = typer.Typer(name="layout", help="Compare and optimise layouts of electrodes.")
 
-LayoutName = Annotated[
+LayoutArgument = Annotated[
     str,
     typer.Argument(
         help="Layout by name (park-inner, park-boundary, grid-CxR, perimeter-N, inner-N), or a file: CSV in "
@@ -28,10 +35,14 @@ LayoutName = Annotated[
         show_default=False,
     ),
 ]
-Width = Annotated[float, typer.Option("--width-mm", help="Of the skin, centred at 0, if the layout does not say it.")]
-Height = Annotated[float, typer.Option("--height-mm", help="Of the skin, centred at 0, if the layout does not say it.")]
-Thickness = Annotated[float, typer.Option("--thickness-mm", help="Of the skin, millimetres.")]
-Conductivity = Annotated[float, typer.Option("--conductivity", help="Of the skin, siemens per metre.")]
+WidthOption = Annotated[
+    float, typer.Option("--width-mm", help="Of the skin, centred at 0, if the layout does not say it.")
+]
+HeightOption = Annotated[
+    float, typer.Option("--height-mm", help="Of the skin, centred at 0, if the layout does not say it.")
+]
+ThicknessOption = Annotated[float, typer.Option("--thickness-mm", help="Of the skin, millimetres.")]
+ConductivityOption = Annotated[float, typer.Option("--conductivity", help="Of the skin, siemens per metre.")]
 # Range of conductivities in S/m: from below deionised water to above silver.
 _MIN_CONDUCTIVITY, _MAX_CONDUCTIVITY = 1e-9, 1e9
 _OPTIMISATION_FILES = ("layout.csv", "layout.svg", "travel.png", "report.json")
@@ -50,7 +61,7 @@ _OPTIMISED_QUANTITIES = (
 )
 _COMPARISON_FILES = ("report.json", "comparison.png")
 # Maximum number of touched positions along a side of the skin: 65,536 touches in total.
-_MAX_POSITIONS = 256
+_MAX_POSITIONS_PER_SIDE = 256
 # Option name for each argument name that error messages of the called functions mention.
 _OPTION_NAMES = {
     "thickness": "--thickness-mm",
@@ -95,7 +106,7 @@ def _read_with_outline(name: str, width: float, height: float) -> "Layout":
             check_within(option, side, 1e3 * MIN_SKIN_SIZE, 1e3 * MAX_SKIN_SIZE, "mm")
         return Rectangle(1e-3 * width, 1e-3 * height)
 
-    with naming_options({"name": "layout", "path": "layout"}):
+    with naming_options_in_errors({"name": "layout", "path": "layout"}):
         if not Path(name).suffix:
             layout = named_layout(name) if name.startswith("park-") else named_layout(name, outline_from_options())
         else:
@@ -121,7 +132,7 @@ def _check_layer(thickness: float, conductivity: float) -> None:
 
 @layout.command()
 def optimise(
-    layout: LayoutName,
+    layout: LayoutArgument,
     output: Annotated[
         Path, typer.Option("--output", "-o", help=f"Folder for {', '.join(_OPTIMISATION_FILES)}.", show_default=False)
     ],
@@ -143,23 +154,23 @@ def optimise(
     starts: Annotated[int, typer.Option(help="The layout, and random ones.")] = 1,
     steps: Annotated[int, typer.Option(help="At most.")] = defaults.STEPS,
     seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
-    thickness: Thickness = 1e3 * defaults.THICKNESS,
-    conductivity: Conductivity = defaults.CONDUCTIVITY,
+    thickness: ThicknessOption = 1e3 * defaults.THICKNESS,
+    conductivity: ConductivityOption = defaults.CONDUCTIVITY,
     contact_impedance: Annotated[
         float | None, typer.Option(help=f"ohm·m² (the layout's, or {defaults.CONTACT_IMPEDANCE:g}).")
     ] = None,
     noise: Annotated[float, typer.Option(help="Standard deviation of a voltage at 1 mA, volts.")] = defaults.NOISE,
     num_points: Annotated[int, typer.Option(help="Nodes of the mesh to optimise on, about.")] = defaults.NUM_POINTS,
-    width: Width = 1e3 * defaults.SIDE,
-    height: Height = 1e3 * defaults.SIDE,
-    quiet: Quiet = False,
+    width: WidthOption = 1e3 * defaults.SIDE,
+    height: HeightOption = 1e3 * defaults.SIDE,
+    quiet: QuietOption = False,
 ) -> None:
     """Move the electrodes of LAYOUT to increase the skin's lowest sensitivity and to decrease the mean variance.
 
     All two-terminal pairs are measured, so the order of electrodes does not matter. The scores of both layouts are
     computed on a finer mesh than that of the optimisation.
     """
-    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.cli.console import Steps, plain_console, print_written_files
     from jeit.design import DesignSpace, improve_layout
     from jeit.design.reports import write_improved_layout
 
@@ -190,7 +201,7 @@ def optimise(
         write_improved_layout(result, output)
     if not quiet:
         _print_improvement(console, result)
-        say_written(console, output / _OPTIMISATION_FILES[0], *_OPTIMISATION_FILES[1:])
+        print_written_files(console, output / _OPTIMISATION_FILES[0], *_OPTIMISATION_FILES[1:])
 
 
 def _print_improvement(console, result: "ImprovedLayout") -> None:
@@ -249,13 +260,13 @@ def _parse_region(text: str, outline: "Domain") -> "Disk | Rectangle":
 
 @layout.command()
 def compare(
-    first: LayoutName,
-    second: LayoutName,
+    first: LayoutArgument,
+    second: LayoutArgument,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for report.json and comparison.png.", show_default=False)
     ],
-    thickness: Thickness = 1e3 * defaults.THICKNESS,
-    conductivity: Conductivity = defaults.CONDUCTIVITY,
+    thickness: ThicknessOption = 1e3 * defaults.THICKNESS,
+    conductivity: ConductivityOption = defaults.CONDUCTIVITY,
     pairs: Annotated[
         int | None,
         typer.Option(
@@ -269,7 +280,7 @@ def compare(
     margin: Annotated[
         float, typer.Option("--margin-mm", help="Touch no nearer to the edge, where a touch is partly off the skin.")
     ] = 1e3 * defaults.MARGIN,
-    places: Annotated[int, typer.Option(help="Places touched along a side.")] = defaults.PLACES,
+    places: Annotated[int, typer.Option(help="Places touched along a side.")] = defaults.NUM_PLACES_PER_SIDE,
     contrast: Annotated[
         float,
         typer.Option(help="Of the touched part's conductivity: 0 for an insulator, above 1 for a conductor."),
@@ -277,12 +288,12 @@ def compare(
     cell: Annotated[float, typer.Option("--cell-mm", help="Size of the mesh's cells, millimetres.")] = 1e3
     * defaults.CELL_SIZE,
     seed: Annotated[int, typer.Option(help="Of the taxels' k-means.")] = 0,
-    width: Width = 1e3 * defaults.SIDE,
-    height: Height = 1e3 * defaults.SIDE,
-    quiet: Quiet = False,
+    width: WidthOption = 1e3 * defaults.SIDE,
+    height: HeightOption = 1e3 * defaults.SIDE,
+    quiet: QuietOption = False,
 ) -> None:
     """Touch two layouts all over, and compare them: sensitivity, blind spots, virtual taxels."""
-    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.cli.console import Steps, plain_console, print_written_files
     from jeit.design import compare_layouts
     from jeit.design.comparison import check_same_outline
     from jeit.design.reports import write_layout_comparison
@@ -291,14 +302,14 @@ def compare(
 
     _check_layer(thickness, conductivity)
     check_positive({"--cell-mm": cell})
-    check_within("--places", places, 2, _MAX_POSITIONS)
+    check_within("--places", places, 2, _MAX_POSITIONS_PER_SIDE)
     check_at_least({"--pairs": (pairs, 0), "--taxels": (taxels, 1), "--seed": (seed, 0)})
     if not 0 <= margin < float("inf"):
         raise ValueError(f"--margin-mm must not be negative; it is {margin:g}.")
     layouts = [_read_with_outline(name, width, height) for name in (first, second)]
     make_folder(output, _COMPARISON_FILES)
     console = plain_console()
-    with naming_options(_OPTION_NAMES), Steps(console, quiet=quiet) as step:
+    with naming_options_in_errors(_OPTION_NAMES), Steps(console, quiet=quiet) as step:
         check_same_outline(*layouts)
         step("mesh")
         protocols = [skin_protocol(compared_layout, num_pairs=pairs) for compared_layout in layouts]
@@ -318,7 +329,7 @@ def compare(
         write_layout_comparison(result, output)
     if not quiet:
         _print_comparison(console, result)
-        say_written(console, output / "report.json", "comparison.png")
+        print_written_files(console, output / "report.json", "comparison.png")
 
 
 def _model_text(skin: "Skin") -> str:
@@ -349,14 +360,14 @@ def _print_comparison(console, result: "LayoutComparison") -> None:
     console.print()
     console.print(table)
     skin = result.skins[0]
-    pairs = " and ".join(f"{one.model.protocol.num_measurements}" for one in result.skins)
+    pairs = " and ".join(f"{skin.model.protocol.num_measurements}" for skin in result.skins)
     notes = [
         f"{_model_text(skin)}; two-terminal measurements: {pairs}",
         f"touched at {result.places} × {result.places} places, {1e3 * result.margin:g} mm or more from the edge, to "
         f"{result.contrast:g} times its conductivity",
         "blind spot: less sensitive than the other layout's least sensitive place",
     ]
-    if len({one.model.protocol.num_measurements for one in result.skins}) > 1:
+    if len({skin.model.protocol.num_measurements for skin in result.skins}) > 1:
         notes.append("sensitivities are norms over all measurements: more measurements alone make them larger")
     for note in notes:
         console.print(note, style="dim", highlight=False, soft_wrap=True)

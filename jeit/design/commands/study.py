@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jeit.cli.options import Quiet, StoppedError, naming_options
+from jeit.cli.options import QuietOption, StoppedError, naming_options_in_errors
 
 if TYPE_CHECKING:
     from jeit.design.study import Progress, Study
@@ -18,10 +18,12 @@ study = typer.Typer(
     help="Sweep over layouts and what surrounds them, as a TOML file says: run, resume, status, report.",
 )
 
-File = Annotated[Path, typer.Argument(metavar="STUDY.toml", help="What to sweep.", show_default=False)]
-Output = Annotated[Path | None, typer.Option("--output", "-o", help="Zarr store (default STUDY.zarr beside the file).")]
-Page = Annotated[Path | None, typer.Option("--page", help="HTML report (default STUDY.html beside the file).")]
-Scheduler = Annotated[
+StudyFileArgument = Annotated[Path, typer.Argument(metavar="STUDY.toml", help="What to sweep.", show_default=False)]
+OutputOption = Annotated[
+    Path | None, typer.Option("--output", "-o", help="Zarr store (default STUDY.zarr beside the file).")
+]
+PageOption = Annotated[Path | None, typer.Option("--page", help="HTML report (default STUDY.html beside the file).")]
+SchedulerOption = Annotated[
     str | None, typer.Option(help="Address of a dask scheduler, such as tcp://host:8786; in this process unless given.")
 ]
 
@@ -34,7 +36,11 @@ def _print_help(context: typer.Context) -> None:
 
 @study.command()
 def run(
-    file: File, output: Output = None, page: Page = None, scheduler: Scheduler = None, quiet: Quiet = False
+    file: StudyFileArgument,
+    output: OutputOption = None,
+    page: PageOption = None,
+    scheduler: SchedulerOption = None,
+    quiet: QuietOption = False,
 ) -> None:
     """Run a study from its beginning, and write its report."""
     from jeit.design.study.lock import lock_store
@@ -51,7 +57,11 @@ def run(
 
 @study.command()
 def resume(
-    file: File, output: Output = None, page: Page = None, scheduler: Scheduler = None, quiet: Quiet = False
+    file: StudyFileArgument,
+    output: OutputOption = None,
+    page: PageOption = None,
+    scheduler: SchedulerOption = None,
+    quiet: QuietOption = False,
 ) -> None:
     """Continue a study that was stopped; its finished chunks are not computed again."""
     from jeit.design.study.store import Store
@@ -64,7 +74,7 @@ def resume(
 
 
 @study.command()
-def status(file: File, output: Output = None) -> None:
+def status(file: StudyFileArgument, output: OutputOption = None) -> None:
     """Print how many points of a study are finished."""
     from jeit.arguments import counted
     from jeit.design.study import study_progress
@@ -81,7 +91,7 @@ def status(file: File, output: Output = None) -> None:
 
 
 @study.command()
-def report(file: File, output: Output = None, page: Page = None) -> None:
+def report(file: StudyFileArgument, output: OutputOption = None, page: PageOption = None) -> None:
     """Write an HTML page with the finished results of a study."""
     from jeit.design.reports import write_study_report
 
@@ -95,7 +105,7 @@ def _read_study_and_path(file: Path, output: Path | None) -> "tuple[Study, Path]
     """Read the study from its TOML file, and return it with the path of its store of results."""
     from jeit.design.study import read_study
 
-    with naming_options({"path": "study"}):
+    with naming_options_in_errors({"path": "study"}):
         return read_study(file), output or file.with_suffix(".zarr")
 
 
@@ -118,13 +128,13 @@ def _run_with_progress(
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
-    from jeit.arguments.extras import need_extra
-    from jeit.cli.console import plain_console, say_written
+    from jeit.arguments.extras import require_extra
+    from jeit.cli.console import plain_console, print_written_files
     from jeit.design.reports import write_study_report
     from jeit.design.study import run_study
 
     report_path = _report_path(file, store, page)
-    need_extra("cluster", "a study")  # before the progress bar starts
+    require_extra("cluster", "a study")  # before the progress bar starts
     console = plain_console()
     task_column, time_column = (
         TextColumn(f"{{{field}}}", markup=False) for field in ("task.description", "task.fields[left]")
@@ -148,16 +158,16 @@ def _run_with_progress(
         output_option = "" if store == file.with_suffix(".zarr") else f" --output {store}"
         raise StoppedError(f"stopped; 'jeit study resume {file}{output_option}' goes on with it.") from None
     if not quiet:
-        say_written(console, store, str(report_path))
+        print_written_files(console, store, str(report_path))
 
 
 def connect_to_scheduler(scheduler: str):
     """Connect to the dask scheduler at the address `scheduler`. Raises `ValueError` if the scheduler does not
     answer."""
-    from jeit.arguments.extras import optional
+    from jeit.arguments.extras import import_optional
 
     try:
-        return optional("distributed", "a cluster").Client(scheduler, timeout=10)
+        return import_optional("distributed", "a cluster").Client(scheduler, timeout=10)
     except (OSError, ValueError) as error:
         raise ValueError(f"--scheduler {scheduler} does not answer: {error}") from None
 

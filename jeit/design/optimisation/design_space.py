@@ -176,7 +176,7 @@ def _check_thickness(thickness: tuple[float, float], depth: float, outline: Doma
 _TOLERANCE = 1e-5
 
 
-class Record:
+class OptimisationHistory:
     """History of an optimisation of v variables from S starts: the variables (S, v) and scores (S,) initially and after
     every step. `callback` is called with each step's number, 0 for the initial layouts, and the scores."""
 
@@ -194,12 +194,12 @@ class Record:
 
 
 def minimise_from_starts(
-    cost, variables: Float[Array, "S v"], steps: int, record: Record, *, tolerance: float = _TOLERANCE
+    cost, variables: Float[Array, "S v"], steps: int, history: OptimisationHistory, *, tolerance: float = _TOLERANCE
 ) -> tuple[Float[Array, "S v"], Status]:
     """Minimise the sum of the costs of S starts over v variables between 0 and 1 by L-BFGS. Returns the final variables
     (S, v) and the status: converged, step limit, or stalled if no step along the gradient lowers the cost.
 
-    `cost`: function of the variables (S, v) that returns the costs (S,), the scores (S,) for the `record`, and the
+    `cost`: function of the variables (S, v) that returns the costs (S,), the scores (S,) for the `history`, and the
     gradient (S, v) of the costs.
     """
     last_evaluation = {}
@@ -211,7 +211,7 @@ def minimise_from_starts(
 
     def record_step(variables):
         is_last_evaluation = np.array_equal(last_evaluation["variables"], variables)
-        record.add(variables, last_evaluation["score"] if is_last_evaluation else cost(variables)[1])
+        history.add(variables, last_evaluation["score"] if is_last_evaluation else cost(variables)[1])
 
     final_variables, _, status = scipy_lbfgsb(
         value_and_gradient, variables, 0.0, 1.0, tolerance=tolerance, max_steps=steps, callback=record_step

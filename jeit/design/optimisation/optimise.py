@@ -22,7 +22,7 @@ from jeit.design.defaults import STEPS
 from jeit.design.optimisation.design_space import (
     Constraints,
     DesignSpace,
-    Record,
+    OptimisationHistory,
     layout_parameters,
     minimise_from_starts,
 )
@@ -35,15 +35,15 @@ from jeit_solvers.engines import as_array, on_host
 from jeit_solvers.module import Module
 
 # Stages of the optimisation: weight w of the penalty, and fraction of all steps after which the stage ends.
-_PENALTY_STAGES = ((1e2, 0.5), (1e3, 0.8), (1e4, 1.0))
+_PENALTY_WEIGHTS_AND_STAGE_ENDS = ((1e2, 0.5), (1e3, 0.8), (1e4, 1.0))
 # Safety margin of the constraints, metres, so that a layout rounded to whole nanometres still satisfies them.
 _CONSTRAINT_MARGIN = 2e-7
 # Weight of the penalty if it is minimised alone: large, so that the minimisation stops only where the penalty is zero.
-_FEASIBILITY_WEIGHT = 1e6
+_PENALTY_WEIGHT_ALONE = 1e6
 # Maximum distance by which the outline may extend beyond the mesh, relative to the size of the skin.
-_MAX_OVERHANG = 0.01
+_MAX_OUTLINE_OVERHANG = 0.01
 # Minimum relative improvement of the score for a layout to count as better than the given layout.
-_MIN_IMPROVEMENT = 1e-9
+_MIN_SCORE_IMPROVEMENT = 1e-9
 # Number of random positions drawn for a random layout; the first positions inside the allowed region are used.
 _NUM_DRAWN_POSITIONS = 20_000
 
@@ -133,7 +133,7 @@ def optimise_layout(
     if not np.isfinite(start_value):
         raise ValueError("score is not finite for the layout given; does some touch change no voltage?")
     search = _LayoutSearch(skin, objective, constraints, variables)
-    final_variables, record, status = search.run(jnp.asarray(np.array(initial_variables)), steps, callback)
+    final_variables, history, status = search.run(jnp.asarray(np.array(initial_variables)), steps, callback)
     final_parameters = jax.tree.map(np.asarray, _parameters_of_starts(variables, final_variables))
     values = np.asarray(search.cost(final_variables, 0.0)[1])
     centres_and_radii = zip(final_parameters.centres, final_parameters.radii, strict=True)
@@ -152,11 +152,11 @@ def optimise_layout(
         **final_parameters._asdict(),
         values=values,
         shortfall=np.maximum(violations, 0),
-        history=np.stack(record.scores, axis=1),
+        history=np.stack(history.scores, axis=1),
         snapshots=np.stack(
             [
                 np.asarray(_parameters_of_starts(variables, step_variables).centres)
-                for step_variables in record.variables
+                for step_variables in history.variables
             ],
             axis=1,
         ),
@@ -183,20 +183,20 @@ class _LayoutSearch(Module):
 
     def run(
         self, initial_variables: Float[Array, "S v"], steps: int, callback
-    ) -> tuple[Float[Array, "S v"], Record, str]:
+    ) -> tuple[Float[Array, "S v"], OptimisationHistory, str]:
         """Run all stages. Returns the final variables (S, v), the history of the starts, and the status of the last
         stage."""
-        record = Record(callback)
+        history = OptimisationHistory(callback)
         variables, status, num_steps_done = initial_variables, "step limit", 0
-        record.add(variables, self.cost(variables, _PENALTY_STAGES[0][0])[1])
-        for weight, end_fraction in _PENALTY_STAGES:
-            num_steps = round(end_fraction * steps) - num_steps_done
+        history.add(variables, self.cost(variables, _PENALTY_WEIGHTS_AND_STAGE_ENDS[0][0])[1])
+        for weight, stage_end_fraction in _PENALTY_WEIGHTS_AND_STAGE_ENDS:
+            num_steps = round(stage_end_fraction * steps) - num_steps_done
             num_steps_done += num_steps
             if num_steps:
                 variables, status = minimise_from_starts(
-                    partial(self.cost, penalty_weight=weight), variables, num_steps, record
+                    partial(self.cost, penalty_weight=weight), variables, num_steps, history
                 )
-        return _make_feasible(self.variables, self.constraints, variables), record, status
+        return _make_feasible(self.variables, self.constraints, variables), history, status
 
     def choose_best(
         self, parameters: LayoutParameters, values, violations, start_value: float, status: str
@@ -205,7 +205,7 @@ class _LayoutSearch(Module):
         index is None if no start satisfies the constraints or improves on the given layout."""
         layout = self.skin.layout
         is_valid = (violations <= 0) & np.isfinite(values)
-        is_initial_valid = self.variables.represents(layout_parameters(self.skin))
+        is_initial_valid = self.variables.reproduces_parameters(layout_parameters(self.skin))
         is_initial_valid = (
             is_initial_valid and _largest_violation(self.constraints, layout.centres, layout.diameters / 2) <= 1e-9
         )
@@ -225,7 +225,7 @@ class _LayoutSearch(Module):
             )
             return None, "infeasible", reason
         best = int(np.where(is_valid, values, -np.inf).argmax())
-        if is_initial_valid and values[best] <= start_value + _MIN_IMPROVEMENT * abs(start_value):
+        if is_initial_valid and values[best] <= start_value + _MIN_SCORE_IMPROVEMENT * abs(start_value):
             return None, status, "no start is better than the layout given."
         reason = f"start {best + 1} of {len(values)} is best; the constraints are satisfied by {is_valid.sum()}."
         if not is_initial_valid:
@@ -283,11 +283,11 @@ def _make_feasible(variables: Variables, constraints: Constraints, start_variabl
 
     def cost(start_variables):
         penalties, gradients = _penalties(
-            start_variables, variables, constraints, _FEASIBILITY_WEIGHT, _CONSTRAINT_MARGIN
+            start_variables, variables, constraints, _PENALTY_WEIGHT_ALONE, _CONSTRAINT_MARGIN
         )
         return penalties, -penalties, gradients
 
-    return minimise_from_starts(cost, start_variables, 500, Record(), tolerance=0.0)[0]
+    return minimise_from_starts(cost, start_variables, 500, OptimisationHistory(), tolerance=0.0)[0]
 
 
 def _penalties(all_variables, variables: Variables, constraints: Constraints, weight: float, safety_margin: float):
@@ -308,15 +308,17 @@ def _penalty_and_gradient(all_variables, variables: Variables, constraints: Cons
 
 
 @eqx.filter_jit
-def _scores_and_gradients(all_variables, search: _LayoutSearch):
+def _scores_and_gradients(all_variables, layout_search: _LayoutSearch):
     """Score (S,) of the layouts of S starts, and its gradient (S, v) with respect to the v variables."""
 
     def compute_score(start_variables):
-        parameters = search.variables.parameters(start_variables)
+        parameters = layout_search.variables.parameters(start_variables)
         # The score is undefined for an electrode outside the skin, so the electrode is moved to the nearest point of
         # the skin.
-        clipped_parameters = parameters._replace(centres=search.constraints.outline.nearest(parameters.centres))
-        return search.objective.score(search.objective.scores_of_varied(search.skin, clipped_parameters))
+        clipped_parameters = parameters._replace(centres=layout_search.constraints.outline.nearest(parameters.centres))
+        return layout_search.objective.score(
+            layout_search.objective.scores_of_varied(layout_search.skin, clipped_parameters)
+        )
 
     # Starts are evaluated one after the other, since the Jacobian of a single layout fills the processor's cache.
     return jax.lax.map(jax.value_and_grad(compute_score), all_variables)
@@ -348,7 +350,9 @@ def _check_arguments(skin: Skin, objective: Objective, space: DesignSpace, steps
 def _check_outline(outline: Domain, skin: Skin) -> None:
     low_x, high_x, low_y, high_y = outline.extent
     points = np.asarray(skin.model.mesh.points)
-    overhang = max(*(points.min(axis=0) - (low_x, low_y)), *((high_x, high_y) - points.max(axis=0)))
+    outline_overhang = max(*(points.min(axis=0) - (low_x, low_y)), *((high_x, high_y) - points.max(axis=0)))
     # The mesh of a disk is a polygon inside the disk, so a small overhang is allowed.
-    if overhang > _MAX_OVERHANG * max(high_x - low_x, high_y - low_y):
-        raise ValueError(f"outline: it reaches {1e3 * overhang:.3g} mm beyond the model's mesh; give the skin's own.")
+    if outline_overhang > _MAX_OUTLINE_OVERHANG * max(high_x - low_x, high_y - low_y):
+        raise ValueError(
+            f"outline: it reaches {1e3 * outline_overhang:.3g} mm beyond the model's mesh; give the skin's own."
+        )

@@ -90,14 +90,14 @@ def optimise_surface_layout(
     score_and_gradient = _score_function(skin, objective)
     positions = np.asarray(layout.centres)
     score, gradient = score_and_gradient(positions)
-    pitch = float(np.sqrt(surface.areas.sum() / len(positions)))
-    step_length, history, snapshots = _MAX_STEP_FRACTION * pitch, [score], [positions]
+    electrode_spacing = float(np.sqrt(surface.areas.sum() / len(positions)))
+    step_length, history, snapshots = _MAX_STEP_FRACTION * electrode_spacing, [score], [positions]
     for step in range(steps):
         normals = surface.normals_at(surface.nearest(positions))
         tangential_gradient = gradient - (gradient * normals).sum(axis=1, keepdims=True) * normals
         max_gradient = np.linalg.norm(tangential_gradient, axis=1).max()
         accepted_step = None
-        while max_gradient > 0 and step_length > _MIN_STEP_FRACTION * pitch:
+        while max_gradient > 0 and step_length > _MIN_STEP_FRACTION * electrode_spacing:
             candidate_positions = surface.nearest(positions + step_length / max_gradient * tangential_gradient).points
             if _is_feasible(candidate_positions, min_distances, surface, radii + margin):
                 candidate_score, candidate_gradient = score_and_gradient(candidate_positions)
@@ -108,7 +108,7 @@ def optimise_surface_layout(
         if accepted_step is None:
             break
         positions, score, gradient = accepted_step
-        step_length = min(1.5 * step_length, _MAX_STEP_FRACTION * pitch)
+        step_length = min(1.5 * step_length, _MAX_STEP_FRACTION * electrode_spacing)
         history.append(score)
         snapshots.append(positions)
         if callback is not None:

@@ -42,7 +42,7 @@ class LayoutParameters(NamedTuple):
     thickness: Float[Array, ""]
 
 
-class Range(Module):
+class LogarithmicRange(Module):
     """Logarithmic mapping from k variables between 0 and 1 to positive values between `lower_limits` (k,) and
     `lower_limits` · exp(`log_ratios`)."""
 
@@ -50,7 +50,7 @@ class Range(Module):
     log_ratios: Float[np.ndarray, " k"]
 
     @classmethod
-    def create(cls, name: str, limits, initial_values, unit: str) -> "Range":
+    def create(cls, name: str, limits, initial_values, unit: str) -> "LogarithmicRange":
         """Create the range of k values between two `limits`, which are the same for all values. `initial_values` (k,)
         only determines the number k. Raises `ValueError` for invalid limits."""
         lower_limit, upper_limit = limits if np.shape(limits) == (2,) else (0.0, 0.0)
@@ -92,9 +92,9 @@ class Variables(Module):
     images: np.ndarray
     electrode_order: np.ndarray
     initial: LayoutParameters
-    sizes: Range | None
-    contacts: Range | None
-    thickness: Range | None
+    sizes: LogarithmicRange | None
+    contacts: LogarithmicRange | None
+    thickness: LogarithmicRange | None
     start: np.ndarray
     pitch: float
 
@@ -116,13 +116,15 @@ class Variables(Module):
         _check_symmetric_counts(is_generator.sum(), len(images), len(centres), symmetry)
         size_range = contact_range = None
         if sizes is True:
-            size_range = Range(radii[is_generator] / 2, np.full(is_generator.sum(), np.log(4.0)))
+            size_range = LogarithmicRange(radii[is_generator] / 2, np.full(is_generator.sum(), np.log(4.0)))
         elif sizes is not False:
-            diameters = Range.create("sizes", sizes, radii[is_generator], "metres")
-            size_range = Range(diameters.lower_limits / 2, diameters.log_ratios)
+            diameters = LogarithmicRange.create("sizes", sizes, radii[is_generator], "metres")
+            size_range = LogarithmicRange(diameters.lower_limits / 2, diameters.log_ratios)
         if contacts is not None:
-            contact_range = Range.create("contact_impedance", contacts, radii[is_generator], "ohm·m²")
-        thickness_range = None if thickness is None else Range.create("thickness", thickness, np.ones(1), "metres")
+            contact_range = LogarithmicRange.create("contact_impedance", contacts, radii[is_generator], "ohm·m²")
+        thickness_range = (
+            None if thickness is None else LogarithmicRange.create("thickness", thickness, np.ones(1), "metres")
+        )
         min_radius = radii.min() if size_range is None else size_range.lower_limits.min()
         low, size = np.array([x_min, y_min]) + min_radius, np.array([x_max - x_min, y_max - y_min]) - 2 * min_radius
         if (size <= 0).any():
@@ -148,19 +150,28 @@ class Variables(Module):
             for values in (radii, initial.contact_impedance)
         )
         symmetric_parameters = LayoutParameters(initial.centres, radii, impedance, initial.thickness)
-        pitch = float(np.sqrt(np.prod(size) / len(electrode_order)))
-        ranges = size_range, contact_range, thickness_range
-        return cls(low, size, images, electrode_order, symmetric_parameters, *ranges, np.concatenate(start), pitch)
+        electrode_spacing = float(np.sqrt(np.prod(size) / len(electrode_order)))
+        parameter_ranges = size_range, contact_range, thickness_range
+        return cls(
+            low,
+            size,
+            images,
+            electrode_order,
+            symmetric_parameters,
+            *parameter_ranges,
+            np.concatenate(start),
+            electrode_spacing,
+        )
 
-    def represents(self, parameters: LayoutParameters) -> bool:
+    def reproduces_parameters(self, parameters: LayoutParameters) -> bool:
         """Whether the variables `start` reproduce the given `parameters`: True if the parameters have the symmetry and
         lie in the ranges."""
-        represented = _compiled_parameters(self, jnp.asarray(self.start))
+        represented_parameters = _compiled_parameters(self, jnp.asarray(self.start))
         are_equal = (
             np.allclose(represented_values, parameter_values, rtol=1e-6, atol=0)
-            for represented_values, parameter_values in zip(represented[1:], parameters[1:], strict=True)
+            for represented_values, parameter_values in zip(represented_parameters[1:], parameters[1:], strict=True)
         )
-        return bool(np.allclose(represented.centres, parameters.centres, atol=1e-6)) and all(are_equal)
+        return bool(np.allclose(represented_parameters.centres, parameters.centres, atol=1e-6)) and all(are_equal)
 
     @property
     def num_generators(self) -> int:
@@ -206,7 +217,7 @@ _compiled_parameters = eqx.filter_jit(Variables.parameters)
 
 
 @values_at_once
-def _scaled(conductance, thickness, initial_thickness):
+def _scale_conductance(conductance, thickness, initial_thickness):
     return conductance * (thickness / initial_thickness)
 
 
@@ -301,7 +312,7 @@ class Objective(Module):
         """Compute the scores of a skin with its electrodes and thickness replaced by those of `varied`. The scores are
         differentiable with respect to `varied`."""
         model = skin.model.with_electrodes(SheetDiscs(varied.centres, varied.radii, varied.contact_impedance))
-        conductance = _scaled(skin.model_conductivity, varied.thickness, skin.thickness)
+        conductance = _scale_conductance(skin.model_conductivity, varied.thickness, skin.thickness)
         touches = self.touches.with_thickness(varied.thickness)
         options = {"prior": self.prior, "noise": self.noise, "temperature": self.temperature}
         return layout_scores(model, conductance, touches, **options)

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind, check_name
 from jeit.design.sensitivity import SensitivityMap
 from jeit.design.taxels import Taxels
-from jeit.plot.axes import axes_or_new, draw_legend_above, draw_scale_bar, extent_of, hide_axes, soften_axes
-from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SEQUENTIAL, draw_colour_bar
+from jeit.plot.axes import draw_legend_above, draw_scale_bar, extent_of, get_or_create_axes, hide_axes, style_graph_axes
+from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SEQUENTIAL_COLOUR_MAP, draw_colour_bar
 
 _COLOURS = (DARK_GREY, "#c8102e", "#1f6fb4", "#2a9d6f")
 _TAXEL_COLOURS = (*_COLOURS, "#8a5cb8", "#d98a1c")
@@ -52,7 +52,7 @@ def plot_sensitivity_map(
     ```
     """
     _check_is_sensitivity_map("theta", theta)
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     grid = theta.grid
     rows, columns = grid.shape
     corner = np.asarray(grid.places[0]) - np.array([grid.columns[0], grid.rows[0]]) * np.array(grid.pitch)
@@ -63,7 +63,7 @@ def plot_sensitivity_map(
         1e3 * theta.image(),
         origin="lower",
         extent=extent,
-        cmap=SEQUENTIAL,
+        cmap=SEQUENTIAL_COLOUR_MAP,
         vmin=0,
         vmax=1e3 * max_sensitivity,
         aspect="equal",
@@ -104,7 +104,7 @@ def plot_sensitivity_histograms(
     check_kind("maps", maps, Mapping, "{name: map}")
     for name, sensitivity in maps.items():
         _check_is_sensitivity_map(f"maps['{name}']", sensitivity)
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     max_sensitivity = max(float(np.max(np.asarray(sensitivity.values))) for sensitivity in maps.values())
     edges = np.linspace(0, max_sensitivity, bins + 1)
     for colour, (name, sensitivity) in zip(_COLOURS, maps.items(), strict=False):
@@ -115,7 +115,7 @@ def plot_sensitivity_histograms(
     )
     ax.set_xlabel("Sensitivity (mV)", color=DARK_GREY)
     ax.set_ylabel("Share of the area (%)", color=DARK_GREY)
-    soften_axes(ax)
+    style_graph_axes(ax)
     draw_legend_above(ax)
     if title:
         ax.set_title(title)
@@ -159,15 +159,15 @@ def plot_taxels(
     ```
     """
     check_name("colour", colour, _QUANTITIES)
-    _check_single(taxels)
+    _check_single_layout(taxels)
     labels = np.asarray(taxels.labels)
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     if colour == "label":
         cells = _draw_cells(ax, taxels, _map_colours(taxels)[labels], colour_map=_PALETTE)
         cells.set_clim(0, colormaps[_PALETTE].N - 1)
     else:
         values = 1e4 * np.asarray(taxels.areas)[labels] if colour == "area" else np.asarray(taxels.coverage)
-        cells = _draw_cells(ax, taxels, values, colour_map=SEQUENTIAL)
+        cells = _draw_cells(ax, taxels, values, colour_map=SEQUENTIAL_COLOUR_MAP)
         cells.set_clim(0, float(values.max()) if limit is None else limit * (1e4 if colour == "area" else 1))
         draw_colour_bar(ax, cells, _QUANTITIES[colour])
     if outlines:
@@ -203,10 +203,10 @@ def plot_taxel_areas(
     if not 1 <= len(layouts) <= len(_TAXEL_COLOURS):
         raise ValueError(f"taxels are of {len(layouts)} layouts; give 1 to {len(_TAXEL_COLOURS)}, {{name: taxels}}.")
     for layout_taxels in layouts.values():
-        _check_single(layout_taxels)
+        _check_single_layout(layout_taxels)
     areas = {name: 1e4 * np.asarray(layout_taxels.areas) for name, layout_taxels in layouts.items()}
     edges = np.linspace(0, max(area.max() for area in areas.values()) or 1.0, bins + 1)
-    ax = axes_or_new(ax, (5.8, 3.8))
+    ax = get_or_create_axes(ax, (5.8, 3.8))
     for (name, area), colour in zip(areas.items(), _TAXEL_COLOURS, strict=False):
         label = f"{name}: {area.mean():.1f} ± {area.std():.1f} cm²"
         counts = np.histogram(area, edges)[0]
@@ -215,7 +215,7 @@ def plot_taxel_areas(
     ax.set_xlabel("Taxel area (cm²)", color=DARK_GREY)
     ax.set_ylabel("Taxels", color=DARK_GREY)
     ax.set_title(title or "")
-    soften_axes(ax)
+    style_graph_axes(ax)
     draw_legend_above(ax)
     return ax
 
@@ -235,13 +235,13 @@ def plot_similarity(
     `electrodes`: positions (L, 2) or (L, 3) of the electrodes to be marked, metres. Raises `ValueError` for an
     `index` that no taxel has, and for taxels of a batch of layouts.
     """
-    _check_single(taxels)
+    _check_single_layout(taxels)
     num_taxels = len(taxels.similarity)
     if not isinstance(index, (int, np.integer)) or not 0 <= index < num_taxels:
         raise ValueError(
             f"index must be from 0 to {num_taxels - 1}, of one of the {num_taxels} taxels; it is {index!r}."
         )
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     cells = _draw_cells(ax, taxels, np.asarray(taxels.similarity[index]), colour_map="magma")
     # Negative similarities are drawn as 0.
     cells.set_clim(0, 1)
@@ -252,7 +252,7 @@ def plot_similarity(
     return ax
 
 
-def _check_single(taxels: Taxels) -> None:
+def _check_single_layout(taxels: Taxels) -> None:
     check_kind("taxels", taxels, Taxels, "Taxels, as of find_taxels")
     if taxels.similarity.ndim != 2:
         raise ValueError(
@@ -290,8 +290,8 @@ def _map_colours(taxels: Taxels) -> np.ndarray:
     np.fill_diagonal(are_neighbours, False)
     colours = np.full(num_taxels, -1)
     for taxel_index in range(num_taxels):
-        free_colours = np.setdiff1d(np.arange(num_taxels), colours[are_neighbours[taxel_index]])
-        colours[taxel_index] = free_colours[0] % colormaps[_PALETTE].N
+        unused_colours = np.setdiff1d(np.arange(num_taxels), colours[are_neighbours[taxel_index]])
+        colours[taxel_index] = unused_colours[0] % colormaps[_PALETTE].N
     return colours
 
 

@@ -14,9 +14,9 @@ from jeit.arguments import check_kind
 from jeit.design.optimisation.optimise import Optimisation
 from jeit.layout.surface_layout import flat_layout
 from jeit.mesh import Domain
-from jeit.plot.axes import axes_or_new, draw_scale_bar, hide_axes
+from jeit.plot.axes import draw_scale_bar, get_or_create_axes, hide_axes
 from jeit.plot.colours import DARK_GREY, LIGHT_GREY
-from jeit.plot.imaging.electrodes import METAL
+from jeit.plot.imaging.electrodes import ELECTRODE_COLOUR
 
 _KEEP_OUT_STYLE = {"facecolor": "none", "edgecolor": LIGHT_GREY, "hatch": "////", "linewidth": 0.5, "zorder": 1}
 
@@ -58,7 +58,7 @@ def plot_travel(
         )
     final_centres, radii = optimisation.centres[start], optimisation.radii[start]
     paths = np.concatenate([optimisation.snapshots[start], final_centres[None]])
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     outline = flat_layout(optimisation.layout).outline
     if outline is not None:
         ax.add_patch(PathPatch(outline_path(outline), facecolor="none", edgecolor=DARK_GREY, linewidth=0.9, zorder=2))
@@ -67,11 +67,13 @@ def plot_travel(
         draw_scale_bar(ax, extent)
     for domain in keep_out:
         ax.add_patch(PathPatch(outline_path(domain), **_KEEP_OUT_STYLE))
-    initial_discs = [Circle((x, y), r) for (x, y), r in zip(paths[0], radii, strict=True)]
-    final_discs = [Circle((x, y), r) for (x, y), r in zip(final_centres, radii, strict=True)]
-    ax.add_collection(PatchCollection(initial_discs, facecolor="none", edgecolor=LIGHT_GREY, linewidth=1.0, zorder=3))
+    initial_circles = [Circle((x, y), r) for (x, y), r in zip(paths[0], radii, strict=True)]
+    final_circles = [Circle((x, y), r) for (x, y), r in zip(final_centres, radii, strict=True)]
+    ax.add_collection(PatchCollection(initial_circles, facecolor="none", edgecolor=LIGHT_GREY, linewidth=1.0, zorder=3))
     ax.add_collection(LineCollection(list(paths.swapaxes(0, 1)), colors=LIGHT_GREY, linewidths=1.2, zorder=3))
-    ax.add_collection(PatchCollection(final_discs, facecolor=METAL, edgecolor=DARK_GREY, linewidth=0.6, zorder=4))
+    ax.add_collection(
+        PatchCollection(final_circles, facecolor=ELECTRODE_COLOUR, edgecolor=DARK_GREY, linewidth=0.6, zorder=4)
+    )
     _draw_legend(ax, has_excluded_areas=bool(keep_out))
     distances = np.linalg.norm(final_centres - paths[0], axis=1)
     ax.set_title(f"Moved {1e3 * distances.mean():.0f} mm on average" if title is None else title, color=DARK_GREY)
@@ -87,7 +89,7 @@ def _draw_legend(ax: Axes, *, has_excluded_areas: bool) -> None:
         Line2D(
             [],
             [],
-            markerfacecolor=METAL,
+            markerfacecolor=ELECTRODE_COLOUR,
             markeredgecolor=DARK_GREY,
             markeredgewidth=0.6,
             label="where it ended",

@@ -16,7 +16,7 @@ from jeit.arguments import check_kind
 from jeit.electrodes import FaceDiscs, SurfaceDiscs
 from jeit.layout import SurfaceLayout
 from jeit.mesh.geodesic import Unrolled
-from jeit.plot.axes import axes_or_new, draw_scale_bar, extent_of, hide_axes
+from jeit.plot.axes import draw_scale_bar, extent_of, get_or_create_axes, hide_axes
 from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, LIGHT_GREY, SERIES_COLOURS, ColourScale, check_scale
 
 # The plot states the distortion of lengths if its mean exceeds this relative value.
@@ -61,19 +61,19 @@ def plot_unrolled(
     """
     check_kind("unrolled", unrolled, Unrolled, "a surface laid flat, as of unroll(skin.model.mesh)")
     check_scale(scale)
-    ax = axes_or_new(ax, (7.4, 5.2))
+    ax = get_or_create_axes(ax, (7.4, 5.2))
     points = unrolled.points
     triangulation = Triangulation(points[:, 0], points[:, 1], unrolled.cells)
     if values is not None:
-        checked_values = _check_values(unrolled, values)
-        scaled_colours = scale.of(checked_values, "S")
-        per_cell = len(checked_values) == len(unrolled.cells)
+        value_array = _check_values(unrolled, values)
+        scaled_colours = scale.of(value_array, "S")
+        is_per_cell = len(value_array) == len(unrolled.cells)
         style: dict[str, Any] = {"shading": "gouraud"}
-        if per_cell:
+        if is_per_cell:
             style = {"shading": "flat", "edgecolors": "face", "linewidth": 0.5}
         mesh_image = ax.tripcolor(
             triangulation,
-            scaled_colours.factor * (checked_values if per_cell else checked_values[unrolled.nodes]),
+            scaled_colours.factor * (value_array if is_per_cell else value_array[unrolled.nodes]),
             **style,
             **scaled_colours.keywords,
         )
@@ -108,15 +108,15 @@ def plot_unrolled(
 
 
 def _check_values(unrolled: Unrolled, values: ArrayLike) -> np.ndarray:
-    checked_values, num_values = np.asarray(values), (len(unrolled.cells), len(unrolled.surface.points))
-    if checked_values.shape not in ((num_values[0],), (num_values[1],)):
+    value_array, num_values = np.asarray(values), (len(unrolled.cells), len(unrolled.surface.points))
+    if value_array.shape not in ((num_values[0],), (num_values[1],)):
         raise ValueError(
-            f"values has shape {checked_values.shape}; give one for each of the {num_values[0]} triangles or the "
+            f"values has shape {value_array.shape}; give one for each of the {num_values[0]} triangles or the "
             f"{num_values[1]} nodes."
         )
-    if np.iscomplexobj(checked_values):
+    if np.iscomplexobj(value_array):
         raise ValueError("values are complex; draw their real or imaginary part.")
-    return checked_values
+    return value_array
 
 
 def _draw_edges(ax: Axes, unrolled: Unrolled) -> None:

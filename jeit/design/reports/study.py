@@ -91,9 +91,9 @@ def draw_scores(data):
     columns = min(_NUM_COLUMNS, len(names))
     rows = -(-len(names) // columns)
     figure = Figure(figsize=(2.8 * columns + 1.8, 2.2 * rows + 0.3), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    axes_of_scores = figure.subplots(rows, columns, squeeze=False).ravel()
     point_numbers = np.arange(data.sizes["point"])
-    for axes, name in zip(panels, names, strict=False):
+    for axes, name in zip(axes_of_scores, names, strict=False):
         values, unit = values_and_unit(data, name)
         for layout_index, layout in enumerate(dict.fromkeys(data.layout.values.tolist())):
             has_layout = data.layout.values == layout
@@ -106,10 +106,10 @@ def draw_scores(data):
                 color=f"C{layout_index}",
                 label=_escape_for_matplotlib(layout),
             )
-            ones_array = np.ones(is_infinite.sum())
+            vertical_positions = np.ones(is_infinite.sum())
             axes.plot(
                 point_numbers[is_infinite],
-                ones_array,
+                vertical_positions,
                 "^",
                 ms=5,
                 color=f"C{layout_index}",
@@ -119,10 +119,10 @@ def draw_scores(data):
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.tick_params(labelsize=7)
         axes.grid(alpha=0.3)
-    for axes in panels[len(names) :]:
+    for axes in axes_of_scores[len(names) :]:
         axes.set_axis_off()
     figure.supxlabel("Point", fontsize=9)
-    handles, labels = panels[0].get_legend_handles_labels()
+    handles, labels = axes_of_scores[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", frameon=False, fontsize=8)
     return figure
 
@@ -155,12 +155,12 @@ def draw_maps(study: Study, data):
     rows = -(-len(point_indices) // columns)
     height = 2.4 + 0.15 * max(title.count("\n") for title in titles)
     figure = Figure(figsize=(max(2.6 * columns, 4.0) + 0.8, height * rows + 0.3), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    axes_of_maps = figure.subplots(rows, columns, squeeze=False).ravel()
     map_drawing = (
         _UnrolledMaps(study.outline, grid) if isinstance(study.outline, Triangles) else _FlatMaps(study.outline, grid)
     )
     image = None
-    for axes, point_index, map_values in zip(panels, point_indices, values, strict=False):
+    for axes, point_index, map_values in zip(axes_of_maps, point_indices, values, strict=False):
         layout = study.points[point_index].layout
         image = map_drawing.draw_values(axes, map_values, norm=scale, cmap="magma")
         diameter = 1e3 * np.asarray(layout.diameters)
@@ -177,12 +177,12 @@ def draw_maps(study: Study, data):
         axes.add_collection(circles)
         axes.set_title(titles[point_index], fontsize=8)
         axes.tick_params(labelsize=7)
-    for axes in panels[len(point_indices) :]:
+    for axes in axes_of_maps[len(point_indices) :]:
         axes.set_axis_off()
     assert image is not None
     figure.colorbar(
         image,
-        ax=panels.tolist(),
+        ax=axes_of_maps.tolist(),
         label="Sensitivity (mV)",
         ticks=LogLocator(subs=_TICKS),
         format=_PLAIN_NUMBER,
@@ -209,11 +209,11 @@ class _UnrolledMaps:
     position that is nearest along the surface."""
 
     def __init__(self, outline: Triangles, grid: TouchGrid):
-        fine_surface = outline
-        while len(fine_surface.points) < _MIN_MAP_NODES:
-            fine_surface = fine_surface.finer()
-        self.unrolled_surface = unroll(fine_surface)
-        self.nearest_places = Geodesics.create(fine_surface).owners(grid.places)[0][self.unrolled_surface.nodes]
+        refined_surface = outline
+        while len(refined_surface.points) < _MIN_MAP_NODES:
+            refined_surface = refined_surface.finer()
+        self.unrolled_surface = unroll(refined_surface)
+        self.nearest_places = Geodesics.create(refined_surface).owners(grid.places)[0][self.unrolled_surface.nodes]
 
     def draw_values(self, axes, values, **style):
         axes.set_aspect("equal")
@@ -230,10 +230,10 @@ def point_titles(study: Study) -> list[str]:
     """Title of every point of a study: its number and layout, followed by the other parameters that differ between
     points, two per line."""
     coordinates = [point.coordinates for point in study.points]
-    varying = [name for name in _LABELS if len({values[name] for values in coordinates}) > 1]
+    varying_parameters = [name for name in _LABELS if len({values[name] for values in coordinates}) > 1]
     titles = []
     for point_index, values in enumerate(coordinates):
-        labels = [_parameter_text(name, values[name]) for name in varying]
+        labels = [_parameter_text(name, values[name]) for name in varying_parameters]
         label_lines = [", ".join(labels[start : start + 2]) for start in range(0, len(labels), 2)]
         titles.append("\n".join([f"{point_index}: {_escape_for_matplotlib(str(values['layout']))}", *label_lines]))
     return titles
@@ -289,7 +289,7 @@ def write_study_report(study: Study, store: str | Path, path: str | Path) -> Non
         Store(study, store, create=False).versions,
         {name: metadata.version(name) for name in _PACKAGES},
     )
-    page_parts = [
+    html_parts = [
         f"<h1>{escape(study.name)}</h1>",
         f"<p>{progress.points} of {progress.all_points} points finished, in {progress.chunks} of {progress.all_chunks} "
         f"chunks. Sensitivity: ‖Δv‖₂ of all channels to one touch, {'exact' if study.exact else 'linearised'}, on "
@@ -321,7 +321,7 @@ def write_study_report(study: Study, store: str | Path, path: str | Path) -> Non
     ]
     page = (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(study.name)}</title>'
-        f"<style>{_STYLE}</style></head>\n<body>\n" + "\n".join(page_parts) + "\n</body></html>\n"
+        f"<style>{_STYLE}</style></head>\n<body>\n" + "\n".join(html_parts) + "\n</body></html>\n"
     )
     path = Path(path)
     temporary = path.with_name(f".{path.name}.tmp")
@@ -336,10 +336,10 @@ def write_study_report(study: Study, store: str | Path, path: str | Path) -> Non
 
 
 def _figure_html(figure: Any, caption: str) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    encoded = base64.b64encode(buffer.getvalue()).decode()
-    return f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{encoded}">' + (
+    image_file = io.BytesIO()
+    figure.savefig(image_file, format="png", dpi=110)
+    base64_image = base64.b64encode(image_file.getvalue()).decode()
+    return f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{base64_image}">' + (
         f"<figcaption>{escape(caption)}.</figcaption></figure>"
     )
 

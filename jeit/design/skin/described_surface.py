@@ -21,7 +21,7 @@ _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
 # Typical extent of a skin, metres, from which the likely unit of length of a file is determined.
 _TYPICAL_EXTENT = 0.15
 # Side of an equilateral triangle divided by the square root of the triangle's area.
-_SIDE_TO_ROOT_AREA = 2 / 3**0.25
+_TRIANGLE_SIDE_PER_ROOT_AREA = 2 / 3**0.25
 
 
 def described_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Mesh:
@@ -72,10 +72,10 @@ def surface_identity(table: SurfaceTable, folder: Path) -> str:
     return json.dumps(values, default=np.ndarray.tolist)
 
 
-def typical_cell(surface: Mesh) -> float:
+def typical_cell_size(surface: Mesh) -> float:
     """Typical cell size of a surface, metres: side of an equilateral triangle with the mean area of the surface's
     triangles."""
-    return _SIDE_TO_ROOT_AREA * float(np.sqrt(np.mean(np.asarray(measures(surface)))))
+    return _TRIANGLE_SIDE_PER_ROOT_AREA * float(np.sqrt(np.mean(np.asarray(measures(surface)))))
 
 
 def _create_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Mesh:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import IN_MILLIMETRES, check_kind, check_metres, object_html, object_text, picture
+from jeit.arguments import MILLIMETRE_HINT, check_kind, check_metres, object_html, object_text, picture
 from jeit.design.defaults import CELL_SIZE, CONDUCTIVITY, CONTACT_IMPEDANCE, CONTRAST, NUM_LAYERS, THICKNESS
 from jeit.design.skin.names import skin_protocol
 from jeit.design.skin.sheet_touches import SheetTouches, sheet_touches
@@ -24,7 +24,7 @@ from jeit.forward.system import check_conductivity
 from jeit.layout import Layout, SurfaceLayout
 from jeit.layout.surface_layout import check_layout, flat_layout
 from jeit.mesh import Domain, Mesh, Rectangle, layer, shell
-from jeit.mesh.generate.unstructured import MOST_POINTS
+from jeit.mesh.generate.unstructured import MAX_POINTS
 from jeit.mesh.geodesic import Triangles
 from jeit.protocol import Protocol
 from jeit_solvers.engines import host, on_host, values_at_once
@@ -32,13 +32,13 @@ from jeit_solvers.module import Module
 
 # Number of nodes of a plane mesh times (cell size)² / area: 1.155 for equilateral cells, and slightly more due to the
 # nodes on the edge.
-_NODES_PER_CELL_AREA = 1.2
+_NUM_NODES_PER_CELL_AREA = 1.2
 # Maximum cell size, relative to the smallest electrode diameter.
-_MAX_CELL_RATIO = 1.5
+_MAX_CELL_SIZE_RATIO = 1.5
 
 # Maximum thickness of a layer of cells, relative to the depth of a touch: the uppermost centroids are a quarter of the
 # layer's thickness below the surface.
-_MAX_LAYER_RATIO = 3.0
+_MAX_LAYER_THICKNESS_RATIO = 3.0
 
 
 class Skin(Module):
@@ -180,8 +180,8 @@ class Skin(Module):
     @property
     def touched_face(self) -> str:
         """The touched face of a curved layer: "outer", or "inner" if the electrodes are on the outer face."""
-        inward = isinstance(self.layout, SurfaceLayout) and not self.layout.outward
-        return "inner" if inward else "outer"
+        is_touched_on_inside = isinstance(self.layout, SurfaceLayout) and not self.layout.outward
+        return "inner" if is_touched_on_inside else "outer"
 
     @property
     def model_conductivity(self) -> Float[Array, "..."]:
@@ -224,7 +224,7 @@ class Skin(Module):
                 self.model.mesh, indentation, places, thickness=float(self.thickness), contrast=contrast
             )
         max_depth = float(indentation.depth_at(host.zeros(())))
-        max_thickness = _MAX_LAYER_RATIO * self.num_layers * max_depth
+        max_thickness = _MAX_LAYER_THICKNESS_RATIO * self.num_layers * max_depth
         thickness_text = (
             f"thickness is {1e3 * self.thickness:g} mm; give more than the {1e3 * max_depth:g} mm that a touch is "
             f"deep, and no more than {1e3 * max_thickness:g} mm, where {self.num_layers} layers of cells become too "
@@ -374,17 +374,17 @@ def check_cell_size(
     """
     check_metres(name, cell_size)
     min_diameter = smallest_diameter(layout)
-    max_size = _MAX_CELL_RATIO * min_diameter
+    max_size = _MAX_CELL_SIZE_RATIO * min_diameter
     if cell_size > (1 + 1e-9) * max_size:
-        unit_hint = f"; {IN_MILLIMETRES}" if cell_size**2 > area else "."
+        unit_hint = f"; {MILLIMETRE_HINT}" if cell_size**2 > area else "."
         raise ValueError(
             f"{name} is {1e3 * cell_size:g} mm; give no more than {1e3 * max_size:.3g} mm, as electrodes of "
             f"'{layout.name}' are {1e3 * min_diameter:.3g} mm across{unit_hint}"
         )
-    scaled_area = _NODES_PER_CELL_AREA * area * (num_layers + 1)
+    scaled_area = _NUM_NODES_PER_CELL_AREA * area * (num_layers + 1)
     num_nodes = scaled_area / cell_size**2
-    if num_nodes > MOST_POINTS:
-        min_size_mm = 1.05e3 * math.sqrt(scaled_area / MOST_POINTS)
+    if num_nodes > MAX_POINTS:
+        min_size_mm = 1.05e3 * math.sqrt(scaled_area / MAX_POINTS)
         raise ValueError(
             f"{name} is {1e3 * cell_size:g} mm, which makes about {num_nodes:.2g} nodes; give {min_size_mm:.2g} mm or "
             "more."

@@ -13,7 +13,7 @@ from jeit.design.skin.described_surface import described_surface
 from jeit.design.skin.names import ProtocolName, curved_layout, skin_protocol, study_layout
 from jeit.design.skin.skin import Skin
 from jeit.design.skin.surface_tables import SURFACE, SurfaceTable, check_keys_of_surface
-from jeit.files import MOST_ELECTRODES, check_memory, read_toml
+from jeit.files import MAX_ELECTRODES, check_memory, read_toml
 from jeit.files.schema import Number, Table, Word
 from jeit.mesh import Rectangle
 
@@ -22,7 +22,7 @@ THICKNESS = Number(0.05, 200, "mm")
 CONDUCTIVITY = Number(1e-6, 1e8, "S/m")
 DIAMETER = Number(0.1, 200, "mm")
 IMPEDANCE = Number(1e-9, 1e3, "ohm·m²")
-PAIRS = Number(0, MOST_ELECTRODES * (MOST_ELECTRODES - 1) // 2)
+PAIRS = Number(0, MAX_ELECTRODES * (MAX_ELECTRODES - 1) // 2)
 CURRENT = Number(1e-4, 1e3, "mA")
 CELL = Number(0.1, 200, "mm")
 LAYERS = Number(1, 50)
@@ -31,7 +31,7 @@ LAYERS = Number(1, 50)
 class MaterialTable(Table):
     """Table "skin": model, size and material of the skin."""
 
-    subject = "a skin"
+    name_in_messages = "a skin"
     model: Literal["sheet", "layer"] = "sheet"
     width_mm: Annotated[float, SIDE] = 1e3 * defaults.SIDE
     height_mm: Annotated[float, SIDE] = 1e3 * defaults.SIDE
@@ -43,7 +43,7 @@ class LayoutTable(Table):
     """Table "electrodes": layout, diameter and contact impedance. If a diameter or impedance is NaN, the value of the
     layout is used."""
 
-    subject = "a skin"
+    name_in_messages = "a skin"
     layout: Word
     diameter_mm: Annotated[float, DIAMETER] = math.nan
     contact_impedance_ohm_m2: Annotated[float, IMPEDANCE] = math.nan
@@ -52,7 +52,7 @@ class LayoutTable(Table):
 class MeasurementTable(Table):
     """Table "measurement": the measurement protocol."""
 
-    subject = "a skin"
+    name_in_messages = "a skin"
     protocol: ProtocolName = defaults.PROTOCOL
     pairs: Annotated[int, PAIRS] | None = None
     current_mA: Annotated[float, CURRENT] = 1e3 * defaults.CURRENT
@@ -61,7 +61,7 @@ class MeasurementTable(Table):
 class CellsTable(Table):
     """Table "mesh": cell size, and number of layers of cells."""
 
-    subject = "a skin"
+    name_in_messages = "a skin"
     cell_mm: Annotated[float, CELL] = 1e3 * defaults.CELL_SIZE
     layers: Annotated[int, LAYERS] = defaults.NUM_LAYERS
 
@@ -69,7 +69,7 @@ class CellsTable(Table):
 class SkinTable(Table):
     """All tables of a skin file."""
 
-    subject = "a skin"
+    name_in_messages = "a skin"
     skin: MaterialTable = MaterialTable()
     surface: Annotated[SurfaceTable | None, SURFACE] = None
     electrodes: LayoutTable = Field(default_factory=dict, validate_default=True)

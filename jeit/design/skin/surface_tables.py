@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from jeit.files.schema import Number, Numbers, OneOf, Table, Word, fault
+from jeit.files.schema import Number, Numbers, Table, TableOfKind, Word, fault
 from jeit.mesh.gmsh import CAD
 
 _RADIUS = Number(2, 5000, "mm")
@@ -15,7 +15,7 @@ _SECTION = Numbers(((2, 2),), 2, 5000, "mm", single=True)
 class TubeTable(Table):
     """Surface of a skin: the lateral surface of a cylinder."""
 
-    subject = "a tube"
+    name_in_messages = "a tube"
     kind: Literal["tube"]
     radius_mm: Annotated[float, _RADIUS]
     height_mm: Annotated[float, _LENGTH]
@@ -25,7 +25,7 @@ class TubeTable(Table):
 class ForearmTable(Table):
     """Surface of a skin: a tapered sleeve. Each end is specified by a radius, or by the two half widths of an oval."""
 
-    subject = "a forearm"
+    name_in_messages = "a forearm"
     kind: Literal["forearm"]
     length_mm: Annotated[float, _LENGTH]
     wrist_mm: Annotated[Any, _SECTION]
@@ -36,7 +36,7 @@ class ForearmTable(Table):
 class SphereTable(Table):
     """Surface of a skin: a sphere."""
 
-    subject = "a sphere"
+    name_in_messages = "a sphere"
     kind: Literal["sphere"]
     radius_mm: Annotated[float, _RADIUS]
     outward: bool = True
@@ -45,7 +45,7 @@ class SphereTable(Table):
 class CapTable(Table):
     """Surface of a skin: the cap of a sphere about its pole."""
 
-    subject = "a cap"
+    name_in_messages = "a cap"
     kind: Literal["cap"]
     radius_mm: Annotated[float, _RADIUS]
     angle_degrees: Annotated[float, Number(5, 170, "degrees")]
@@ -55,7 +55,7 @@ class CapTable(Table):
 class BentSheetTable(Table):
     """Surface of a skin: a flat sheet bent around a cylinder along `axis`."""
 
-    subject = "a bent sheet"
+    name_in_messages = "a bent sheet"
     kind: Literal["bent sheet"]
     width_mm: Annotated[float, _LENGTH]
     height_mm: Annotated[float, _LENGTH]
@@ -67,7 +67,7 @@ class BentSheetTable(Table):
 class ScanTable(Table):
     """Surface of a skin: a file of triangles or a CAD file, with the file's unit of length."""
 
-    subject = "a surface's file"
+    name_in_messages = "a surface's file"
     file: Word
     unit: Literal["mm", "cm", "m", "inch"]
     outward: bool = True
@@ -79,7 +79,7 @@ class ScanTable(Table):
 
 
 SurfaceTable = TubeTable | ForearmTable | SphereTable | CapTable | BentSheetTable | ScanTable
-SURFACE = OneOf(
+SURFACE = TableOfKind(
     "kind",
     TubeTable,
     ForearmTable,

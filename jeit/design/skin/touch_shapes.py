@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.arguments import check_kind, describe
-from jeit.design.defaults import BALL_DIAMETER, DEPTH, DEVIATION, PLACES
+from jeit.design.defaults import BALL_DIAMETER, DEPTH, DEVIATION, NUM_PLACES_PER_SIDE
 from jeit.layout import spread
 from jeit.mesh import Domain
 from jeit.mesh.geodesic import Triangles
 from jeit.mesh.outline.domain import check_length
-from jeit_solvers.engines import either_engine, namespace
+from jeit_solvers.engines import namespace, numpy_or_compiled
 from jeit_solvers.module import Module
 
 
@@ -56,7 +56,7 @@ class Bell(AbstractIndentation):
         self.depth = check_length("depth", depth)
         self.deviation = check_length("deviation", deviation)
 
-    @either_engine
+    @numpy_or_compiled
     def depth_at(self, distance):
         """Depth in metres at horizontal distances (metres) from the centre."""
         xp = namespace(self, distance)
@@ -99,7 +99,7 @@ class Hemisphere(AbstractIndentation):
                 f"deeper than {5e2 * self.diameter:g} mm; give less depth, or a larger one."
             )
 
-    @either_engine
+    @numpy_or_compiled
     def depth_at(self, distance):
         """Depth in metres at horizontal distances (metres) from the centre of the ball."""
         xp, radius = namespace(self, distance), self.diameter / 2
@@ -171,13 +171,13 @@ class SurfaceGrid(TouchGrid):
         are scaled accordingly."""
         nearest_points = surface.nearest(self.places)
         areas = self.areas * nearest_points.of_nodes(surface, face.node_areas / surface.node_areas)
-        mean_area = float(areas.mean())
+        mean_triangle_area = float(areas.mean())
         return SurfaceGrid(
             nearest_points.of_nodes(surface, face.points),
             self.rows,
             self.columns,
             self.shape,
-            (mean_area**0.5, mean_area**0.5),
+            (mean_triangle_area**0.5, mean_triangle_area**0.5),
             areas,
         )
 
@@ -188,7 +188,9 @@ class SurfaceGrid(TouchGrid):
         )
 
 
-def touch_grid(outline: Domain | Triangles, columns: int = PLACES, rows: int = PLACES) -> TouchGrid:
+def touch_grid(
+    outline: Domain | Triangles, columns: int = NUM_PLACES_PER_SIDE, rows: int = NUM_PLACES_PER_SIDE
+) -> TouchGrid:
     """Create a grid of touched positions: the bounding box of a skin's outline is divided into equal rectangles, and
     the positions are the centres that lie inside the outline.
 
@@ -226,7 +228,7 @@ def touch_grid(outline: Domain | Triangles, columns: int = PLACES, rows: int = P
 
 
 def touches_away_from_the_edge(
-    outline: Domain | Triangles, margin: float, columns: int = PLACES, rows: int = PLACES
+    outline: Domain | Triangles, margin: float, columns: int = NUM_PLACES_PER_SIDE, rows: int = NUM_PLACES_PER_SIDE
 ) -> TouchGrid:
     """The touched positions of `touch_grid` that are farther than a `margin` from the outline, so that touches do not
     reach beyond the edge.

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
 from jeit.arguments import check_kind
-from jeit.design.defaults import CONTRAST, MOST_CONTRAST
+from jeit.design.defaults import CONTRAST, MAX_CONTRAST
 from jeit.design.skin.touch_shapes import AbstractIndentation, check_places
 from jeit.electrodes.discs import smooth_step
 from jeit.forward import ForwardModel
@@ -172,31 +172,33 @@ def touched_cells(
     places = check_places(places, 3 if is_curved(mesh) else 2)
     check_kind("indentation", indentation, AbstractIndentation, "an indentation, such as Bell() or Hemisphere()")
     _check_values(contrast, edge)
-    is_layer = mesh.dimension == 3
+    is_solid_layer = mesh.dimension == 3
     max_depth = float(indentation.depth_at(host.zeros(())))
-    if is_layer and thickness is not None:
+    if is_solid_layer and thickness is not None:
         raise ValueError("thickness is for sheets; that of a layer is in its mesh.")
-    if not is_layer and (thickness is None or not 0 < thickness < np.inf):
+    if not is_solid_layer and (thickness is None or not 0 < thickness < np.inf):
         raise ValueError(f"thickness must be given for a sheet, in metres, positive; it is {thickness!r}.")
-    cells_in_reach = reached_cells(mesh, places, indentation.reach, max_depth + edge if is_layer else np.inf, face)
-    thickness = cells_in_reach.thickness if is_layer else thickness
+    cells_in_reach = reached_cells(
+        mesh, places, indentation.reach, max_depth + edge if is_solid_layer else np.inf, face
+    )
+    thickness = cells_in_reach.thickness if is_solid_layer else thickness
     assert thickness is not None
     if max_depth >= thickness:
         raise ValueError(
             f"the indentation is {1e3 * max_depth:.3g} mm deep, and the skin {1e3 * thickness:.3g} mm thick; press "
             "less."
         )
-    cells, is_entry = pad_rows(cells_in_reach.cells)
+    cells, is_not_padding = pad_rows(cells_in_reach.cells)
     distances = np.full(cells.shape, np.inf)
-    distances[is_entry] = np.concatenate(cells_in_reach.distances)
+    distances[is_not_padding] = np.concatenate(cells_in_reach.distances)
     depths, centroid_depths = np.asarray(indentation.depth_at(as_array(distances))), cells_in_reach.centroid_depths
-    if not is_layer:
+    if not is_solid_layer:
         fractions = depths / thickness
     elif edge:
         fractions = np.asarray(smooth_step(jnp.asarray((depths - centroid_depths[cells]) / edge)))
     else:
         fractions = (depths > centroid_depths[cells]).astype(float)
-    is_changed = is_entry & (fractions > 0)
+    is_changed = is_not_padding & (fractions > 0)
     empty_touches = np.flatnonzero(~is_changed.any(axis=1))
     if empty_touches.size:
         raise ValueError(
@@ -205,11 +207,11 @@ def touched_cells(
             "off the skin (places are in metres), or its cells are too coarse for so shallow an indentation; refine "
             "the mesh, in a layer upwards."
         )
-    changed_cells, is_entry = pad_rows(
+    changed_cells, is_not_padding = pad_rows(
         [touch_cells[is_used] for touch_cells, is_used in zip(cells, is_changed, strict=True)]
     )
     changes = np.zeros(changed_cells.shape)
-    changes[is_entry] = (contrast - 1) * fractions[is_changed]
+    changes[is_not_padding] = (contrast - 1) * fractions[is_changed]
     return TouchedCells(as_array(places), as_array(changed_cells), as_array(changes), mesh.num_cells)
 
 
@@ -224,10 +226,10 @@ def pad_rows(rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check_values(contrast: float, edge: float) -> None:
-    if not 0 <= contrast <= MOST_CONTRAST or contrast == 1:
+    if not 0 <= contrast <= MAX_CONTRAST or contrast == 1:
         raise ValueError(
             f"contrast must be a factor for the conductivity, 0 for an insulator, above 1 for a conductor, up to "
-            f"{MOST_CONTRAST:g}, where the limit is reached long before; it is {contrast!r}."
+            f"{MAX_CONTRAST:g}, where the limit is reached long before; it is {contrast!r}."
         )
     if not 0 <= edge < np.inf:
         raise ValueError(f"edge must be a depth in metres, not negative; it is {edge!r}.")
@@ -262,13 +264,13 @@ def touched_nodes(model: ForwardModel, touches: TouchedCells, strips: Strips | N
     is_touched[np.asarray(mesh.cells)[cells[is_changed]]] = True
     if strips is None:
         strips = Strips.create(model.system.pattern, np.asarray(mesh.points), is_touched)
-    untouched_index = strips.num_strips * strips.selected_per_strip  # one entry for all untouched nodes
-    node_indices = np.where(is_touched, strips.place, untouched_index).astype(np.int32)[np.asarray(mesh.cells)]
+    shared_untouched_index = strips.num_strips * strips.selected_per_strip  # one entry for all untouched nodes
+    node_indices = np.where(is_touched, strips.place, shared_untouched_index).astype(np.int32)[np.asarray(mesh.cells)]
     corners, chunk_results = np.zeros((*cells.shape, mesh.cells.shape[1]), np.int32), []
     for start in range(0, len(cells), _TOUCHES_AT_ONCE):
         chunk = slice(start, start + _TOUCHES_AT_ONCE)
-        chunk_nodes = np.where(is_changed[chunk, :, None], node_indices[cells[chunk]], untouched_index)
-        corners[chunk], (touch, number, node) = _number_nodes(chunk_nodes, untouched_index)
+        chunk_nodes = np.where(is_changed[chunk, :, None], node_indices[cells[chunk]], shared_untouched_index)
+        corners[chunk], (touch, number, node) = _number_nodes(chunk_nodes, shared_untouched_index)
         chunk_results.append((start + touch, number, node))
     corners[~is_changed] = 0
     touch, number, node = (np.concatenate(arrays) for arrays in zip(*chunk_results, strict=True))
@@ -282,14 +284,14 @@ def _number_nodes(nodes: Int[np.ndarray, "b c q"], padding_index: int):
     """Number the distinct mesh nodes of each of b touches from 0, except for the index `padding_index`, which marks
     padding. Returns the number of every entry of `nodes` (b, c, q), and for every distinct node its touch, number and
     index."""
-    first_keys = (padding_index + 1) * np.arange(len(nodes), dtype=np.int32)
-    keys = nodes + first_keys[:, None, None]
+    first_key_of_touch = (padding_index + 1) * np.arange(len(nodes), dtype=np.int32)
+    keys = nodes + first_key_of_touch[:, None, None]
     is_used = np.zeros(len(nodes) * (padding_index + 1), bool)
     is_used[keys] = True
-    is_used[first_keys + padding_index] = False
+    is_used[first_key_of_touch + padding_index] = False
     distinct_keys = np.flatnonzero(is_used)
     touch, node = np.divmod(distinct_keys, padding_index + 1)
-    local_number = np.arange(len(distinct_keys)) - np.searchsorted(distinct_keys, first_keys)[touch]
+    number_within_touch = np.arange(len(distinct_keys)) - np.searchsorted(distinct_keys, first_key_of_touch)[touch]
     numbers_of_keys = np.zeros(len(is_used), np.int32)
-    numbers_of_keys[distinct_keys] = local_number
-    return numbers_of_keys[keys], (touch, local_number, node)
+    numbers_of_keys[distinct_keys] = number_within_touch
+    return numbers_of_keys[keys], (touch, number_within_touch, node)

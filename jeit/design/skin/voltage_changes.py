@@ -38,7 +38,7 @@ from jeit_solvers.module import Module
 _TOLERANCE, _MAX_STEPS = 1e-8, 200
 # Factor by which an insulating touch is assumed to lower the energy of a field (the true factor depends on the shape of
 # the touched part), and maximum of this factor for touched parts with a very low remaining conductivity.
-_INSULATING_FACTOR, _MAX_FACTOR = 10.0, 1e6
+_INSULATING_ENERGY_FACTOR, _MAX_FACTOR = 10.0, 1e6
 # Voltage changes below this value, relative to the energy of the load D F, are rounding errors.
 _MIN_RELATIVE_VOLTAGE = 1e-12
 # Number of touches processed at once for exact and linearised changes, so that their blocks of the inverse or of the
@@ -46,7 +46,7 @@ _MIN_RELATIVE_VOLTAGE = 1e-12
 EXACT_BATCH_SIZE, _LINEAR_BATCH_SIZE = 2, 8
 # Multiple to which the number of strips of nodes that a touch spans is padded, since a program is compiled for each
 # number.
-_STRIP_MULTIPLE = 3
+_NUM_STRIPS_MULTIPLE = 3
 # Number of touches per call of a compiled program. The numbers of nodes and of cells of a touch are padded to sizes,
 # and these are the ratios of successive sizes. One program is compiled for each size, and the cost of a touch grows
 # with the square of its number of nodes.
@@ -103,7 +103,8 @@ def _linear_changes(model: ForwardModel, conductivity, touched: TouchedCells):
 def _exact_changes(model: ForwardModel, conductivity, touched: TouchedCells):
     touch_geometry = touched_nodes(model, touched)
     max_distance = (
-        -(-touch_geometry.strips.max_strip_distance(touch_geometry.nodes) // _STRIP_MULTIPLE) * _STRIP_MULTIPLE
+        -(-touch_geometry.strips.max_strip_distance(touch_geometry.nodes) // _NUM_STRIPS_MULTIPLE)
+        * _NUM_STRIPS_MULTIPLE
     )
     solved_system = evaluate(model, solved_system_of, conductivity)
     fields_and_inverse_of_skin = fields_and_inverse(solved_system, touch_geometry.strips, max_distance)
@@ -173,7 +174,7 @@ def _weakening_factor(change: Float[Array, "b c"]) -> Float[Array, " b"]:
         jnp.where(
             remaining_conductivity > 0,
             1 / jnp.where(remaining_conductivity > 0, remaining_conductivity, 1.0),
-            _INSULATING_FACTOR,
+            _INSULATING_ENERGY_FACTOR,
         ).max(axis=1),
         1,
         _MAX_FACTOR,
@@ -206,12 +207,12 @@ def _impedance_changes(blocks, corners, inverse, fields, weakening_factor):
         curvature = jnp.sum(direction * system_product, axis=1, keepdims=True)
         # The solutions of converged touches are not changed any more, since their residual and curvature are rounding
         # errors.
-        is_active = (energy > max_energy) & (curvature > 0)
-        step_length = jnp.where(is_active, energy / jnp.where(is_active, curvature, 1.0), 0.0)
+        is_unconverged = (energy > max_energy) & (curvature > 0)
+        step_length = jnp.where(is_unconverged, energy / jnp.where(is_unconverged, curvature, 1.0), 0.0)
         solution, residual = solution + step_length * direction, residual - step_length * system_product
         scaled_residual = inverse @ residual
         new_energy = jnp.sum(residual * scaled_residual, axis=1, keepdims=True)
-        ratio = jnp.where(is_active, new_energy / jnp.where(is_active, energy, 1.0), 0.0)
+        ratio = jnp.where(is_unconverged, new_energy / jnp.where(is_unconverged, energy, 1.0), 0.0)
         return solution, residual, scaled_residual, direction, scaled_direction, new_energy, ratio, num_steps + 1
 
     def is_unfinished(state):
@@ -222,8 +223,10 @@ def _impedance_changes(blocks, corners, inverse, fields, weakening_factor):
     initial_energy = jnp.sum(right_hand_side * scaled_load, axis=1, keepdims=True)
     # The remaining error is at most the energy Rᵀ G R times `weakening_factor`. The voltages change by at least Fᵀ D F
     # due to insulators, and by at least (Fᵀ D F)² divided by the energy of the load due to conductors.
-    linear_change = jnp.abs(jnp.sum(fields * right_hand_side, axis=1, keepdims=True))
-    voltages = jnp.minimum(linear_change, linear_change**2 / jnp.where(initial_energy > 0, initial_energy, 1.0))
+    linearised_magnitude = jnp.abs(jnp.sum(fields * right_hand_side, axis=1, keepdims=True))
+    voltages = jnp.minimum(
+        linearised_magnitude, linearised_magnitude**2 / jnp.where(initial_energy > 0, initial_energy, 1.0)
+    )
     max_energy = (
         _TOLERANCE * jnp.maximum(voltages, _MIN_RELATIVE_VOLTAGE * initial_energy) / weakening_factor[:, None, None]
     )
@@ -241,8 +244,8 @@ def _impedance_changes(blocks, corners, inverse, fields, weakening_factor):
     change = _transpose(solution) @ (right_hand_side + residual) + _transpose(residual) @ scaled_residual
     change -= _transpose(fields) @ right_hand_side
     # Voltage changes below this limit consist of rounding errors of the load D F.
-    is_rounding = jnp.sum(voltages, axis=(1, 2)) < _MIN_RELATIVE_VOLTAGE * jnp.sum(initial_energy, axis=(1, 2))
-    converged = jnp.all(energy <= max_energy, axis=(1, 2)) & ~is_rounding
+    is_rounding_error = jnp.sum(voltages, axis=(1, 2)) < _MIN_RELATIVE_VOLTAGE * jnp.sum(initial_energy, axis=(1, 2))
+    converged = jnp.all(energy <= max_energy, axis=(1, 2)) & ~is_rounding_error
     return jnp.where(converged[:, None, None], (change + _transpose(change)) / 2, jnp.nan)
 
 
@@ -292,13 +295,17 @@ class RestingSkin(Module):
         strips = Strips.create(model.system.pattern, np.asarray(model.mesh.points), np.asarray(touchable))
         if 8 * float(strips.num_strips * strips.selected_per_strip) ** 2 > max_bytes:
             return None
-        solved = evaluate(model, solved_system_of, conductivity)
+        solved_untouched_system = evaluate(model, solved_system_of, conductivity)
         voltages = on_device(
             evaluate_in_numpy(
-                lambda solved, protocol: channel_voltages(protocol, solved.impedance()), solved, model.protocol
+                lambda solved_untouched_system, protocol: channel_voltages(
+                    protocol, solved_untouched_system.impedance()
+                ),
+                solved_untouched_system,
+                model.protocol,
             )
         )
-        skin_fields_and_inverse = fields_and_inverse(solved, strips, max(strips.num_strips - 1, 1))
+        skin_fields_and_inverse = fields_and_inverse(solved_untouched_system, strips, max(strips.num_strips - 1, 1))
         return cls(model, voltages, cell_stiffness(model, conductivity), strips, *skin_fields_and_inverse)
 
     def changes(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
@@ -359,7 +366,7 @@ def _padded_size(count, ratio: float):
     return (np.ceil(ratio**exponent - 1e-9) * 16).astype(int)
 
 
-def _pad_rows(rows: np.ndarray, length: int, mode) -> np.ndarray:
+def _pad_rows(rows: np.ndarray, length: int, padding_mode) -> np.ndarray:
     """Truncate or pad the n rows of `rows` (n, k, …) from k to `length` entries."""
     num_missing = max(length - rows.shape[1], 0)
-    return np.pad(rows[:, :length], [(0, 0), (0, num_missing), *[(0, 0)] * (rows.ndim - 2)], mode)
+    return np.pad(rows[:, :length], [(0, 0), (0, num_missing), *[(0, 0)] * (rows.ndim - 2)], padding_mode)

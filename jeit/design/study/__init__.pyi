@@ -1,11 +1,11 @@
 from .run import Progress, run_study, study_progress
-from .spec import Point, Study, read_study
+from .spec import Study, StudyPoint, read_study
 from .store import open_results
 
 __all__ = [
-    "Point",
     "Progress",
     "Study",
+    "StudyPoint",
     "open_results",
     "read_study",
     "run_study",

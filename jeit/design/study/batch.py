@@ -15,7 +15,7 @@ from jax.sharding import Mesh as Devices
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float
 
-from jeit.design.defaults import OPTIMALITY
+from jeit.design.defaults import SHEET_ONLY_SCORES
 from jeit.design.scores import TouchPrior, layout_scores
 from jeit.design.sensitivity import SensitivityMap
 from jeit.design.skin.sheet_touches import SheetTouches
@@ -23,7 +23,7 @@ from jeit.design.skin.skin import Skin, model_conductivity, smallest_diameter
 from jeit.design.skin.touch_shapes import SurfaceGrid, TouchGrid, touch_grid
 from jeit.design.skin.touched_cells import TouchedCells, touched_surface
 from jeit.design.skin.voltage_changes import touch_changes
-from jeit.design.study.spec import Point, Shape, Study
+from jeit.design.study.spec import PointShape, Study, StudyPoint
 from jeit.design.taxels import find_taxels
 from jeit.electrodes import FaceDiscs, SheetDiscs, SurfaceDiscs
 from jeit.forward import ForwardModel
@@ -128,7 +128,7 @@ def study_grid(study: Study) -> TouchGrid:
 
 
 @lru_cache(maxsize=4)
-def _first_skin(study: Study, shape: Shape) -> Skin:
+def _first_skin(study: Study, shape: PointShape) -> Skin:
     """Skin of the first point of a study that has the given `shape`; all points of a shape have the same mesh."""
     point = next(point for point in study.points if point.shape == shape)
     return Skin.create(
@@ -142,13 +142,13 @@ def _first_skin(study: Study, shape: Shape) -> Skin:
 
 
 @lru_cache(maxsize=4)
-def _shared_data(study: Study, shape: Shape) -> _SharedData:
+def _shared_data(study: Study, shape: PointShape) -> _SharedData:
     skin, grid, touches, prior, lengths = _first_skin(study, shape), study_grid(study), None, None, None
     if isinstance(grid, SurfaceGrid) and isinstance(skin.layout, SurfaceLayout):
         face_surface = touched_surface(skin.model.mesh, skin.touched_face)
         if not eqx.tree_equal(face_surface, study.outline):
             grid = grid.on(Triangles.of(skin.layout.surface), face_surface)
-    if set(OPTIMALITY) & set(study.scores):
+    if set(SHEET_ONLY_SCORES) & set(study.scores):
         touches = skin.sheet_touches(grid.places, study.indentation, contrast=study.contrast)
         touched = touches.touched
         if isinstance(skin.layout, SurfaceLayout):
@@ -159,7 +159,7 @@ def _shared_data(study: Study, shape: Shape) -> _SharedData:
     return _SharedData(skin.model, touched, touches, prior, grid, skin.thickness, jax.random.key(study.seed))
 
 
-def _point_data(point: Point, current: float) -> _PointData:
+def _point_data(point: StudyPoint, current: float) -> _PointData:
     return _PointData(
         electrodes=point.electrodes,
         protocol=point.measurement_protocol(current),
@@ -176,7 +176,7 @@ def _stack_trees(trees):
 
 @partial(jax.jit, static_argnames=("scores", "num_taxels", "threshold", "num_devices"))
 def _solve_batch(
-    shared: _SharedData,
+    shared_data: _SharedData,
     point_data: _PointData,
     *,
     scores: tuple[str, ...],
@@ -184,42 +184,46 @@ def _solve_batch(
     threshold: float,
     num_devices: int,
 ) -> dict[str, Array]:
-    def solve_point(shared: _SharedData, point_data: _PointData) -> dict[str, Array]:
-        model, touched = _model_and_touched_cells(shared, point_data)
+    def solve_point(shared_data: _SharedData, point_data: _PointData) -> dict[str, Array]:
+        model, touched = _model_and_touched_cells(shared_data, point_data)
         changes = touch_changes(model, point_data.conductivity, touched, linear=True)
-        return _compute_results(shared, point_data, changes, scores=scores, num_taxels=num_taxels, threshold=threshold)
+        return _compute_results(
+            shared_data, point_data, changes, scores=scores, num_taxels=num_taxels, threshold=threshold
+        )
 
     batch = jax.vmap(solve_point, in_axes=(None, 0))
     if num_devices == 1:
-        return batch(shared, point_data)
+        return batch(shared_data, point_data)
     devices = Devices(np.array(jax.devices()), ("point",))
     point_sharding = PartitionSpec("point")
     return jax.shard_map(
         batch, mesh=devices, in_specs=(PartitionSpec(), point_sharding), out_specs=point_sharding, check_vma=False
-    )(shared, point_data)
+    )(shared_data, point_data)
 
 
 def _solve_exactly(
-    shared: _SharedData, all_point_data: list[_PointData], options: dict, solved: Callable[[int], None] | None
+    shared_data: _SharedData, all_point_data: list[_PointData], options: dict, solved: Callable[[int], None] | None
 ) -> Iterator[dict[str, Array]]:
     """Yield the results of each skin, with exact sensitivity maps. The callback `solved` is called as in
     `solve_chunk`."""
     for num_solved, point_data in enumerate(all_point_data, 1):
-        model, touched = _model_and_touched_cells(shared, point_data)
-        yield _compute_results(shared, point_data, touch_changes(model, point_data.conductivity, touched), **options)
+        model, touched = _model_and_touched_cells(shared_data, point_data)
+        yield _compute_results(
+            shared_data, point_data, touch_changes(model, point_data.conductivity, touched), **options
+        )
         if solved is not None and num_solved < len(all_point_data):
             solved(num_solved)
 
 
-def _model_and_touched_cells(shared: _SharedData, point_data: _PointData) -> tuple[ForwardModel, TouchedCells]:
+def _model_and_touched_cells(shared_data: _SharedData, point_data: _PointData) -> tuple[ForwardModel, TouchedCells]:
     """Return the forward model of a point's skin, and the cells that the touches change."""
-    model = shared.model.with_electrodes(point_data.electrodes).with_protocol(point_data.protocol)
+    model = shared_data.model.with_electrodes(point_data.electrodes).with_protocol(point_data.protocol)
     touched = eqx.tree_at(
         # The relative change of a sheet's conductivity is proportional to depth / thickness; layers of one shape have
         # the same thickness.
         lambda cells_to_change: cells_to_change.change,
-        shared.touched,
-        replace_fn=lambda change: change * (shared.thickness / point_data.thickness),
+        shared_data.touched,
+        replace_fn=lambda change: change * (shared_data.thickness / point_data.thickness),
     )
     return model, touched
 

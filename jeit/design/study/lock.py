@@ -39,8 +39,8 @@ def lock_store(path: Path, content_name: str) -> Iterator[None]:
         lock_path.parent.mkdir(parents=True, exist_ok=True)
         descriptor = _acquire(lock_path, path, content_name)
     except OSError as error:
-        verb = "written" if path.exists() else "made"
-        reason = f"the {content_name}'s store cannot be {verb} ({error.strerror})"
+        action_verb = "written" if path.exists() else "made"
+        reason = f"the {content_name}'s store cannot be {action_verb} ({error.strerror})"
         raise OSError(error.errno, reason, str(path)) from error
     try:
         yield
@@ -136,9 +136,9 @@ def _refusal_message(owner: dict, lock_path: Path, store_path: Path, content_nam
         owner_text = "this process" if owner.get("pid") == os.getpid() else owner_text
         remedy = f"wait until it ends, or stop it, then resume the {content_name}."
         return f"{store_path} is being written by {owner_text}{since_text}; {remedy}"
-    machine = "this machine" if _is_on_this_machine(owner) else describe(owner.get("host"))
+    machine_text = "this machine" if _is_on_this_machine(owner) else describe(owner.get("host"))
     return (
-        f"{store_path} is being written by {owner_text} on {machine}{since_text}, or was when that was killed: from "
-        f"here this cannot be seen. Where it still runs, wait; where it does not, delete {lock_path} and resume the "
-        f"{content_name}."
+        f"{store_path} is being written by {owner_text} on {machine_text}{since_text}, or was when that was killed: "
+        f"from here this cannot be seen. Where it still runs, wait; where it does not, delete {lock_path} and resume "
+        f"the {content_name}."
     )

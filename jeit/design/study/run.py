@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from jeit.arguments.extras import need_extra, optional
+from jeit.arguments.extras import import_optional, require_extra
 from jeit.design.study.batch import check_points, solve_chunk
 from jeit.design.study.spec import Study
 from jeit.design.study.store import Store, open_results, writing
@@ -76,20 +76,20 @@ def solve_on_cluster(
 ) -> Iterator[tuple[int, _Result]]:
     """Yield the number of each chunk with its results `solve(shared_data, number)`, in the order in which the workers
     of a `dask.distributed.Client` complete the chunks. Chunks of a lost worker are solved again."""
-    distributed = optional("distributed", "a cluster")
+    distributed = import_optional("distributed", "a cluster")
     # `shared_data` is sent once, as a task, so that it is sent again if the only worker that has it is lost.
     # Scattered data would then be lost, and sending `shared_data` with every chunk would transfer a layer of 70 MB a
     # thousand times.
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sending large graph")
-        work_future = client.submit(_return_unchanged, shared_data, pure=False)
-    futures = {client.submit(solve, work_future, number, pure=False, retries=2): number for number in numbers}
+        shared_data_future = client.submit(_return_unchanged, shared_data, pure=False)
+    futures = {client.submit(solve, shared_data_future, number, pure=False, retries=2): number for number in numbers}
     try:
         for future, results in distributed.as_completed(futures, with_results=True):
             yield futures[future], results
             future.release()
     finally:
-        client.cancel([work_future, *futures])
+        client.cancel([shared_data_future, *futures])
 
 
 def _return_unchanged(data: Any) -> Any:
@@ -125,7 +125,7 @@ def run_study(
     print(results["mean"].values)
     ```
     """
-    need_extra("cluster", "a study")
+    require_extra("cluster", "a study")
     check_points(study)
     with writing(study, path) as store:
         finished_chunks = set(store.intact_chunks())

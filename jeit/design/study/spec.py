@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jeit.design import defaults
-from jeit.design.defaults import OPTIMALITY
-from jeit.design.skin.described_surface import described_surface, surface_identity, typical_cell
+from jeit.design.defaults import SHEET_ONLY_SCORES
+from jeit.design.skin.described_surface import described_surface, surface_identity, typical_cell_size
 from jeit.design.skin.names import ProtocolName, curved_layout, is_layout_file, skin_protocol, study_layout
 from jeit.design.skin.skin import check_cell_size, longer_side, skin_electrodes
 from jeit.design.skin.touch_shapes import AbstractIndentation, Bell, Hemisphere
@@ -41,9 +41,9 @@ _MIN_ELECTRODES = {"adjacent": 4, "opposite": 4, "two-terminal": 2}
 _MAX_FILE_BYTES, _MAX_STORE_BYTES = 2**22, 20e9
 
 
-class Shape(NamedTuple):
-    """Parameters that points must have in common to share a mesh and a batch; fields as in `Point`. `thickness` is 0
-    for sheets, whose mesh does not depend on the thickness."""
+class PointShape(NamedTuple):
+    """Parameters that points must have in common to share a mesh and a batch; fields as in `StudyPoint`. `thickness` is
+    0 for sheets, whose mesh does not depend on the thickness."""
 
     electrodes: int
     protocol: str
@@ -54,7 +54,7 @@ class Shape(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Point:
+class StudyPoint:
     """One skin of a study: its `layout` (with diameters and contact impedances) and other parameters, in SI units.
 
     `pairs`: number of pairs of nearest electrodes that a two-terminal `protocol` measures, 0 for all pairs. `layers`:
@@ -71,10 +71,10 @@ class Point:
     layers: int
 
     @property
-    def shape(self) -> Shape:
+    def shape(self) -> PointShape:
         """Parameters that the points of a batch have in common."""
         thickness = self.thickness if self.layers else 0.0
-        return Shape(self.layout.num_electrodes, self.protocol, self.pairs, self.cell_size, self.layers, thickness)
+        return PointShape(self.layout.num_electrodes, self.protocol, self.pairs, self.cell_size, self.layers, thickness)
 
     @property
     def electrodes(self) -> SheetDiscs | SurfaceDiscs | FaceDiscs:
@@ -123,7 +123,7 @@ class Study:
     """
 
     name: str
-    points: tuple[Point, ...]
+    points: tuple[StudyPoint, ...]
     outline: Rectangle | Triangles
     indentation: AbstractIndentation
     contrast: float
@@ -265,7 +265,7 @@ def _study_from_table(text: str, table: StudyTable, folder: Path) -> Study:
         for layout in layouts_on_meshes:
             _check_layout(layout, outline, layers, table)
     points = tuple(
-        Point(
+        StudyPoint(
             layouts_on_meshes[mesh_index % len(layouts_on_meshes)],
             thickness,
             conductivity,
@@ -330,7 +330,7 @@ def _check_touches(table: StudyTable) -> None:
     """Check that there are enough touches for the scores, and that disk space and memory suffice for the results and
     the computation."""
     scores, num_touches = table.scores, table.touch.columns * table.touch.rows
-    sheet_scores = [score for score in OPTIMALITY if score in scores.wanted]
+    sheet_scores = [score for score in SHEET_ONLY_SCORES if score in scores.wanted]
     num_bytes = 8.0 * table.num_points * num_touches
     if num_bytes > _MAX_STORE_BYTES:
         raise ValueError(
@@ -441,7 +441,7 @@ def _surface_meshes(
         return cell_sizes, outline, [lambda name, *sizes: study_layout(name, folder, outline, *sizes)]
     surfaces = [described_surface(surface_table, folder, size) for size in cell_sizes]
     if isinstance(surface_table, ScanTable) and surface_table.has_cells:
-        cell_sizes = [typical_cell(surfaces[0])]
+        cell_sizes = [typical_cell_size(surfaces[0])]
 
     def layout_factory(surface: Mesh) -> LayoutFactory:
         return lambda name, *sizes: curved_layout(name, folder, surface, surface_table.outward, *sizes)

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jeit.arguments import check_kind
-from jeit.arguments.extras import optional
+from jeit.arguments.extras import import_optional
 from jeit.design.study.contents import Contents, study_contents
 from jeit.design.study.lock import lock_store
 from jeit.design.study.spec import Study
@@ -56,7 +56,7 @@ class ArrayShape(NamedTuple):
     data_type: str
 
 
-def find_danger(path: Path) -> str | None:
+def find_unsafe_content(path: Path) -> str | None:
     """Reason why a store must not be opened; None if nothing in the store can run code or link to other paths. Raises
     `OSError` for files that cannot be read."""
     for folder, folders, files in os.walk(path):
@@ -197,7 +197,7 @@ _EXTRA_PURPOSE = "a store of results"
 _PATH_DESCRIPTION = "that of the store, such as 'results.zarr'"
 
 
-class OtherContents(ValueError):
+class DifferentContentsError(ValueError):
     """Raised if the contents of a store differ from the requested study or work."""
 
 
@@ -212,7 +212,7 @@ class Store:
         """Raises `FileNotFoundError` if there is no store and `create` is False. Raises `ValueError` if the path is not
         a store or is the store of a different study, if the store is damaged, or if opening the store might run code.
         Raises `ImportError` without the extra `cluster`, and `OSError` if the store cannot be written."""
-        zarr = optional("zarr", _EXTRA_PURPOSE)
+        zarr = import_optional("zarr", _EXTRA_PURPOSE)
         self.contents = work if isinstance(work, Contents) else study_contents(work)
         check_kind("path", path, (str, os.PathLike), _PATH_DESCRIPTION)
         self.path, kind = Path(path), self.contents.kind
@@ -232,7 +232,7 @@ class Store:
                 "place where nothing is."
             )
         if attributes.get("fingerprint") != self.contents.fingerprint:
-            raise OtherContents(
+            raise DifferentContentsError(
                 f"{self.path} holds the results of another {kind}, or of this one before it was changed; move it away "
                 "or choose another path."
             )
@@ -307,23 +307,23 @@ class Store:
 
     def open_dataset(self):
         """Open the whole store as an `xarray.Dataset`, whose values are read from disk when they are needed."""
-        return optional("xarray", _EXTRA_PURPOSE).open_zarr(str(self.path), chunks=None, zarr_format=3)
+        return import_optional("xarray", _EXTRA_PURPOSE).open_zarr(str(self.path), chunks=None, zarr_format=3)
 
     def _check(self, expected_arrays: Mapping[str, ArrayShape]) -> None:
         """Check the metadata before Zarr opens the store. Raises `ValueError` if the store is dangerous or damaged."""
         try:
-            danger = find_danger(self.path)
-            damage = None if danger else find_damage(self.path, expected_arrays)
+            danger_text = find_unsafe_content(self.path)
+            damage_text = None if danger_text else find_damage(self.path, expected_arrays)
         except OSError as error:
             raise self._damage_error(error) from None
-        if danger:
+        if danger_text:
             raise ValueError(
-                f"{self.path} is not opened, because it might run code or write elsewhere: {danger}. No "
+                f"{self.path} is not opened, because it might run code or write elsewhere: {danger_text}. No "
                 f"{self.contents.kind} that jeit wrote is like that. Delete it if it came from somebody else, and run "
                 f"the {self.contents.kind} yourself, to another place."
             )
-        if damage:
-            raise self._damage_error(damage)
+        if damage_text:
+            raise self._damage_error(damage_text)
 
     def _attributes(self) -> dict:
         """Read the attributes of the store; empty if the path is not a store. Raises `ValueError` if the attributes
@@ -390,7 +390,7 @@ def open_results(study: Study, path: str | Path):
     results = open_results(study, "study.zarr")
     ```
     """
-    xarray = optional("xarray", _EXTRA_PURPOSE)
+    xarray = import_optional("xarray", _EXTRA_PURPOSE)
     store = Store(study, path, create=False)
     is_finished = np.zeros(len(study.points), bool)
     for number in store.intact_chunks():
@@ -454,10 +454,10 @@ def _remove_temporary_stores(path: Path) -> None:
 
 
 def _checksum(results: Mapping[str, np.ndarray]) -> str:
-    digest = hashlib.sha256()
+    sha256 = hashlib.sha256()
     for name in sorted(results):
-        digest.update(name.encode() + np.ascontiguousarray(results[name], dtype=float).tobytes())
-    return digest.hexdigest()
+        sha256.update(name.encode() + np.ascontiguousarray(results[name], dtype=float).tobytes())
+    return sha256.hexdigest()
 
 
 def _read_json(path: Path) -> dict:

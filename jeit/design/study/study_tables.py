@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from jeit.design import defaults
-from jeit.design.defaults import OPTIMALITY, ScoreName
+from jeit.design.defaults import SHEET_ONLY_SCORES, ScoreName
 from jeit.design.skin.names import ProtocolName
 from jeit.design.skin.skin_file import (
     CELL,
@@ -23,7 +23,7 @@ from jeit.design.skin.skin_file import (
     THICKNESS,
 )
 from jeit.design.skin.surface_tables import SURFACE, SurfaceTable, check_keys_of_surface
-from jeit.files.schema import Number, Several, Table, Word, fault
+from jeit.files.schema import Number, SweptList, Table, Word, fault
 
 # Maximum numbers of layouts and of points of a study, which are created before any computation and take milliseconds
 # and kilobytes each.
@@ -33,7 +33,7 @@ _MAX_LAYOUTS, _MAX_POINTS = 2000, 100_000
 class MaterialSweep(Table):
     """Table "skin": model, size and material of the skins."""
 
-    subject = "a study"
+    name_in_messages = "a study"
     model: Literal["sheet", "layer"] = "sheet"
     width_mm: Annotated[float, SIDE] = 1e3 * defaults.SIDE
     height_mm: Annotated[float, SIDE] = 1e3 * defaults.SIDE
@@ -45,8 +45,8 @@ class LayoutSweep(Table):
     """Table "electrodes": layouts, diameters and contact impedances. If a diameter or impedance is NaN, the values of
     the layout are used."""
 
-    subject = "a study"
-    layouts: Several[Word]
+    name_in_messages = "a study"
+    layouts: SweptList[Word]
     diameter_mm: Annotated[list[float], DIAMETER] = Field(default=[math.nan])
     contact_impedance_ohm_m2: Annotated[list[float], IMPEDANCE] = Field(default=[math.nan])
     minimum_gap_mm: Annotated[float, Number(0, 1000, "mm")] = 0.0
@@ -55,8 +55,8 @@ class LayoutSweep(Table):
 class MeasurementSweep(Table):
     """Table "measurement": measurement protocols, current and noise."""
 
-    subject = "a study"
-    protocol: Several[ProtocolName] = Field(default=[defaults.PROTOCOL])
+    name_in_messages = "a study"
+    protocol: SweptList[ProtocolName] = Field(default=[defaults.PROTOCOL])
     pairs: Annotated[list[int], PAIRS] | None = None
     current_mA: Annotated[float, CURRENT] = 1e3 * defaults.CURRENT
     noise_V: Annotated[list[float], Number(1e-12, 1, "V")] = Field(default=[defaults.NOISE])
@@ -65,21 +65,21 @@ class MeasurementSweep(Table):
 class TouchTable(Table):
     """Table "touch": shape of the touches, and grid of the touched positions."""
 
-    subject = "a study"
+    name_in_messages = "a study"
     indentation: Literal["bell", "hemisphere"] = "bell"
     depth_mm: Annotated[float, Number(0.01, 100, "mm")] = 1e3 * defaults.DEPTH
     deviation_mm: Annotated[float, Number(0.1, 200, "mm")] = 1e3 * defaults.DEVIATION
     diameter_mm: Annotated[float, Number(0.1, 200, "mm")] = 1e3 * defaults.BALL_DIAMETER
-    contrast: Annotated[float, Number(0, defaults.MOST_CONTRAST)] = defaults.CONTRAST
+    contrast: Annotated[float, Number(0, defaults.MAX_CONTRAST)] = defaults.CONTRAST
     exact: bool = False
-    columns: Annotated[int, Number(1, 1000)] = defaults.STUDY_PLACES
-    rows: Annotated[int, Number(1, 1000)] = defaults.STUDY_PLACES
+    columns: Annotated[int, Number(1, 1000)] = defaults.NUM_STUDY_PLACES_PER_SIDE
+    rows: Annotated[int, Number(1, 1000)] = defaults.NUM_STUDY_PLACES_PER_SIDE
 
 
 class CellsSweep(Table):
     """Table "mesh": cell sizes, and number of layers of cells."""
 
-    subject = "a study"
+    name_in_messages = "a study"
     cell_mm: Annotated[list[float], CELL] = Field(default=[1e3 * defaults.CELL_SIZE])
     layers: Annotated[int, LAYERS] = defaults.NUM_LAYERS
 
@@ -87,8 +87,8 @@ class CellsSweep(Table):
 class ScoresTable(Table):
     """Table "scores": scores to be computed, and their parameters."""
 
-    subject = "a study"
-    wanted: Several[ScoreName] = Field(default=["minimum", "mean", "uniformity"])
+    name_in_messages = "a study"
+    wanted: SweptList[ScoreName] = Field(default=["minimum", "mean", "uniformity"])
     num_taxels: Annotated[int, Number(1, 10_000)] = defaults.NUM_TAXELS
     threshold: Annotated[float, Number(0.01, 0.99)] = defaults.THRESHOLD
     correlation_mm: Annotated[float, Number(0.1, 1000, "mm")] = 1e3 * defaults.CORRELATION
@@ -98,7 +98,7 @@ class ScoresTable(Table):
 class StudyTable(Table):
     """All tables of a study file."""
 
-    subject = "a study"
+    name_in_messages = "a study"
     name: Word = "study"
     chunk_points: Annotated[int, Number(1, 4096)] = 16
     skin: MaterialSweep = MaterialSweep()
@@ -119,8 +119,10 @@ class StudyTable(Table):
     def num_points(self) -> int:
         """Number of points of the study, that is of all combinations of swept values."""
         skin, measurement = self.skin, self.measurement
-        other_lists = (measurement.protocol, measurement.pairs or [0], measurement.noise_V, self.mesh.cell_mm)
-        return self.num_layouts * math.prod(map(len, (skin.thickness_mm, skin.conductivity_S_per_m, *other_lists)))
+        other_value_lists = (measurement.protocol, measurement.pairs or [0], measurement.noise_V, self.mesh.cell_mm)
+        return self.num_layouts * math.prod(
+            map(len, (skin.thickness_mm, skin.conductivity_S_per_m, *other_value_lists))
+        )
 
     def value_of(self, key: str) -> Any:
         """Value of the key with the dotted name `key`, such as "mesh.layers"."""
@@ -173,7 +175,7 @@ _REQUIRED_VALUES: dict[str, tuple[str, tuple[str, ...]]] = {
     "touch.deviation_mm": ("touch.indentation", ("bell",)),
     "touch.diameter_mm": ("touch.indentation", ("hemisphere",)),
     "measurement.pairs": ("measurement.protocol", ("two-terminal",)),
-    "measurement.noise_V": ("scores.wanted", ("blind_spot", *OPTIMALITY)),
+    "measurement.noise_V": ("scores.wanted", ("blind_spot", *SHEET_ONLY_SCORES)),
     "scores.num_taxels": ("scores.wanted", ("taxels",)),
     "scores.threshold": ("scores.wanted", ("taxels",)),
     "scores.seed": ("scores.wanted", ("taxels",)),

@@ -86,10 +86,10 @@ class ConductingDisk:
         if self.inclusion_ratio == 0.0:
             return np.zeros_like(angle)
         contrast = (self.inclusion_conductivity - self.conductivity) / (self.inclusion_conductivity + self.conductivity)
-        modes = np.arange(1, 3 + int(np.ceil(np.log(1e-18) / (2.0 * np.log(self.inclusion_ratio)))))
-        decay = contrast * self.inclusion_ratio ** (2.0 * modes)
+        mode_numbers = np.arange(1, 3 + int(np.ceil(np.log(1e-18) / (2.0 * np.log(self.inclusion_ratio)))))
+        decay = contrast * self.inclusion_ratio ** (2.0 * mode_numbers)
         series = np.polynomial.chebyshev.chebval(
-            np.cos(angle), np.concatenate([[0.0], -2.0 * decay / (1.0 + decay) / modes])
+            np.cos(angle), np.concatenate([[0.0], -2.0 * decay / (1.0 + decay) / mode_numbers])
         )
         return series / (np.pi * self.conductivity)
 
@@ -161,7 +161,7 @@ def arc_transfer_impedance(
 
     theta = angles[:, None] + half_angles[:, None] * nodes
     dtype = np.result_type(disk.kernel(np.ones(1)), z)
-    galerkin = np.zeros((num, order, num, order), dtype=dtype)
+    galerkin_matrix = np.zeros((num, order, num, order), dtype=dtype)
     source = np.zeros((num, order, num))
     for row in range(num):
         for column in range(num):
@@ -171,21 +171,21 @@ def arc_transfer_impedance(
                 block = weighted.T @ disk.kernel(distance) @ weighted
             else:
                 # 2 sin(δ/2)/δ, computed with sinc(x) = sin(πx)/(πx), is the smooth factor of the logarithm's argument.
-                smooth_part = -np.log(np.sinc(distance / (2.0 * np.pi))) / (np.pi * disk.conductivity)
-                block = weighted.T @ (smooth_part + disk.inclusion_kernel(distance)) @ weighted
+                smooth_kernel_part = -np.log(np.sinc(distance / (2.0 * np.pi))) / (np.pi * disk.conductivity)
+                block = weighted.T @ (smooth_kernel_part + disk.inclusion_kernel(distance)) @ weighted
                 logarithm = logarithm_moments(order)
                 logarithm[0, 0] += 4.0 * np.log(half_angles[row])
                 block = block - logarithm / (np.pi * disk.conductivity)
                 mass = disk.radius * half_angles[row] * 2.0 / (2.0 * np.arange(order) + 1.0)
-                galerkin[row, :, row, :] += z[row] * np.diag(mass)
-            galerkin[row, :, column, :] += scale * block
+                galerkin_matrix[row, :, row, :] += z[row] * np.diag(mass)
+            galerkin_matrix[row, :, column, :] += scale * block
         source[row, 0, row] = 2.0 * disk.radius * half_angles[row]
 
     source = source.reshape(num * order, num)
-    density = np.linalg.solve(galerkin.reshape(num * order, num * order), source)
+    density = np.linalg.solve(galerkin_matrix.reshape(num * order, num * order), source)
     impedance = np.linalg.inv(source.T @ density)
-    centring = np.eye(num) - 1.0 / num
-    return centring @ impedance @ centring
+    centring_matrix = np.eye(num) - 1.0 / num
+    return centring_matrix @ impedance @ centring_matrix
 
 
 def disc_contact_resistance(conductivity: complex, radius: float, contact_impedance: complex) -> complex:
@@ -231,23 +231,24 @@ def disc_transfer_impedance(
     centre = positions[:, 0] + 1j * positions[:, 1]
     num_samples = 4 * num_multipoles
     circle = np.exp(2j * np.pi * np.arange(num_samples) / num_samples)
-    # Row n of `analysis` maps samples on a circle to the coefficient of cos nφ, and row N + n to that of sin nφ.
+    # Row n of `multipole_analysis_matrix` maps samples on a circle to the coefficient of cos nφ, and row N + n to that
+    # of sin nφ.
     harmonics = circle ** multipole_orders[:, None]
-    analysis = np.concatenate([harmonics.real, harmonics.imag]) * (2.0 / num_samples)
+    multipole_analysis_matrix = np.concatenate([harmonics.real, harmonics.imag]) * (2.0 / num_samples)
     dtype = np.result_type(disk.conductivity, contact_impedance, 1.0)
-    centring = np.eye(num) - 1.0 / num
+    centring_matrix = np.eye(num) - 1.0 / num
 
-    regular = np.zeros((num, 2 * num_multipoles, num, 2 * num_multipoles))
+    regular_kernel = np.zeros((num, 2 * num_multipoles, num, 2 * num_multipoles))
     regular_mean = np.zeros((num, num, 2 * num_multipoles))
-    fed = np.zeros((num, 2 * num_multipoles, num))
+    fed_multipoles = np.zeros((num, 2 * num_multipoles, num))
     fed_mean = np.zeros((num, num))
-    reflection = np.zeros((num, 2 * num_multipoles), dtype=dtype)
+    reflection_factors = np.zeros((num, 2 * num_multipoles), dtype=dtype)
     contact = np.zeros(num, dtype=dtype)
     for electrode_index in range(num):
         transfer_length = np.sqrt(disk.conductivity * contact_impedance[electrode_index])
         argument = radii[electrode_index] / transfer_length
         slope = argument * ive(multipole_orders + 1, argument) / ive(multipole_orders, argument) + multipole_orders
-        reflection[electrode_index] = np.tile((multipole_orders - slope) / (multipole_orders + slope), 2)
+        reflection_factors[electrode_index] = np.tile((multipole_orders - slope) / (multipole_orders + slope), 2)
         contact[electrode_index] = disc_contact_resistance(
             disk.conductivity, radii[electrode_index], contact_impedance[electrode_index]
         )
@@ -257,31 +258,35 @@ def disc_transfer_impedance(
             # The image is a²/w̄ − w_l = (a² − w_l w̄)/w̄; its term log|w̄| cancels for currents with sum zero.
             logarithm = -np.log(np.abs(disk.radius**2 - centre[source] * point.conj()))
             # The multipole cos nφ is the real part of (b/(w − w_l))^n, and sin nφ is minus its imaginary part.
-            field = (radii[source] * point.conj() / (disk.radius**2 - centre[source] * point.conj()))[
+            field_of_source = (radii[source] * point.conj() / (disk.radius**2 - centre[source] * point.conj()))[
                 :, None
             ] ** multipole_orders
             if electrode_index == source:
                 logarithm = logarithm - np.log(radii[source])
             else:
                 logarithm = logarithm - np.log(np.abs(point - centre[source]))
-                field = field + (radii[source] / (point - centre[source]))[:, None] ** multipole_orders
-            multipoles = np.concatenate([field.real, -field.imag], axis=1)
-            regular[electrode_index, :, source, :] = analysis @ multipoles
+                field_of_source = (
+                    field_of_source + (radii[source] / (point - centre[source]))[:, None] ** multipole_orders
+                )
+            multipoles = np.concatenate([field_of_source.real, -field_of_source.imag], axis=1)
+            regular_kernel[electrode_index, :, source, :] = multipole_analysis_matrix @ multipoles
             regular_mean[electrode_index, source] = multipoles.mean(axis=0)
-            fed[electrode_index, :, source] = analysis @ logarithm
+            fed_multipoles[electrode_index, :, source] = multipole_analysis_matrix @ logarithm
             fed_mean[electrode_index, source] = logarithm.mean()
 
-    current = centring / (2.0 * np.pi * disk.conductivity)
+    current = centring_matrix / (2.0 * np.pi * disk.conductivity)
     size = num * 2 * num_multipoles
-    scatter = reflection[:, :, None, None] * regular
-    incident = reflection[:, :, None] * fed
-    amplitude = np.linalg.solve(np.eye(size) - scatter.reshape(size, size), incident.reshape(size, num) @ current)
-    potential = fed_mean @ current + regular_mean.reshape(num, size) @ amplitude + contact[:, None] * centring
-    return centring @ potential
+    scatter = reflection_factors[:, :, None, None] * regular_kernel
+    incident_multipoles = reflection_factors[:, :, None] * fed_multipoles
+    amplitude = np.linalg.solve(
+        np.eye(size) - scatter.reshape(size, size), incident_multipoles.reshape(size, num) @ current
+    )
+    potential = fed_mean @ current + regular_mean.reshape(num, size) @ amplitude + contact[:, None] * centring_matrix
+    return centring_matrix @ potential
 
 
 # Distance in radii of the sleeve beyond which mirror images are negligible in double precision.
-_IMAGE_CUTOFF = 45.0
+_MAX_IMAGE_DISTANCE = 45.0
 
 
 def sphere_sheet_impedance(positions: np.ndarray, conductivity: complex) -> np.ndarray:
@@ -308,7 +313,7 @@ def sleeve_sheet_impedance(
     """
     angle_difference = angles[:, None] - angles
     z, source = heights[:, None], heights
-    num_images = int(np.ceil(_IMAGE_CUTOFF * radius / (2 * height))) + 1
+    num_images = int(np.ceil(_MAX_IMAGE_DISTANCE * radius / (2 * height))) + 1
     potential = np.zeros(angle_difference.shape)
     for k in range(-num_images, num_images + 1):
         for axial_distance in (z - source + 2 * k * height, z + source + 2 * k * height):

@@ -64,18 +64,18 @@ def face_patch_impedance(
     differ by c/2.
     """
     a, b, c = size
-    wave = [np.arange(number) * np.pi / side for number, side in zip(num_modes, (a, b), strict=True)]
+    wavenumbers = [np.arange(number) * np.pi / side for number, side in zip(num_modes, (a, b), strict=True)]
     modes_x, modes_y = (
         np.sinc(k * width / 2 / np.pi) * np.cos(k * positions[:, axis, None])
-        for axis, (k, width) in enumerate(zip(wave, patch, strict=True))
+        for axis, (k, width) in enumerate(zip(wavenumbers, patch, strict=True))
     )
-    kappa = np.hypot(wave[0][:, None], wave[1])
-    kappa[0, 0] = 1.0
-    mode_weights = np.outer(*(np.where(k > 0, 2, 1) for k in wave))
-    decay_factor = np.exp(-kappa * c)
+    decay_rates = np.hypot(wavenumbers[0][:, None], wavenumbers[1])
+    decay_rates[0, 0] = 1.0
+    mode_weights = np.outer(*(np.where(k > 0, 2, 1) for k in wavenumbers))
+    decay_factor = np.exp(-decay_rates * c)
     same_face_modes, opposite_face_modes = (
-        (1 + decay_factor**2) / (1 - decay_factor**2) / kappa,
-        2 * decay_factor / (1 - decay_factor**2) / kappa,
+        (1 + decay_factor**2) / (1 - decay_factor**2) / decay_rates,
+        2 * decay_factor / (1 - decay_factor**2) / decay_rates,
     )
     same_face_modes[0, 0], opposite_face_modes[0, 0] = 0.0, -c / 2
     is_same_face = np.equal.outer(positions[:, 2] > c / 2, positions[:, 2] > c / 2)
@@ -104,11 +104,11 @@ class ConductingCylinder:
         response = np.zeros((num_around, num_along))
         power = ratio ** (2.0 * bessel_orders[1:, 0])
         response[1:, 0] = self.radius / bessel_orders[1:, 0] * (1 + power) / (1 - power)
-        wave = np.arange(1, num_along) * np.pi / self.height
-        outer_bessel = _Bessel(num_around, wave * self.radius)
-        response[:, 1:] = 1 / (wave * outer_bessel.growth)
+        axial_wavenumbers = np.arange(1, num_along) * np.pi / self.height
+        outer_bessel = _Bessel(num_around, axial_wavenumbers * self.radius)
+        response[:, 1:] = 1 / (axial_wavenumbers * outer_bessel.growth)
         if self.inner_radius > 0:
-            inner_bessel = _Bessel(num_around, wave * self.inner_radius)
+            inner_bessel = _Bessel(num_around, axial_wavenumbers * self.inner_radius)
             # Ratio of the K_n term of F to its I_n term at R₂.
             share = (
                 inner_bessel.growth
@@ -133,12 +133,12 @@ def wall_patch_impedance(
     (arc length, height) in metres. `num_modes`: number of modes summed around and along the cylinder.
     """
     n, m = np.arange(num_modes[0]), np.arange(num_modes[1])
-    wave = m * np.pi / cylinder.height
+    axial_wavenumber = m * np.pi / cylinder.height
     # sin(x)/x is numpy.sinc(x/π).
-    around = np.sinc(n * size[0] / (2 * cylinder.radius) / np.pi)
-    axial_factors = np.sinc(wave * size[1] / 2 / np.pi) * np.cos(wave * heights[:, None])
+    circumferential_factor = np.sinc(n * size[0] / (2 * cylinder.radius) / np.pi)
+    axial_factors = np.sinc(axial_wavenumber * size[1] / 2 / np.pi) * np.cos(axial_wavenumber * heights[:, None])
     mode_factors = np.outer(np.where(n > 0, 2, 1), np.where(m > 0, 2, 1))
-    weight = mode_factors * cylinder.response(*num_modes) * around[:, None] ** 2
+    weight = mode_factors * cylinder.response(*num_modes) * circumferential_factor[:, None] ** 2
     angular_factors = np.cos(n * (angles[:, None] - angles)[..., None])
     impedance = np.einsum("lkn,nm,lm,km->lk", angular_factors, weight, axial_factors, axial_factors, optimize=True)
     return impedance / (2 * np.pi * cylinder.radius * cylinder.height * cylinder.conductivity)
@@ -159,9 +159,13 @@ class _Bessel:
         second_kind_ratios[0] = kve(1, x) / kve(0, x)  # K_{n+1} / K_n
         for n in range(1, count):
             second_kind_ratios[n] = 2 * n / x + 1 / second_kind_ratios[n - 1]
-        zero = np.zeros((1, len(x)))
-        self.log_i = np.log(ive(0, x)) + x + np.concatenate([zero, np.cumsum(np.log(first_kind_ratios[:-1]), axis=0)])
-        self.log_k = np.log(kve(0, x)) - x + np.concatenate([zero, np.cumsum(np.log(second_kind_ratios[:-1]), axis=0)])
+        zero_row = np.zeros((1, len(x)))
+        self.log_i = (
+            np.log(ive(0, x)) + x + np.concatenate([zero_row, np.cumsum(np.log(first_kind_ratios[:-1]), axis=0)])
+        )
+        self.log_k = (
+            np.log(kve(0, x)) - x + np.concatenate([zero_row, np.cumsum(np.log(second_kind_ratios[:-1]), axis=0)])
+        )
         self.growth, self.decay = first_kind_ratios + bessel_orders / x, second_kind_ratios - bessel_orders / x
 
 

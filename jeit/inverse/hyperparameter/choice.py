@@ -20,7 +20,7 @@ DEFAULT_RULE = "noise-figure"
 GAUSS_NEWTON_HYPERPARAMETER = 5.0
 """Default λ of Gauss-Newton images of a tank relative to a reference frame, with a smooth prior; the prior standard
 deviation of log σ is then 1/5."""
-EDGE_PRICE = 300.0
+EDGE_HYPERPARAMETER_PENALTY = 300.0
 """Default λ of total variation: penalty of an edge as long as the body is wide, per unit of jump of log σ across the
 edge."""
 

@@ -103,7 +103,7 @@ def blur_radius(
     strength = signal_to_noise * np.sqrt(len(signals)) / np.maximum(signal_norms, np.finfo(float).tiny)
     components = adjoint(np.asarray(spectrum.basis)) @ signals
     # Data that images in the prior's null space explain are imaged independently of λ.
-    null_space_weights = np.asarray(spectrum.null_space) @ np.linalg.pinv(np.asarray(spectrum.seen))
+    null_space_weights = np.asarray(spectrum.null_space) @ np.linalg.pinv(np.asarray(spectrum.observed_null_space))
     null_space_images, null_space_variance = null_space_weights @ signals, np.sum(abs(null_space_weights) ** 2, axis=1)
     damping = 1 / (eigenvalues + np.asarray(candidates)[:, None] ** 2)
     variance = damping**2 @ (abs(modes) ** 2).T + null_space_variance
@@ -128,15 +128,17 @@ def select_spread_cells(mesh: Mesh, num_cells: int) -> Int[np.ndarray, " T"]:
         start + (np.arange(num_steps) + 0.5) * (end - start) / num_steps
         for start, end, num_steps in zip(lower_corner, upper_corner, counts, strict=True)
     ]
-    lattice = np.stack(np.meshgrid(*coordinates, indexing="ij"), axis=-1).reshape(-1, mesh.space_dimension)
-    distances, nearest_cells = (np.asarray(result) for result in KDTree(centres).query(lattice))
+    grid_points = np.stack(np.meshgrid(*coordinates, indexing="ij"), axis=-1).reshape(-1, mesh.space_dimension)
+    distances, nearest_cells = (np.asarray(result) for result in KDTree(centres).query(grid_points))
     # A surface in space passes between lattice points, so lattice points up to half a spacing from the surface count as
     # inside.
     is_inside = distances <= (spacing / 2 if mesh.is_surface else cell_measures[nearest_cells] ** (1 / mesh.dimension))
     return np.unique(nearest_cells[is_inside] if is_inside.any() else nearest_cells)
 
 
-def greit_noise_figure(target: float, eigenvalues, signal, data_ratio: float, image_modes, measure) -> float:
+def greit_noise_figure(
+    target: float, eigenvalues, signal, data_signal_to_noise: float, image_mode_coefficients, measure
+) -> float:
     """Smallest λ at which GREIT's noise figure is `target`. Raises `ValueError` if no λ gives this noise figure.
 
     The noise figure is the signal-to-noise ratio of the data divided by that of the image, for one target object (Adler
@@ -144,16 +146,19 @@ def greit_noise_figure(target: float, eigenvalues, signal, data_ratio: float, im
 
     The columns of X are the desired images of training targets, the columns of Y the data of the targets, and λ is the
     hyperparameter. With the eigendecomposition YYᵀ = VΛVᵀ, the image of data y is XYᵀV (Λ + λ²)⁻¹ Vᵀy. `signal`: Vᵀy;
-    `image_modes`: XYᵀV; `data_ratio`: signal-to-noise ratio of the data; `measure`: areas of the cells. White noise of
-    unit variance in the data gives a cell of the image the variance Σ (XYᵀV)² / (Λ + λ²)².
+    `image_mode_coefficients`: XYᵀV; `data_signal_to_noise`: signal-to-noise ratio of the data; `measure`: areas of the
+    cells. White noise of unit variance in the data gives a cell of the image the variance Σ (XYᵀV)² / (Λ + λ²)².
     """
     weight = measure / measure.sum()
-    noise_gain = weight @ image_modes**2
+    noise_gain = weight @ image_mode_coefficients**2
 
     def excess_noise_figure(log_hyperparameter) -> float:
         filter_values = 1 / (eigenvalues + np.exp(2 * log_hyperparameter))
-        noise, image = np.sqrt(noise_gain @ filter_values**2), weight @ np.abs(image_modes @ (signal * filter_values))
-        return float(np.log(data_ratio * noise / image / target))
+        noise, image = (
+            np.sqrt(noise_gain @ filter_values**2),
+            weight @ np.abs(image_mode_coefficients @ (signal * filter_values)),
+        )
+        return float(np.log(data_signal_to_noise * noise / image / target))
 
     grid = np.log(np.sqrt(eigenvalues.max()) * np.logspace(-6, 1, 71))
     grid_excesses = np.array([excess_noise_figure(grid_point) for grid_point in grid])
@@ -164,8 +169,8 @@ def greit_noise_figure(target: float, eigenvalues, signal, data_ratio: float, im
             f"noise_figure: no hyperparameter gives {target:g}; here it lies between {min_figure:.3g} and "
             f"{max_figure:.3g}. A larger radius brings it down; a larger noise_figure takes a noisier image."
         )
-    bracket = (grid[below_target[0] - 1], grid[below_target[0]])
-    return float(np.exp(scipy.optimize.root_scalar(excess_noise_figure, bracket=bracket, rtol=1e-10).root))
+    search_interval = (grid[below_target[0] - 1], grid[below_target[0]])
+    return float(np.exp(scipy.optimize.root_scalar(excess_noise_figure, bracket=search_interval, rtol=1e-10).root))
 
 
 Rule = Callable[[Spectrum, Float[Array, " M"] | None, Mesh | None], Choice]
@@ -193,7 +198,9 @@ def generalised_cross_validation(spectrum: Spectrum, data: ArrayLike | None, mes
     # Repeated readings have filter 1 but no residual, so their number is subtracted from the number of channels and
     # from the trace.
     num_independent = len(data) - spectrum.repeated
-    gcv_scores = num_independent * residual**2 / (_filters(spectrum, candidates).sum(axis=1) - spectrum.repeated) ** 2
+    gcv_scores = (
+        num_independent * residual**2 / (_filter_factors(spectrum, candidates).sum(axis=1) - spectrum.repeated) ** 2
+    )
     return Choice.among("gcv", candidates, int(np.argmin(gcv_scores)), gcv_scores, (residual, penalty))
 
 
@@ -227,21 +234,28 @@ def discrepancy(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = 
     criterion = residual / np.sqrt(degrees_of_freedom)
     allowed_indices = np.flatnonzero(criterion <= noise)
     candidate_index = allowed_indices[-1] if allowed_indices.size else 0
-    bracket = None
+    search_interval = None
     if allowed_indices.size and candidate_index + 1 < len(candidates):
 
         def excess_misfit(log_value) -> float:
             return float(
-                np.sqrt(((_filters(spectrum, np.exp(log_value)) * components) ** 2).sum() / degrees_of_freedom) - noise
+                np.sqrt(((_filter_factors(spectrum, np.exp(log_value)) * components) ** 2).sum() / degrees_of_freedom)
+                - noise
             )
 
-        bracket = np.exp(
+        search_interval = np.exp(
             scipy.optimize.root_scalar(
                 excess_misfit, bracket=np.log(candidates[candidate_index : candidate_index + 2])
             ).root
         )
     return Choice.among(
-        "discrepancy", candidates, candidate_index, criterion, (residual, penalty), target=float(noise), between=bracket
+        "discrepancy",
+        candidates,
+        candidate_index,
+        criterion,
+        (residual, penalty),
+        target=float(noise),
+        between=search_interval,
     )
 
 
@@ -346,14 +360,14 @@ def _check_problem(problem, name: str) -> None:
     check_has_values("hyperparameter: the problem", problem, f"the rule '{name}' looks at", remedy)
 
 
-def _filters(spectrum: Spectrum, candidates) -> Float[np.ndarray, "K r"]:
+def _filter_factors(spectrum: Spectrum, candidates) -> Float[np.ndarray, "K r"]:
     squared = np.atleast_1d(candidates)[:, None] ** 2
     return squared / (np.asarray(spectrum.eigenvalues) + squared)
 
 
 def _curvature(spectrum: Spectrum, data, candidates) -> Float[np.ndarray, " K"]:
     """Curvature of the L-curve with parameter t = log λ, computed with df/dt = 2f(1 - f) for the filter f."""
-    filters, eigenvalues = _filters(spectrum, candidates), np.asarray(spectrum.eigenvalues)
+    filters, eigenvalues = _filter_factors(spectrum, candidates), np.asarray(spectrum.eigenvalues)
     squared_components = abs(adjoint(np.asarray(spectrum.basis)) @ data) ** 2
     penalty_terms = (
         squared_components * eigenvalues / (eigenvalues + candidates[:, None] ** 2) ** 2

@@ -105,13 +105,13 @@ def greit(
         _ball_radius(float(cell_measures.sum()), mesh.dimension),
         cell_measures @ cell_centres / cell_measures.sum(),
     )
-    positions, coverage = _place_targets(mesh, body_centre, target_radius * body_radius, num_targets)
-    desired_images = _desired_images(mesh, positions, coverage.T @ cell_measures, radius * body_radius)
+    positions, target_coverage = _place_targets(mesh, body_centre, target_radius * body_radius, num_targets)
+    desired_images = _desired_images(mesh, positions, target_coverage.T @ cell_measures, radius * body_radius)
     # Responses are computed only for those combinations of channels that a body can change, which are fewer than the
     # channels.
     directions = data_directions(model.protocol, channels, root_weight)
     weighted_directions = directions.T * np.asarray(root_weight)  # (r, K)
-    responses, cell_coverage = np.zeros((len(weighted_directions), len(positions))), coverage.tocsr()
+    responses, cell_coverage = np.zeros((len(weighted_directions), len(positions))), target_coverage.tocsr()
     for cells, block in combined_blocks(model, conductivity, channels, weighted_directions):
         responses += (cell_coverage[cells].T @ block.T).T / np.sqrt(len(positions))
     eigenvalues, vectors = np.linalg.eigh(responses @ responses.T)
@@ -119,14 +119,14 @@ def greit(
     image_modes = desired_images @ (responses.T @ vectors) / np.sqrt(len(positions))
     if isinstance(hyperparameter, str):
         central_response = responses[:, np.argmin(np.linalg.norm(positions - body_centre, axis=1))]
-        data_ratio = float(np.abs(directions @ central_response).mean())
+        data_signal_to_noise = float(np.abs(directions @ central_response).mean())
         sampled_cells = slice(None, None, max(1, len(cell_measures) // _NUM_MEAN_CELLS))
         signal_components = vectors.T @ central_response
         chosen_hyperparameter = greit_noise_figure(
             noise_figure,
             eigenvalues,
             signal_components,
-            data_ratio,
+            data_signal_to_noise,
             image_modes[sampled_cells],
             cell_measures[sampled_cells],
         )
@@ -160,20 +160,22 @@ def _place_targets(mesh: Mesh, centre, radius: float, num_targets: int) -> tuple
         spacing = np.cbrt(cell_measures.sum() / num_targets)
         grid = _cubic_lattice(lower_corner, upper_corner, centre, spacing)
     tree, entry_groups = KDTree(grid), []
-    for samples, sample_cells, sample_shares in _sample_points(mesh, radius / _SAMPLES_PER_RADIUS[mesh.dimension]):
+    for samples, sample_cells, fractions_of_samples in _sample_points(
+        mesh, radius / _SAMPLES_PER_RADIUS[mesh.dimension]
+    ):
         if mesh.dimension == 3:
             offsets = (samples - centre) / spacing
             offsets -= np.rint(offsets)  # offset from the nearest centre; not all points lie within a target
             near_indices = np.flatnonzero(
                 np.einsum("qi,qi->q", offsets, offsets) < (_SEARCH_RADII * radius / spacing) ** 2
             )
-            samples, sample_cells, sample_shares = (
+            samples, sample_cells, fractions_of_samples = (
                 samples[near_indices],
                 sample_cells[near_indices],
-                sample_shares[near_indices],
+                fractions_of_samples[near_indices],
             )
         pairs = tree.sparse_distance_matrix(KDTree(samples), radius, output_type="ndarray")
-        entry_groups.append((sample_shares[pairs["j"]], sample_cells[pairs["j"]], pairs["i"]))
+        entry_groups.append((fractions_of_samples[pairs["j"]], sample_cells[pairs["j"]], pairs["i"]))
     overlap_fractions, cells, targets = (
         np.concatenate(group_arrays) for group_arrays in zip(*entry_groups, strict=True)
     )

@@ -192,8 +192,10 @@ class LinearReconstruction:
         if not np.isfinite(voltages).all():
             raise ValueError("difference has NaN or infinite voltages; put zeros in masked channels.")
         first_channels, second_channels, ratio, mixing, weights = self._numpy_arrays
-        combined = _combine_channels(voltages, first_channels, second_channels, ratio, mixing)
-        return on_device(combined @ weights) if is_forked() else product_for_jax(combined, weights)
+        combined_difference = _combine_channels(voltages, first_channels, second_channels, ratio, mixing)
+        return (
+            on_device(combined_difference @ weights) if is_forked() else product_for_jax(combined_difference, weights)
+        )
 
     def image_noise(self, noise: Float[Array | np.ndarray, " M"]) -> Float[np.ndarray, " m"]:
         """Standard deviation (m,) of the image in every cell, S/m (2-D: S), due to independent errors of the channels
@@ -222,12 +224,12 @@ def _full_matrix(reconstruction: LinearReconstruction) -> Inexact[Array, "m M"]:
     weights = (
         reconstruction.weights if reconstruction.mixing is None else reconstruction.mixing @ reconstruction.weights
     )
-    full = sum_into(
+    full_matrix = sum_into(
         (reconstruction.num_measurements, weights.shape[1]),
         reconstruction.second,
         reconstruction.ratio[:, None] * weights,
     )
-    return add_into(full, reconstruction.first, weights).T
+    return add_into(full_matrix, reconstruction.first, weights).T
 
 
 def _image_product(arrays, difference) -> Any:
@@ -236,8 +238,8 @@ def _image_product(arrays, difference) -> Any:
 
 
 def _combine_channels(difference, first_channels, second_channels, ratio, mixing) -> Any:
-    combined = difference[..., first_channels] + ratio * difference[..., second_channels]
-    return combined if mixing is None else combined @ mixing
+    combined_difference = difference[..., first_channels] + ratio * difference[..., second_channels]
+    return combined_difference if mixing is None else combined_difference @ mixing
 
 
 def _find_proportional_channels(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

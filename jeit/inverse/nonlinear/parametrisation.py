@@ -126,8 +126,8 @@ class ElectrodePosition(AbstractUnknown):
 
     def fits(self, model):
         """Whether the model has the same number of electrodes as the unknown, of a kind that can be moved."""
-        movable = isinstance(model.electrodes, AbstractMovableElectrodes)
-        return movable and self.direction.shape[0] == model.electrodes.num_electrodes
+        has_movable_electrodes = isinstance(model.electrodes, AbstractMovableElectrodes)
+        return has_movable_electrodes and self.direction.shape[0] == model.electrodes.num_electrodes
 
     def apply(self, model, estimate, values):
         """Return the model with electrodes displaced by `values`, and the unchanged image."""

@@ -37,7 +37,7 @@ from jeit.inverse.nonlinear.parametrisation import AbstractLink, AbstractUnknown
 from jeit.inverse.prior.bases import AbstractBasis, DenseBasis, expand_rows
 from jeit.inverse.prior.penalties import AbstractPenalty
 from jeit_solvers import QuadraticModel, as_minimum, symmetric_eigen, symmetric_inverse
-from jeit_solvers.engines import either_engine, has_values, host, namespace, on_device, on_host
+from jeit_solvers.engines import has_values, host, namespace, numpy_or_compiled, on_device, on_host
 from jeit_solvers.module import Module
 
 # Relative distance from a bound within which a coefficient counts as being at the bound; solvers scale coefficients and
@@ -152,11 +152,13 @@ def independent_data(
     supports it.
     """
     used_indices = np.flatnonzero(is_used)
-    observed_model = model if is_used.all() else model.with_protocol(model.protocol.subset(used_indices))
-    channels = IndependentChannels.create(observed_model.protocol)
-    independent_model = observed_model
-    if has_values(observed_model.protocol):
-        independent_model = observed_model.with_protocol(observed_model.protocol.subset(np.asarray(channels.index)))
+    model_of_used_channels = model if is_used.all() else model.with_protocol(model.protocol.subset(used_indices))
+    channels = IndependentChannels.create(model_of_used_channels.protocol)
+    independent_model = model_of_used_channels
+    if has_values(model_of_used_channels.protocol):
+        independent_model = model_of_used_channels.with_protocol(
+            model_of_used_channels.protocol.subset(np.asarray(channels.index))
+        )
     # For a solid body, compiled programs would hold several copies of the Jacobian.
     if at_once and (model.at_once or model.mesh.dimension == 3) and has_values(independent_model):
         independent_model, channels = on_host(
@@ -177,13 +179,13 @@ def keep_informed_shapes(inversion: Inversion, min_signal: float, persistence: f
     scale = np.sqrt(
         _expected_variance(squared_singular_values[is_informed], persistence) / squared_singular_values[is_informed]
     )
-    combinations = scale[:, None] * scaled_right_vectors[is_informed]
-    shapes = host.asarray(expand_rows(on_host(inversion.basis), combinations).T, np.float32)
+    shape_combinations = scale[:, None] * scaled_right_vectors[is_informed]
+    shapes = host.asarray(expand_rows(on_host(inversion.basis), shape_combinations).T, np.float32)
     informed_inversion = eqx.tree_at(lambda problem: problem.basis, inversion, DenseBasis(shapes))
     return informed_inversion if namespace(inversion) is np else on_device(informed_inversion)
 
 
-@either_engine
+@numpy_or_compiled
 def _singular_values(inversion: Inversion):
     """Squared singular values of the whitened Jacobian at the background with respect to the image's coefficients, and
     its right singular vectors multiplied by the singular values."""
@@ -245,7 +247,7 @@ class Inversion(Module):
         """Image x per cell, on the link's scale."""
         return self._model_and_image(*self._split_coefficients(coefficients))[1]
 
-    def applied(self, model: ForwardModel, coefficients: Float[Array, " n"]) -> ForwardModel:
+    def with_applied_unknowns(self, model: ForwardModel, coefficients: Float[Array, " n"]) -> ForwardModel:
         """Copy of `model` changed by the estimated unknowns, such as contact impedances or electrode positions."""
         for unknown, values in zip(self.unknowns, self.values(coefficients), strict=True):
             model, _ = unknown.apply(model, self.reference, values)
@@ -278,8 +280,10 @@ class Inversion(Module):
             jacobian = self.basis.restrict(jacobian * self.link.slope(estimate))
         columns = [jacobian]
         if self.unknowns:
-            unknown_blocks = jax.jacfwd(lambda values: self._predict(shapes, values))(values)
-            columns += [block * unknown.deviation for block, unknown in zip(unknown_blocks, self.unknowns, strict=True)]
+            jacobian_of_unknowns = jax.jacfwd(lambda values: self._predict(shapes, values))(values)
+            columns += [
+                block * unknown.deviation for block, unknown in zip(jacobian_of_unknowns, self.unknowns, strict=True)
+            ]
         weight, xp = self.data.weight, namespace(voltages, jacobian)
         # A factorisation may succeed although some conductivities are negative; NaN causes a descent to reject the
         # point.
@@ -365,11 +369,13 @@ def _preconditioner(point, problem):
     inverse_data_covariance = symmetric_inverse((data_covariance + data_covariance.T) / 2 + inversion.data.covariance)
 
     def apply_preconditioner(vector):
-        prior_part = inversion.penalty.inverse_hessian(coefficients, is_free, jnp.where(is_free, vector, 0)[:, None])[
-            :, 0
-        ]
+        preconditioned_image = inversion.penalty.inverse_hessian(
+            coefficients, is_free, jnp.where(is_free, vector, 0)[:, None]
+        )[:, 0]
         return jnp.where(
-            is_free, prior_part - covariance_product @ (inverse_data_covariance @ (jacobian @ prior_part)), vector
+            is_free,
+            preconditioned_image - covariance_product @ (inverse_data_covariance @ (jacobian @ preconditioned_image)),
+            vector,
         )
 
     return apply_preconditioner

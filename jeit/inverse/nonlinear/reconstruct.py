@@ -39,7 +39,7 @@ from jeit.inverse.prior.matern import DEFAULT_PRIOR
 from jeit.inverse.prior.priors import AbstractPrior, check_prior
 from jeit.inverse.spectrum import Spectrum
 from jeit_solvers import Status
-from jeit_solvers.engines import as_array, either_engine, has_values, namespace, on_device, on_host
+from jeit_solvers.engines import as_array, has_values, namespace, numpy_or_compiled, on_device, on_host
 from jeit_solvers.module import Module
 
 
@@ -185,7 +185,7 @@ def reconstruct(
     _check_protocol(model, is_used)
     may_use_numpy = not (parametrisation.unknowns or solver.keeps_bounds or solver.needs_squares)
     independent_model, data = independent_data(model, measured, is_used, deviation, at_once=may_use_numpy)
-    inversion, choice = pose(
+    inversion, choice = pose_least_squares(
         independent_model, data, background, prior, hyperparameter, parametrisation, per_cell=solver.keeps_bounds
     )
     if parametrisation.informative and inversion.penalty.is_standard_normal:
@@ -199,7 +199,10 @@ def reconstruct(
     )
     solution = solver.minimise(inversion, start_coefficients, box)
     coefficients, status, reason = solution.coefficients, solution.status, solution.reason
-    fitted_model, conductivity = inversion.applied(model, coefficients), _conductivity(inversion, coefficients)
+    fitted_model, conductivity = (
+        inversion.with_applied_unknowns(model, coefficients),
+        _conductivity(inversion, coefficients),
+    )
     predicted = evaluate(fitted_model, voltages_of, conductivity)
     xp = jnp if not has_values(predicted, measured, deviation) else np
     used_indices = np.flatnonzero(is_used)
@@ -265,7 +268,7 @@ def _choose_solver(solver, prior: AbstractPrior, parametrisation: Parametrisatio
 
 
 @np.errstate(all="ignore")  # a problem that is not finite is reported when it is solved
-def pose(
+def pose_least_squares(
     model: ForwardModel,
     data: Data,
     background: Float[Array, " m"],
@@ -283,19 +286,19 @@ def pose(
     mesh, link = model.mesh, parametrisation.link
     reference, regions = link.estimate(background), parametrisation.regions_of(mesh)
     requested_hyperparameter = prior.default_hyperparameter if hyperparameter is None else hyperparameter
-    is_rule = isinstance(requested_hyperparameter, str) or callable(requested_hyperparameter)
+    is_rule_requested = isinstance(requested_hyperparameter, str) or callable(requested_hyperparameter)
     if prior.is_quadratic:
         predicted, whitened_jacobian, whitening_data = _whitened_jacobian(
             model, data, background, link.slope(reference)
         )
         spectrum = difference = None
-        if is_rule:
+        if is_rule_requested:
             spectrum = Spectrum.create(
                 whitened_jacobian, prior.covariance_product(mesh, whitened_jacobian), prior.null_space(mesh)
             )
             difference = whitening_data.whiten(whitening_data.weight * (whitening_data.voltages - predicted))
         choice = choose(spectrum, requested_hyperparameter, difference, mesh)
-    elif is_rule:
+    elif is_rule_requested:
         raise ValueError(f"hyperparameter: total variation takes a number, not the rule {requested_hyperparameter!r}.")
     else:
         whitened_jacobian, choice = None, choose(None, requested_hyperparameter, None)
@@ -359,6 +362,6 @@ def _mismatch_reason(model: ForwardModel, measured, background, used_indices) ->
     return f" The voltages are {ratio:.2g} times those of the background; are they in volts, and their signs right?"
 
 
-@either_engine
+@numpy_or_compiled
 def _conductivity(inversion: Inversion, coefficients):
     return inversion.conductivity(coefficients)

@@ -25,7 +25,7 @@ from jeit_solvers.module import Module
 _Setting = TypeVar("_Setting")
 
 _MAX_STEPS = 30
-_REASONS = {
+_REASON_BY_STATUS = {
     Status.CONVERGED: "The next step would change the objective by less than the tolerance.",
     Status.STEP_LIMIT: "Stopped after {}; raise max_steps, or the hyperparameter.",
     Status.STALLED: "No shorter step lowered the objective; the model is at odds with the data.",
@@ -322,7 +322,7 @@ def counted_iterations(iterations: int, shortened: int = 0) -> str:
 
 
 def _reason(status: Status, iterations: int, shortened: int = 0) -> str:
-    return _REASONS[status].format(counted_iterations(iterations, shortened))
+    return _REASON_BY_STATUS[status].format(counted_iterations(iterations, shortened))
 
 
 def expand(coefficients: Float[Array, " n"], inversion: Inversion):
@@ -363,7 +363,7 @@ def _run_descent(descent: Descent, inversion: Inversion, start) -> Solution:
         start, problem = on_host((start, inversion))
         point, state = descent.at_once(expand, start, problem, descent.history)
         point = as_array(point)
-        status = Status.CONVERGED if state.converged else Status.STALLED if state.stuck else Status.STEP_LIMIT
+        status = Status.CONVERGED if state.converged else Status.STALLED if state.is_stuck else Status.STEP_LIMIT
     elif not has_values(inversion, start):
         problem, frozen_start = undifferentiated((inversion, start))
         solution = _least_squares(problem, frozen_start, descent, descent.history, {"expand": expand})
@@ -372,10 +372,10 @@ def _run_descent(descent: Descent, inversion: Inversion, start) -> Solution:
     else:
         solution = _least_squares(inversion, start, descent, descent.history, {"expand": expand})
         point, state, status = solution.value, solution.state, ended(solution.result)
-    accepted = int(state.num_accepted)
-    iterations = max(accepted - 1, 0)
+    num_accepted_steps = int(state.num_accepted)
+    iterations = max(num_accepted_steps - 1, 0)
     reason = _reason(status, iterations, int(state.num_steps) - 1 - iterations)
-    return Solution(point, iterations, as_array(np.asarray(state.history)[:accepted]), status, reason)
+    return Solution(point, iterations, as_array(np.asarray(state.history)[:num_accepted_steps]), status, reason)
 
 
 def _traced_solution(inversion: Inversion, start, coefficients, iterations, status, box=None) -> Solution:

@@ -138,7 +138,7 @@ def apply_to_columns(
 
 # Diagonal entries of at least this fraction of the largest entry count as equal to it, as occurs in symmetric meshes.
 # The first of these entries is the pivot, so that rounding errors do not decide.
-_EQUAL_DIAGONAL = 1 - 1e-4
+_EQUAL_DIAGONAL_FRACTION = 1 - 1e-4
 
 
 def pivoted_cholesky(
@@ -155,11 +155,11 @@ def pivoted_cholesky(
     for rank in range(shapes.shape[0]):
         if residual_diagonal.sum() <= allowed_residual:
             return shapes[:rank].T
-        pivot = int(np.argmax(residual_diagonal >= _EQUAL_DIAGONAL * residual_diagonal.max()))
-        row = column(pivot) - shapes[:rank, pivot] @ shapes[:rank]
-        shapes[rank] = row / np.sqrt(residual_diagonal[pivot])
+        pivot_index = int(np.argmax(residual_diagonal >= _EQUAL_DIAGONAL_FRACTION * residual_diagonal.max()))
+        row = column(pivot_index) - shapes[:rank, pivot_index] @ shapes[:rank]
+        shapes[rank] = row / np.sqrt(residual_diagonal[pivot_index])
         residual_diagonal = np.maximum(residual_diagonal - shapes[rank] ** 2, 0)
-        residual_diagonal[pivot] = 0
+        residual_diagonal[pivot_index] = 0
     return shapes.T
 
 
@@ -172,12 +172,12 @@ def traced_pivoted_cholesky(scaled: Float[Array, "m d"], *, tolerance: float, ma
     """
     num_columns = min(max_rank, len(scaled))
     pivots, rank = _pivots(jax.lax.stop_gradient(scaled), tolerance, num_columns)
-    is_needed = jnp.arange(num_columns) < rank
+    is_within_rank = jnp.arange(num_columns) < rank
     pivot_points = scaled[pivots]
-    columns = jnp.where(is_needed, jnp.exp(-_squared_distances(scaled, pivot_points)), 0)
+    columns = jnp.where(is_within_rank, jnp.exp(-_squared_distances(scaled, pivot_points)), 0)
     pivot_covariance = jnp.exp(-_squared_distances(pivot_points, pivot_points))
     lower_factor = jnp.linalg.cholesky(
-        jnp.where(is_needed & is_needed[:, None], pivot_covariance, jnp.eye(num_columns))
+        jnp.where(is_within_rank & is_within_rank[:, None], pivot_covariance, jnp.eye(num_columns))
     )
     return jax.scipy.linalg.solve_triangular(lower_factor, columns.T, lower=True).T
 
@@ -197,11 +197,11 @@ def _pivots(scaled, tolerance: float, max_rank: int):
 
     def add_pivot(state):
         rank, pivots, shapes, residual_diagonal = state
-        pivot = jnp.argmax(residual_diagonal >= _EQUAL_DIAGONAL * residual_diagonal.max())
-        row = jnp.exp(-((scaled - scaled[pivot]) ** 2).sum(axis=1)) - shapes[:, pivot] @ shapes
-        row = row / jnp.sqrt(residual_diagonal[pivot])
-        residual_diagonal = jnp.maximum(residual_diagonal - row**2, 0).at[pivot].set(0)
-        return rank + 1, pivots.at[rank].set(pivot), shapes.at[rank].set(row), residual_diagonal
+        pivot_index = jnp.argmax(residual_diagonal >= _EQUAL_DIAGONAL_FRACTION * residual_diagonal.max())
+        row = jnp.exp(-((scaled - scaled[pivot_index]) ** 2).sum(axis=1)) - shapes[:, pivot_index] @ shapes
+        row = row / jnp.sqrt(residual_diagonal[pivot_index])
+        residual_diagonal = jnp.maximum(residual_diagonal - row**2, 0).at[pivot_index].set(0)
+        return rank + 1, pivots.at[rank].set(pivot_index), shapes.at[rank].set(row), residual_diagonal
 
     initial_state = 0, jnp.zeros(max_rank, int), jnp.zeros((max_rank, len(scaled))), jnp.ones(len(scaled))
     rank, pivots, _, _ = jax.lax.while_loop(is_incomplete, add_pivot, initial_state)
@@ -211,7 +211,7 @@ def _pivots(scaled, tolerance: float, max_rank: int):
 # Grid points per correlation length.
 _GRID_POINTS_PER_LENGTH = 3
 # Number of grid points along an axis from which the cubic interpolates.
-_CUBIC = 4
+_NUM_INTERPOLATION_POINTS = 4
 # Maximum number of grid points, per point of the field and in total, up to which a grid saves time.
 _MAX_GRID_RATIO, _MAX_GRID_POINTS = 8, 500_000
 # Number of columns processed at a time, which limits the memory for values on the grid.
@@ -235,7 +235,7 @@ class GriddedGaussian:
         ]
         grid_positions = (positions - lower_corner) / spacing
         self._interpolation = _cubic_interpolation(grid_positions, self._shape)
-        weights, nodes = _cubic_weights(grid_positions), np.arange(_CUBIC)
+        weights, nodes = _cubic_weights(grid_positions), np.arange(_NUM_INTERPOLATION_POINTS)
         grid_covariance = np.exp(-((nodes[:, None] - nodes) ** 2) / (2 * _GRID_POINTS_PER_LENGTH**2))
         self.variance = np.prod(np.einsum("mdi,ij,mdj->md", weights, grid_covariance, weights), axis=1)
 
@@ -260,14 +260,18 @@ class GriddedGaussian:
 def _cubic_weights(positions: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d 4"]:
     """Weights of cubic Lagrange interpolation from the two grid points on either side, along every axis."""
     offset = positions - np.floor(positions) + 1
-    nodes = np.arange(_CUBIC)
+    nodes = np.arange(_NUM_INTERPOLATION_POINTS)
     return np.stack([np.prod([(offset - j) / (i - j) for j in nodes if j != i], axis=0) for i in nodes], axis=-1)
 
 
 def _cubic_interpolation(positions: Float[np.ndarray, "m d"], shape: tuple[int, ...]) -> scipy.sparse.csr_array:
     """Sparse matrix (m, grid points) that interpolates from a grid of the given `shape` to points `positions` (m, d),
     in units of the grid spacing."""
-    first_nodes, nodes, axis_weights = np.floor(positions).astype(int) - 1, np.arange(_CUBIC), _cubic_weights(positions)
+    first_nodes, nodes, axis_weights = (
+        np.floor(positions).astype(int) - 1,
+        np.arange(_NUM_INTERPOLATION_POINTS),
+        _cubic_weights(positions),
+    )
     weight, grid_indices = np.ones((len(positions), 1)), np.zeros((len(positions), 1), int)
     for axis, axis_size in enumerate(shape):
         weight = (weight[:, :, None] * axis_weights[:, axis, None, :]).reshape(len(positions), -1)

@@ -115,13 +115,17 @@ class _MaternField(NamedTuple):
         system = NodalSystem.create(mesh)
         mesh = system.mesh
         nodes_per_cell, num_nodes = mesh.cells.shape[1], mesh.num_points
-        kappa = (1.0 if mesh.dimension == 3 else np.sqrt(2)) / length
+        inverse_length = (1.0 if mesh.dimension == 3 else np.sqrt(2)) / length
         basis_gradients, cell_measures = np.asarray(gradients(mesh)), np.asarray(measures(mesh))
         stiffness = np.einsum("mid,mjd,m->mij", basis_gradients, basis_gradients, cell_measures)
         mass = np.bincount(mesh.cells.ravel(), np.repeat(cell_measures / nodes_per_cell, nodes_per_cell), num_nodes)
         wall_measures = np.asarray(facet_measures(mesh)) / mesh.dimension
-        wall_masses = np.bincount(mesh.facets.ravel(), np.repeat(wall_measures, mesh.dimension), num_nodes)
-        solve = system.inverse(system.assemble(stiffness, kappa**2 * mass + kappa / _ROBIN_COEFFICIENT * wall_masses))
+        wall_node_measures = np.bincount(mesh.facets.ravel(), np.repeat(wall_measures, mesh.dimension), num_nodes)
+        solve = system.inverse(
+            system.assemble(
+                stiffness, inverse_length**2 * mass + inverse_length / _ROBIN_COEFFICIENT * wall_node_measures
+            )
+        )
         fields = _covariance_factor(solve, mass)
         scale = 1 / np.sqrt(np.einsum("nk,nk->n", fields, fields))
         return cls(system.means, solve, mass, scale, scale[:, None] * fields)

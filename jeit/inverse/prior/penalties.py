@@ -165,7 +165,7 @@ class AbstractNormal(Module):
         """Number of independent standard normal numbers needed to draw a sample of n coefficients."""
 
     @abc.abstractmethod
-    def drawn(self, numbers: Float[Array, "d k"]) -> Float[Array, "n k"]:
+    def draw_samples(self, numbers: Float[Array, "d k"]) -> Float[Array, "n k"]:
         """Samples (n, k) of mean zero, computed from standard normal `numbers` with d = `num_draws`."""
 
 
@@ -184,7 +184,7 @@ class StandardNormal(AbstractNormal):
         """Number of random numbers per sample: one for each coefficient."""
         return num_coefficients
 
-    def drawn(self, numbers):
+    def draw_samples(self, numbers):
         """Samples: the `numbers` themselves."""
         return numbers
 
@@ -217,7 +217,7 @@ class SparsePrecisionNormal(AbstractNormal):
         further unknown."""
         return num_coefficients - self.plan.size + self.plan.num_pivots
 
-    def drawn(self, numbers):
+    def draw_samples(self, numbers):
         """Samples, computed with a triangular factor of Q."""
         num_pivots = self.plan.num_pivots
         image = inverse_root(self.plan, self.factor, numbers[:num_pivots])

@@ -63,16 +63,16 @@ def check_prior(prior: Any) -> None:
 # Number of rows of a dense covariance computed at a time.
 _ROWS_AT_ONCE = 512
 # Fraction of a Gaussian prior's variance that the shapes of its basis may leave out.
-_OMITTED_VARIANCE = 1e-3
+_MAX_OMITTED_VARIANCE = 1e-3
 # Maximum number of shapes of the basis.
-_MAX_SHAPES = 2000
+_MAX_BASIS_SHAPES = 2000
 # Number of cells above which images consist only of shapes that the data resolve, and the Laplace prior couples nodes
 # in place of cells.
 _LARGE_MESH_CELLS = 30_000
 # Squared signal of a shape, relative to the largest, below which the data do not resolve the shape.
-_MIN_SIGNAL = 1e-12
+_MIN_SQUARED_SIGNAL = 1e-12
 # Term added to the diagonal of a precision matrix that has constant images in its null space.
-_DIAGONAL_TERM = 1e-6
+_RELATIVE_DIAGONAL_TERM = 1e-6
 
 
 class AbstractPrior(Module):
@@ -117,13 +117,13 @@ class AbstractPrior(Module):
         """
         assert jacobian is not None  # a quadratic prior may depend on it
         if not per_cell:
-            is_large = mesh.num_cells > _LARGE_MESH_CELLS and has_values(mesh, jacobian, self)
-            basis = (self.informed_basis if is_large else self.basis)(mesh, jacobian).scaled(1 / hyperparameter)
+            is_large_mesh = mesh.num_cells > _LARGE_MESH_CELLS and has_values(mesh, jacobian, self)
+            basis = (self.informed_basis if is_large_mesh else self.basis)(mesh, jacobian).scaled(1 / hyperparameter)
             return basis if regions is None else basis.pooled(regions), Ridge()
         if regions is not None:
             raise ValueError("regions: bounded solvers take every cell; use link=Bounded(lower, upper) instead.")
-        form = QuadraticForm.create(*self.entries(mesh, jacobian), hyperparameter, mesh.num_cells)
-        return DiagonalBasis(host.ones(mesh.num_cells)), form
+        quadratic_form = QuadraticForm.create(*self.entries(mesh, jacobian), hyperparameter, mesh.num_cells)
+        return DiagonalBasis(host.ones(mesh.num_cells)), quadratic_form
 
     @abc.abstractmethod
     def covariance_product(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> Float[Array, "m M"]:
@@ -245,8 +245,8 @@ class Laplace(AbstractPrior):
         check_cells(mesh)
         pairs, _ = interior_facets(mesh)
         num_cells = mesh.num_cells
-        links = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), shape=(num_cells, num_cells))
-        adjacency_matrix = (links + links.T).tocsr()
+        adjacency = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), shape=(num_cells, num_cells))
+        adjacency_matrix = (adjacency + adjacency.T).tocsr()
         return (
             2 * (scipy.sparse.diags_array(np.asarray(adjacency_matrix.sum(axis=1)).ravel()) - adjacency_matrix).tocsr()
         )
@@ -254,7 +254,7 @@ class Laplace(AbstractPrior):
     def basis(self, mesh, jacobian):
         """Dense basis from a Cholesky factor of Q, with a very small penalty on constant images."""
         precision = self.precision(mesh, jacobian).toarray()
-        precision[np.diag_indices_from(precision)] += _DIAGONAL_TERM
+        precision[np.diag_indices_from(precision)] += _RELATIVE_DIAGONAL_TERM
         lower_factor = scipy.linalg.cholesky(precision, lower=True)
         return DenseBasis(scipy.linalg.solve_triangular(lower_factor, np.eye(len(lower_factor)), lower=True).T)
 
@@ -263,7 +263,7 @@ class Laplace(AbstractPrior):
         constant images; in a sheet, `basis`."""
         if mesh.dimension != 3:
             return self.basis(mesh, jacobian)
-        covariance_product = partial(_node_covariance_product, mesh, degrees_of_freedom=_DIAGONAL_TERM)
+        covariance_product = partial(_node_covariance_product, mesh, degrees_of_freedom=_RELATIVE_DIAGONAL_TERM)
         return informed_shapes(np.asarray(jacobian), covariance_product, None)
 
     def null_space(self, mesh):
@@ -320,7 +320,7 @@ class Gaussian(AbstractPrior):
         if not has_values(centres, self.length):
             scaled_centres = jnp.asarray(centres) / (np.sqrt(2) * self.length)
             return DenseBasis(
-                traced_pivoted_cholesky(scaled_centres, tolerance=_OMITTED_VARIANCE, max_rank=_MAX_SHAPES)
+                traced_pivoted_cholesky(scaled_centres, tolerance=_MAX_OMITTED_VARIANCE, max_rank=_MAX_BASIS_SHAPES)
             )
         centres = np.asarray(centres)
 
@@ -329,7 +329,9 @@ class Gaussian(AbstractPrior):
 
         unit_variances = np.ones(len(centres))
         return DenseBasis(
-            host.asarray(pivoted_cholesky(unit_variances, column, tolerance=_OMITTED_VARIANCE, max_rank=_MAX_SHAPES))
+            host.asarray(
+                pivoted_cholesky(unit_variances, column, tolerance=_MAX_OMITTED_VARIANCE, max_rank=_MAX_BASIS_SHAPES)
+            )
         )
 
     def informed_basis(self, mesh, jacobian):
@@ -363,8 +365,8 @@ def informed_shapes(
     product = np.asarray(covariance(jacobian.T))
     data_covariance = jacobian @ product
     eigenvalues, vectors = np.linalg.eigh((data_covariance + data_covariance.T) / 2)
-    is_resolved = eigenvalues > _MIN_SIGNAL * eigenvalues[-1]
-    shapes = (product @ (vectors[:, is_resolved] / np.sqrt(eigenvalues[is_resolved]))).astype(np.float32)
+    is_informed = eigenvalues > _MIN_SQUARED_SIGNAL * eigenvalues[-1]
+    shapes = (product @ (vectors[:, is_informed] / np.sqrt(eigenvalues[is_informed]))).astype(np.float32)
     if variance is None:
         return DenseBasis(host.asarray(shapes))
     shape_variance = np.einsum("mn,mn->m", shapes, shapes)

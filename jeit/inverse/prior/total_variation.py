@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jeit.inverse.hyperparameter.choice import EDGE_PRICE
+from jeit.inverse.hyperparameter.choice import EDGE_HYPERPARAMETER_PENALTY
 from jeit.inverse.prior.bases import DiagonalBasis, NodalBasis
 from jeit.inverse.prior.linear_algebra import factorise_matrix
 from jeit.inverse.prior.penalties import AbstractPenalty, SparsePrecisionNormal
@@ -234,8 +234,8 @@ class TotalVariation(AbstractPrior):
 
     @property
     def default_hyperparameter(self) -> float:
-        """Default hyperparameter λ, `EDGE_PRICE`."""
-        return EDGE_PRICE
+        """Default hyperparameter λ, `EDGE_HYPERPARAMETER_PENALTY`."""
+        return EDGE_HYPERPARAMETER_PENALTY
 
     def covariance_product(self, mesh, jacobian) -> NoReturn:
         """Not available for this prior. Raises `ValueError`."""
@@ -354,7 +354,9 @@ class TotalVariationPenalty(AbstractPenalty):
         if self.between_bounds:
             return None
         image, _ = self._split_coefficients(coefficients)
-        return SparsePrecisionNormal(self.pattern, self.plan, self._factor(self.weight / self._smoothed_height(image)))
+        return SparsePrecisionNormal(
+            self.pattern, self.plan, self._factorise(self.weight / self._smoothed_height(image))
+        )
 
     def model(self, residual, jacobian, coefficients, data):
         """Objective at c and the function that computes a step in data space, by Gauss-Newton for the data and lagged
@@ -371,7 +373,7 @@ class TotalVariationPenalty(AbstractPenalty):
 
         def step(damping):
             xp = namespace(self, jacobian)
-            flux = stiffness * self._jump(self.reference + image)
+            flux = stiffness * self._jump_across_facets(self.reference + image)
             gradient = self.level * image
             gradient = gradient + self._divergence(flux)
             size = image.shape[0]
@@ -384,7 +386,7 @@ class TotalVariationPenalty(AbstractPenalty):
             image_change, unknown_change = self._split_coefficients(direction)
             slope = weighted_residual @ data_change + gradient @ image_change + unknowns @ unknown_change
             penalty_curvature = (
-                (stiffness * self._jump(image_change) ** 2).sum()
+                (stiffness * self._jump_across_facets(image_change) ** 2).sum()
                 + (self.level * image_change**2).sum()
                 + unknown_change @ unknown_change
             )
@@ -394,15 +396,15 @@ class TotalVariationPenalty(AbstractPenalty):
 
     def _solve(self, stiffness, columns):
         """Q⁻¹ times `columns`, where Q is the touching quadratic form with weights `stiffness` of the squared jumps."""
-        return solve(self.plan, self._factor(stiffness), columns)
+        return solve(self.plan, self._factorise(stiffness), columns)
 
-    def _factor(self, stiffness) -> Factor:
+    def _factorise(self, stiffness) -> Factor:
         """Factorise the touching quadratic form Q with weights `stiffness` of the squared jumps."""
         facet_matrices = stiffness[:, None, None] * np.array([[1.0, -1.0], [-1.0, 1.0]])
         return factorise(self.plan, self.pattern.assemble(facet_matrices, self.level[:, None, None]))
 
     def _divergence(self, flux):
-        """Adjoint of `_jump`, applied to a `flux` across every facet."""
+        """Adjoint of `_jump_across_facets`, applied to a `flux` across every facet."""
         first_cells, second_cells = self.pairs[:, 0], self.pairs[:, 1]
         return sum_into(self.level.shape, first_cells, flux) - sum_into(self.level.shape, second_cells, flux)
 
@@ -411,10 +413,10 @@ class TotalVariationPenalty(AbstractPenalty):
         size = self.level.shape[0]
         return coefficients[:size], coefficients[size:]
 
-    def _jump(self, image):
+    def _jump_across_facets(self, image):
         """Difference of the image across each facet."""
         return image[self.pairs[:, 0]] - image[self.pairs[:, 1]]
 
     def _smoothed_height(self, image):
         """Smoothed jump √(d² + β²) of an image across each facet."""
-        return namespace(self, image).sqrt(self._jump(self.reference + image) ** 2 + self.smoothing**2)
+        return namespace(self, image).sqrt(self._jump_across_facets(self.reference + image) ** 2 + self.smoothing**2)

@@ -2,12 +2,12 @@ from .bodies import Quantities
 from .ellipsoid import KINDS, Ellipsoid, EllipsoidPrior
 from .quantities import Accuracy
 from .reconstruction import ShapeReconstruction
-from .search import LEAST_RISE, reconstruct_shapes
+from .search import MIN_OBJECTIVE_RATIO, reconstruct_shapes
 from .star import Star, StarPrior
 
 __all__ = [
     "KINDS",
-    "LEAST_RISE",
+    "MIN_OBJECTIVE_RATIO",
     "Accuracy",
     "Ellipsoid",
     "EllipsoidPrior",

@@ -23,7 +23,7 @@ from jeit.arguments.checks import Interval
 from jeit_solvers import results_on_cores
 
 # Step of the finite differences of a centroid, in standard deviations of a coefficient.
-_CENTROID_STEP = 0.1
+_CENTROID_DIFFERENCE_STEP = 0.1
 # Fields of `Bodies`, except `start`, that have one value per body.
 _FIELDS_PER_BODY = ("sign", "is_other_kind", "is_kind_certain", "same_material", "fixed_contrast")
 
@@ -120,7 +120,7 @@ class Quantities:
     centroid_radius: float = float("nan")
 
 
-TINY = 1e-30
+MIN_POSITIVE_VALUE = 1e-30
 """Minimum area, m², or volume, m³, which replaces that of a body that has left the domain."""
 
 
@@ -131,7 +131,7 @@ def polarisation(contrast, axes: int):
     return np.expm1(contrast) / (np.exp(contrast) + axes - 1)
 
 
-def results_for(bodies: Bodies, function: Callable[[Any], Any], parts: Sequence[Any]) -> list[Any]:
+def results_of_parts(bodies: Bodies, function: Callable[[Any], Any], parts: Sequence[Any]) -> list[Any]:
     """Results of a `function` that fits `bodies`, for each of its `parts`: on several cores in a solid. The arrays of a
     sheet are so small that several threads would mostly wait for each other in Python."""
     return results_on_cores(function, parts) if bodies.dimension == 3 else [function(part) for part in parts]
@@ -152,7 +152,7 @@ class BodyImage(NamedTuple):
     overlap_slope: Float[np.ndarray, "p n"]
 
 
-class Covered(NamedTuple):
+class CellCoverage(NamedTuple):
     """Coverage of cells by a body.
 
     **Fields**: `cells` (c,): indices of the cells that the body reaches; `share` (c,): fraction of each of these cells
@@ -206,12 +206,12 @@ class Bodies(abc.ABC):
         bodies and their coefficients."""
 
     @abc.abstractmethod
-    def mixture(self, share: Float[np.ndarray, " c"], contrast: float) -> tuple[Any, Any, Any]:
+    def mixed_log_conductivity(self, share: Float[np.ndarray, " c"], contrast: float) -> tuple[Any, Any, Any]:
         """log σ/σ₀ (c,) of cells of which a body with signed `contrast` covers the fraction `share`; and the
         derivatives of log σ/σ₀ with respect to `share` and `contrast`."""
 
     @abc.abstractmethod
-    def coverage(self, k: int, row: Float[np.ndarray, " q"]) -> Covered:
+    def coverage(self, k: int, row: Float[np.ndarray, " q"]) -> CellCoverage:
         """Coverage of cells by body k, whose coefficients are `row`."""
 
     @abc.abstractmethod
@@ -228,9 +228,9 @@ class Bodies(abc.ABC):
         slopes = []
         for index, deviation in enumerate(deviations):
             step = np.zeros(len(coefficients))
-            step[1 + k * self.prior.size + index] = _CENTROID_STEP * deviation
+            step[1 + k * self.prior.size + index] = _CENTROID_DIFFERENCE_STEP * deviation
             ends = [self.body(k, coefficients + direction * step).centroid for direction in (-1, 1)]
-            slopes.append((ends[1] - ends[0]) / (2 * _CENTROID_STEP * deviation))
+            slopes.append((ends[1] - ends[0]) / (2 * _CENTROID_DIFFERENCE_STEP * deviation))
         return np.stack(slopes, axis=1)
 
     @property
@@ -310,10 +310,10 @@ class Bodies(abc.ABC):
         """
         others, remaining = self.without(k, coefficients)
         row, dimension = self.rows(coefficients)[k], self.dimension
-        half_row = np.zeros(self.prior.size)
-        half_row[dimension : dimension + 2] = row[dimension : dimension + 2]
-        half_row[dimension] -= np.log(2) / dimension / self.prior.radius_spread
-        offset = np.exp(self.log_radius(half_row)) * self.axis(k, row, number)
+        row_of_half = np.zeros(self.prior.size)
+        row_of_half[dimension : dimension + 2] = row[dimension : dimension + 2]
+        row_of_half[dimension] -= np.log(2) / dimension / self.prior.radius_spread
+        offset = np.exp(self.log_radius(row_of_half)) * self.axis(k, row, number)
         if dimension == 3:
             offset = offset * 2 ** (-1 / 3)  # somewhat farther out than the centroids of the two halves
         centre = self.centre(k, row)
@@ -322,7 +322,7 @@ class Bodies(abc.ABC):
             name: np.append(getattr(others, name), [getattr(self, name)[k]] * 2) for name in _FIELDS_PER_BODY
         }
         other_fields["is_kind_certain"][-2:] = False
-        return replace(self, start=start, **other_fields), np.concatenate([remaining, half_row, half_row])
+        return replace(self, start=start, **other_fields), np.concatenate([remaining, row_of_half, row_of_half])
 
     def with_modes(self, modes: int, coefficients) -> tuple[Self, Float[np.ndarray, " n"]]:
         """The bodies with a different number of modes of their form, and their coefficients; the coefficients of added
@@ -345,7 +345,7 @@ class Bodies(abc.ABC):
         cell_shares = np.zeros((len(coverages), num_cells))
         for k, (cells, share, slope) in enumerate(coverages):
             contrast, contrast_slope = (self.sign[k] * value for value in self.contrast(k, rows[k]))
-            body_image, share_slope, mixture_slope = self.mixture(share, contrast)
+            body_image, share_slope, mixture_slope = self.mixed_log_conductivity(share, contrast)
             image[cells] += body_image
             body_slope = share_slope[:, None] * slope
             body_slope[:, dimension + 1] = mixture_slope * contrast_slope

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jeit.arguments import check_name
-from jeit.inverse.shapes.bodies import TINY, Bodies, BodyPrior, Covered, Quantities, polarisation
+from jeit.inverse.shapes.bodies import MIN_POSITIVE_VALUE, Bodies, BodyPrior, CellCoverage, Quantities, polarisation
 from jeit.mesh import Mesh, measures
 from jeit_solvers.module import Module
 
@@ -23,24 +23,26 @@ KINDS = ("either", "ellipsoids", "columns")
 """Kinds of bodies that a solid may contain: ellipsoids, columns through its whole height, or either."""
 
 # Barycentric coordinates of the twenty points at which a cell is sampled; all represent equal parts of the cell.
-_SAMPLES = np.array([[2 * n + 1 for n in indices] for indices in np.ndindex(4, 4, 4, 4) if sum(indices) == 3]) / 10
+_BARYCENTRIC_SAMPLES = (
+    np.array([[2 * n + 1 for n in indices] for indices in np.ndindex(4, 4, 4, 4) if sum(indices) == 3]) / 10
+)
 # Width of the blur of a surface, in units of the cell size: large enough for the coverage to be differentiable, but
 # small, because the estimates of blurred bodies are too small and too strong.
-_BLUR = 0.1
+_RELATIVE_BLUR_WIDTH = 0.1
 # Exponents of the power mean of the conductivities of body and bath in cells that a surface cuts, for bodies more (1)
 # and less (-1) conductive than the bath. With edges of half the radius, the change of voltages due to balls 0.1 to 12
 # times as conductive as the bath then agrees within 1 to 5 % with that on meshes whose facets follow the surface. With
 # a single exponent of 0.15, the change due to balls of 12 times the conductivity was 13 to 19 % too large, an error
 # proportional to the edge length.
-_POWERS = {1: -1.0, -1: 0.5}
+_POWER_MEAN_EXPONENTS = {1: -1.0, -1: 0.5}
 # Distance from a surface within which cells are refined, in units of the body's shortest half axis.
-_BAND = 0.1
+_RELATIVE_REFINEMENT_DISTANCE = 0.1
 # Lower limit of the shortest half axis, in units of the geometric mean of the three.
 _MIN_AXIS_RATIO = 0.6
 # Distance from a surface, in widths of the blur, beyond which the covered share of a cell is less than 1e-8.
-_REACH = 20
+_MAX_BLUR_DISTANCE = 20
 # Orthonormal basis of the symmetric matrices S of zero trace.
-_STRETCHES = np.array(
+_STRETCH_BASIS = np.array(
     [
         np.diag([1, -1, 0]) / np.sqrt(2),
         np.diag([1, 1, -2]) / np.sqrt(6),
@@ -50,7 +52,7 @@ _STRETCHES = np.array(
     ]
 )
 # 1 for the elements of this basis that stretch a column: those within the x-y plane that have no trace in this plane.
-_LEVEL = np.array([1.0, 0.0, 1.0, 0.0, 0.0])
+_IS_COLUMN_STRETCH = np.array([1.0, 0.0, 1.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -164,7 +166,7 @@ class Ellipsoid(Module):
 
     def with_quantities(self, known: Quantities) -> Ellipsoid:
         """Copy of the body with the quantities `known`; volume and contrast become the medians."""
-        scale = (known.measure / max(self.volume, TINY)) ** (1 / self.bounded_axes)
+        scale = (known.measure / max(self.volume, MIN_POSITIVE_VALUE)) ** (1 / self.bounded_axes)
         is_upright = self.column & (np.abs(self.axes[:, 2]) > 0.5 * np.linalg.norm(self.axes, axis=1))
         return replace(
             self,
@@ -200,12 +202,12 @@ class Ellipsoids(Bodies):
     def create(cls, mesh: Mesh, prior: BodyPrior, start, sign) -> Ellipsoids:
         """Create ellipsoids for a mesh, with starting centres `start` (k, 3), metres."""
         points, volume = np.asarray(mesh.points), np.asarray(measures(mesh))
-        samples = points.T[:, np.asarray(mesh.cells)] @ _SAMPLES.T
+        samples = points.T[:, np.asarray(mesh.cells)] @ _BARYCENTRIC_SAMPLES.T
         start, total = np.reshape(np.asarray(start, float), (-1, 3)), float(volume.sum())
         sign, false = np.asarray(sign, float), np.zeros(len(start), bool)
         nans = np.full(len(start), np.nan)
         span, ends = float(np.ptp(points, axis=0).max()), (float(points[:, 2].min()), float(points[:, 2].max()))
-        width = _BLUR * np.cbrt(volume)
+        width = _RELATIVE_BLUR_WIDTH * np.cbrt(volume)
         return cls(prior, volume / total, span, start, sign, false, false, false, nans, samples, width, total, ends)
 
     def bounded_axes(self, k: int) -> int:
@@ -236,7 +238,7 @@ class Ellipsoids(Bodies):
             radius = np.cbrt(3 / 4 * volume) if is_column[k] else np.sqrt(volume / (self.ends[1] - self.ends[0]))
             rows[k, 3] = np.log(radius / (self.prior.radius * self.span)) / self.prior.radius_spread
             rows[k, 2], is_column[k] = 0, not is_column[k]
-            rows[k, 5:] *= _LEVEL[: self.prior.size - 5]
+            rows[k, 5:] *= _IS_COLUMN_STRETCH[: self.prior.size - 5]
         return replace(self, is_other_kind=is_column), np.append(coefficients[0], rows)
 
     def of_one_material(self, sign: int, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
@@ -253,17 +255,18 @@ class Ellipsoids(Bodies):
             rows[k, 3] += np.log(old_strength / new_strength) / self.bounded_axes(k) / self.prior.radius_spread
         return replace(self, same_material=self.same_material | (self.sign == sign)), np.append(coefficients[0], rows)
 
-    def mixture(self, share, contrast):
+    def mixed_log_conductivity(self, share, contrast):
         """log(1 + share (exp(p contrast) - 1)) / p, the power mean of body and bath: harmonic (p = -1) for a conductive
         body, p = 1/2 for a resistive one. Also its derivatives with respect to `share` and `contrast`."""
-        power = _POWERS[1 if contrast > 0 else -1]
+        power = _POWER_MEAN_EXPONENTS[1 if contrast > 0 else -1]
         rise = np.expm1(power * contrast)
         power_mean = 1 + share * rise
         return np.log(power_mean) / power, rise / (power * power_mean), share * (1 + rise) / power_mean
 
     def display_image(self, coefficients) -> Float[np.ndarray, " m"]:
         """Image log σ/σ₀ (m,) of the bodies, for display. Partly covered cells have the geometric mean of body and
-        bath, so log σ on a surface is halfway between the two; voltages are computed with `mixture` instead."""
+        bath, so log σ on a surface is halfway between the two; voltages are computed with `mixed_log_conductivity`
+        instead."""
         image = np.full(len(self.weight), coefficients[0] * self.prior.drift)
         for k, row in enumerate(self.rows(coefficients)):
             cells, share, _ = self.coverage(k, row)
@@ -288,19 +291,25 @@ class Ellipsoids(Bodies):
             distance_outside = distance - distance / np.maximum(scaled_distance, 1e-9)
             nearest, farthest = distance_outside.min(axis=1), distance_outside.max(axis=1)
             encloses = distance.min(axis=1) < farthest - nearest  # the corners surround a body smaller than a cell
-            is_near = ((nearest < _BAND * shortest_axis) | encloses) & (farthest > -_BAND * shortest_axis)
-            max_lengths[is_near] = np.minimum(max_lengths[is_near], edge * shortest_axis)
+            is_near_surface = ((nearest < _RELATIVE_REFINEMENT_DISTANCE * shortest_axis) | encloses) & (
+                farthest > -_RELATIVE_REFINEMENT_DISTANCE * shortest_axis
+            )
+            max_lengths[is_near_surface] = np.minimum(max_lengths[is_near_surface], edge * shortest_axis)
         return max_lengths
 
-    def left_refined_cells(self, coefficients, others: Bodies, new_coefficients) -> bool:
+    def left_refined_cells(self, coefficients, other_bodies: Bodies, new_coefficients) -> bool:
         """Whether a surface has left the cells that were refined for it, a body was removed, or a body changed kind,
-        between these bodies with `coefficients` and the bodies `others` with `new_coefficients`."""
-        if not np.array_equal(self.is_other_kind, others.is_other_kind):
+        between these bodies with `coefficients` and the bodies `other_bodies` with `new_coefficients`."""
+        if not np.array_equal(self.is_other_kind, other_bodies.is_other_kind):
             return True
-        for k, (row, new_row) in enumerate(zip(self.rows(coefficients), others.rows(new_coefficients), strict=True)):
-            shift = np.linalg.norm((self.centre(k, row) - others.centre(k, new_row)) * self._axes_of(k))
+        for k, (row, new_row) in enumerate(
+            zip(self.rows(coefficients), other_bodies.rows(new_coefficients), strict=True)
+        ):
+            shift = np.linalg.norm((self.centre(k, row) - other_bodies.centre(k, new_row)) * self._axes_of(k))
             matrix = self._shape_matrix(k, row)
-            if shift + np.linalg.norm(matrix - self._shape_matrix(k, new_row), 2) > 2 * _BAND * self._min_axis(matrix):
+            if shift + np.linalg.norm(
+                matrix - self._shape_matrix(k, new_row), 2
+            ) > 2 * _RELATIVE_REFINEMENT_DISTANCE * self._min_axis(matrix):
                 return True
         return False
 
@@ -337,8 +346,10 @@ class Ellipsoids(Bodies):
             matrix[2, 2], centre[2] = (self.ends[1] - self.ends[0]) / 2, sum(self.ends) / 2
         half_lengths, direction = np.linalg.eigh(matrix)
         contrast, axes = float(self.contrast(k, row)[0]), (half_lengths * direction).T[::-1]
-        is_alike = int((self.first == self.first[k]).sum()) > 1
-        return Ellipsoid(int(self.sign[k]), centre, axes, volume, centroid, contrast, is_column, is_alike, float(rise))
+        shares_material = int((self.first == self.first[k]).sum()) > 1
+        return Ellipsoid(
+            int(self.sign[k]), centre, axes, volume, centroid, contrast, is_column, shares_material, float(rise)
+        )
 
     def centroid_slope(self, k: int, coefficients, deviations) -> Float[np.ndarray, "3 q"]:
         """Derivatives of the centroid of body k with respect to its q coefficients, metres."""
@@ -351,7 +362,7 @@ class Ellipsoids(Bodies):
         centroid = centre @ fractions / fractions.sum()
         return (centre - centroid[:, None]) @ (weight[:, None] * slope) / fractions.sum()
 
-    def coverage(self, k: int, row) -> Covered:
+    def coverage(self, k: int, row) -> CellCoverage:
         """Coverage of cells by body k, whose coefficients are `row`."""
         log_stretch, direction = np.linalg.eigh(self._stretch(k, row))
         inverse_stretch = (direction * np.exp(-log_stretch)) @ direction.T
@@ -361,8 +372,8 @@ class Ellipsoids(Bodies):
         offset = (self.points[:, :, 0] - centre[:, None]) * axes[:, None]
         distance = np.maximum(_lengths(offset), 1e-9 * self.span)
         depth = distance * (radius / np.maximum(_lengths(inverse_stretch @ offset), 1e-9 * self.span) - 1)
-        is_near = np.abs(depth) < _REACH * self.width
-        cells, inner_cells = np.flatnonzero(is_near), np.flatnonzero(~is_near & (depth > 0))
+        is_near_surface = np.abs(depth) < _MAX_BLUR_DISTANCE * self.width
+        cells, inner_cells = np.flatnonzero(is_near_surface), np.flatnonzero(~is_near_surface & (depth > 0))
         offset = (self.points[:, cells] - centre[:, None, None]) * axes[:, None, None]
         distance, width = _lengths(offset), self.width[cells, None]
         if (is_at_centre := distance == 0).any():
@@ -376,7 +387,8 @@ class Ellipsoids(Bodies):
         # compensates for this.
         excess = (np.pi * width) ** 2 * (axes.sum() - 1) / (6 * surface)
         inside = 0.5 * (1 + np.tanh(0.5 * (surface - excess - distance) / width))
-        share_slope = inside * (1 - inside) / width / len(_SAMPLES)  # d share / d(surface - excess - distance)
+        # d share / d(surface - excess - distance)
+        share_slope = inside * (1 - inside) / width / len(_BARYCENTRIC_SAMPLES)
         growth = surface + excess  # d(surface - excess) / d log surface
         round_offset_slope = -share_slope * growth / scaled_distance**2 * round_offset
         offset_slope = share_slope * (growth - distance) / distance**2 * offset
@@ -386,7 +398,7 @@ class Ellipsoids(Bodies):
         form_slope = outer_products.reshape(len(cells), 9) @ stretches.reshape(-1, 9).T
         columns = [centre_slope, (share_slope * growth).sum(axis=1)[:, None], np.zeros((len(cells), 1)), form_slope]
         slopes = np.concatenate(columns, axis=1) * self.prior.deviation(self.span)
-        return Covered(
+        return CellCoverage(
             np.concatenate([cells, inner_cells]),
             np.concatenate([inside.mean(axis=1), np.ones(len(inner_cells))]),
             np.concatenate([slopes, np.zeros((len(inner_cells), slopes.shape[1]))]),
@@ -394,22 +406,24 @@ class Ellipsoids(Bodies):
 
     def _mask(self, k: int) -> Float[np.ndarray, "5"]:
         """Mask (5,) of the basis of S: 1 for the elements along which body k may be stretched, else 0."""
-        return _LEVEL if self.is_other_kind[k] else np.ones(5)
+        return _IS_COLUMN_STRETCH if self.is_other_kind[k] else np.ones(5)
 
     def _stretch(self, k: int, row) -> Float[np.ndarray, "3 3"]:
         """Log stretch S (3, 3) of body k, a symmetric matrix."""
         values = self.prior.roughness * row[5:] * self._mask(k)[: len(row) - 5]
-        return np.tensordot(values, _STRETCHES[: len(values)], 1) if len(values) else np.zeros((3, 3))
+        return np.tensordot(values, _STRETCH_BASIS[: len(values)], 1) if len(values) else np.zeros((3, 3))
 
     @staticmethod
     def _stretch_slopes(log_stretch, direction) -> Float[np.ndarray, "5 3 3"]:
         """Derivatives of exp(-S) with respect to the coefficients of S in its basis."""
         differences = log_stretch[:, None] - log_stretch
-        means = (log_stretch[:, None] + log_stretch) / 2
+        mean_log_stretches = (log_stretch[:, None] + log_stretch) / 2
         # (exp(-a) - exp(-b)) / (a - b) = -exp(-(a + b) / 2) sinh(h) / h with h = (a - b) / 2.
-        halves = np.where(np.abs(differences) > 1e-12, differences / 2, 1)
-        quotients = -np.exp(-means) * np.where(np.abs(differences) > 1e-12, np.sinh(halves) / halves, 1)
-        return direction @ ((direction.T @ _STRETCHES @ direction) * quotients) @ direction.T
+        half_differences = np.where(np.abs(differences) > 1e-12, differences / 2, 1)
+        quotients = -np.exp(-mean_log_stretches) * np.where(
+            np.abs(differences) > 1e-12, np.sinh(half_differences) / half_differences, 1
+        )
+        return direction @ ((direction.T @ _STRETCH_BASIS @ direction) * quotients) @ direction.T
 
 
 def _lengths(vectors: Float[np.ndarray, "3 *n"]) -> Float[np.ndarray, "*n"]:

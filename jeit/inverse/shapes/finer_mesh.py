@@ -21,16 +21,16 @@ from jeit.electrodes import AbstractElectrodes, CombinedElectrodes, FacetElectro
 from jeit.forward import ForwardModel
 from jeit.forward.changes import solved_fields
 from jeit.inverse.shapes.ellipsoid import Ellipsoids
-from jeit.inverse.shapes.problem import Fit, ShapeProblem
+from jeit.inverse.shapes.problem import ShapeFit, ShapeProblem
 from jeit.mesh import Mesh
 from jeit.mesh.bisection import bisect_with_parents
-from jeit.mesh.checks import MOST_POINTS
+from jeit.mesh.checks import MAX_POINTS
 from jeit.protocol import Protocol
 from jeit_solvers.engines import on_host
 
 # Maximum ratio of the number of nodes of the refined mesh to that of the original mesh, unless even the longest edges
 # require more.
-_MAX_NODES = 2.5
+_MAX_NODE_RATIO = 2.5
 
 
 class FinerModel(NamedTuple):
@@ -57,7 +57,7 @@ class FinerModel(NamedTuple):
         return self.problem.background * np.exp(image + np.broadcast_to(field, self.cell.max() + 1)[self.cell])
 
 
-def refine_at_surfaces(problem: ShapeProblem, fit: Fit, edges: Sequence[float]) -> FinerModel:
+def refine_at_surfaces(problem: ShapeProblem, fit: ShapeFit, edges: Sequence[float]) -> FinerModel:
     """Refine the mesh of a shape problem at the surfaces of the ellipsoids of a fit.
 
     `edges`: edge lengths on the surfaces, in units of an ellipsoid's shortest half axis, in descending order. The mesh
@@ -67,13 +67,13 @@ def refine_at_surfaces(problem: ShapeProblem, fit: Fit, edges: Sequence[float]) 
     bodies, model = fit.bodies, problem.model
     assert isinstance(bodies, Ellipsoids)
     tagged_mesh, names = _tag_electrodes(model.mesh, model.electrodes)
-    mesh, parent_cells, max_points = tagged_mesh, np.arange(tagged_mesh.num_cells), MOST_POINTS
+    mesh, parent_cells, max_points = tagged_mesh, np.arange(tagged_mesh.num_cells), MAX_POINTS
     for edge in edges:
         refined = bisect_with_parents(mesh, partial(bodies.edges, fit.coefficients, edge), max_points)
         if refined is None:
             break
         mesh, parent_cells = refined[0], parent_cells[refined[1]]
-        max_points = int(_MAX_NODES * tagged_mesh.num_points)
+        max_points = int(_MAX_NODE_RATIO * tagged_mesh.num_points)
     refined_model = on_host(ForwardModel(mesh, _electrodes_on(mesh, model.electrodes, iter(names)), model.protocol))
     background = problem.background[parent_cells]
     voltage_change = (

@@ -11,34 +11,35 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jeit.inverse.shapes.bodies import Bodies, results_for
-from jeit.inverse.shapes.problem import Fit, ShapeProblem
+from jeit.inverse.shapes.bodies import Bodies, results_of_parts
+from jeit.inverse.shapes.problem import ShapeFit, ShapeProblem
 from jeit.inverse.shapes.reconstruction import Body
 
 STEPS = 40
 """Maximum number of steps of a fit."""
 COARSE_TOLERANCE = 1e-2
 """Relative change of the cost that ends a fit whose result is only compared."""
-CERTAIN_RISE = 10.0
+CERTAIN_OBJECTIVE_RATIO = 10.0
 """A body is beyond doubt if the objective without it is larger by more than this factor."""
 MIN_EVIDENCE_GAIN = 2.0
 """Minimum gain of log evidence with which a description of the bodies with more parameters is accepted."""
 _TRIAL_STEPS = 6
 # Maximum number of steps of the first part of a fit without a body, after which the fit ends if the cost exceeds the
 # cost at which the body is beyond doubt by more than this factor; and maximum number of further steps.
-_FIRST_REMOVAL_STEPS, _HOPELESS_RISE, _REMOVAL_STEPS = 3, 30.0, 6
+_FIRST_REMOVAL_STEPS, _HOPELESS_OBJECTIVE_RATIO, _REMOVAL_STEPS = 3, 30.0, 6
 # The data exclude a change of a body's kind if it raises the objective, after a few steps of the fit, by more than this
 # factor: on finer meshes the factor increases, because the objective of the right kind decreases.
-_EXCLUDED_RISE = 100.0
+_EXCLUDED_OBJECTIVE_RATIO = 100.0
 # Maximum number of changes of the number or kind of bodies in a search.
-_MAX_CHANGES = 10
+_MAX_MODEL_CHANGES = 10
 
 
 class SearchResult(NamedTuple):
-    """Result of removing ghosts: `fit` of the remaining bodies, their `rises`, and the removed bodies, `doubtful`."""
+    """Result of removing ghosts: `fit` of the remaining bodies, their `objective_ratios`, and the removed bodies,
+    `doubtful`."""
 
-    fit: Fit
-    rises: list[float]
+    fit: ShapeFit
+    objective_ratios: list[float]
     doubtful: tuple[Body, ...]
 
 
@@ -50,7 +51,7 @@ def grow_bodies(problem: ShapeProblem, bodies: Bodies, coefficients, steps: int)
 
 def remove_unsupported(
     problem: ShapeProblem,
-    fitted: Fit,
+    fitted: ShapeFit,
     doubtful: Sequence[Body],
     least_rise: float,
     min_costs: Float[np.ndarray, " k"] | None = None,
@@ -65,10 +66,10 @@ def remove_unsupported(
         bodies, coefficients, cost, _ = fitted
         # After a ghost is removed, leaving out a further body raises the cost at least as much as before, so costs
         # computed earlier are lower limits.
-        certain_cost = max(CERTAIN_RISE * cost, problem.surprise(fitted) + MIN_EVIDENCE_GAIN)
+        certain_cost = max(CERTAIN_OBJECTIVE_RATIO * cost, problem.negative_log_evidence(fitted) + MIN_EVIDENCE_GAIN)
         uncertain = np.flatnonzero(costs <= certain_cost).tolist()
         starts = [bodies.without(k, coefficients) for k in uncertain]
-        fits_without = results_for(bodies, partial(_fit_without, problem, certain_cost), starts)
+        fits_without = results_of_parts(bodies, partial(_fit_without, problem, certain_cost), starts)
         fits = dict(zip(uncertain, fits_without, strict=True))
         costs[uncertain] = [fit.cost for fit in fits_without]
         weakest = min(fits, key=lambda k: costs[k], default=None)
@@ -79,31 +80,31 @@ def remove_unsupported(
         fitted = problem.fit(fits[weakest].bodies, fits[weakest].coefficients, STEPS)
 
 
-def _fit_without(problem: ShapeProblem, certain_cost: float, start: tuple[Bodies, Float[np.ndarray, " n"]]) -> Fit:
+def _fit_without(problem: ShapeProblem, certain_cost: float, start: tuple[Bodies, Float[np.ndarray, " n"]]) -> ShapeFit:
     """Fit the remaining bodies from their coefficients `start`. The fit ends early if its cost remains far above
     `certain_cost`, above which the omitted body certainly exists."""
     first_fit = problem.fit(*start, _FIRST_REMOVAL_STEPS, 2 * COARSE_TOLERANCE)
-    if first_fit.cost > _HOPELESS_RISE * certain_cost:
+    if first_fit.cost > _HOPELESS_OBJECTIVE_RATIO * certain_cost:
         return first_fit
     return problem.fit(first_fit.bodies, first_fit.coefficients, _REMOVAL_STEPS, 2 * COARSE_TOLERANCE)
 
 
-def _split_bodies(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None:
+def _split_bodies(problem: ShapeProblem, fitted: ShapeFit, least_rise: float) -> ShapeFit | None:
     """Fit the bodies with one body split in two; None if the data support no split. Each body adds parameters, so no
     split is tried if the whole cost is less than the gain of evidence that it needs."""
     bodies, coefficients, cost, _ = fitted
     if cost < MIN_EVIDENCE_GAIN:
         return None
 
-    def trial(index: tuple[int, ...]) -> Fit:
+    def trial(index: tuple[int, ...]) -> ShapeFit:
         return _trial_fit(problem, grow_bodies(problem, *bodies.split(index[0], coefficients, index[1]), _TRIAL_STEPS))
 
-    trials = results_for(bodies, trial, list(np.ndindex(len(bodies.sign), bodies.num_splits)))
+    trials = results_of_parts(bodies, trial, list(np.ndindex(len(bodies.sign), bodies.num_splits)))
     split = _best_fit(problem, fitted, trials)
     return split if split and cost >= least_rise * split.cost and _is_supported(problem, fitted, split) else None
 
 
-def alternative_fits(problem: ShapeProblem, result: SearchResult) -> tuple[SearchResult, Fit | None]:
+def alternative_fits(problem: ShapeProblem, result: SearchResult) -> tuple[SearchResult, ShapeFit | None]:
     """Fit the bodies with one or all of them changed to the other kind (weak star or column).
 
     Returns the `result`, with those bodies marked whose kind is certain, and the fit; None if the data support no
@@ -111,33 +112,35 @@ def alternative_fits(problem: ShapeProblem, result: SearchResult) -> tuple[Searc
     """
     fitted = result.fit
     bodies = fitted.bodies
-    can_change = ~bodies.is_other_kind & ~bodies.is_kind_certain & (not bodies.prior.is_of_one_kind)
-    indices = np.flatnonzero(can_change)
+    can_change_kind = ~bodies.is_other_kind & ~bodies.is_kind_certain & (not bodies.prior.is_of_one_kind)
+    indices = np.flatnonzero(can_change_kind)
     groups = [[k] for k in indices] + [indices] * (len(indices) > 1)
-    trials = results_for(
+    trials = results_of_parts(
         bodies, lambda group: _trial_fit(problem, bodies.with_other_kind(group, fitted.coefficients)), groups
     )
     is_kind_certain = bodies.is_kind_certain.copy()
     for k, trial in zip(indices, trials, strict=False):
-        is_kind_certain[k] = trial.cost > _EXCLUDED_RISE * fitted.cost
+        is_kind_certain[k] = trial.cost > _EXCLUDED_OBJECTIVE_RATIO * fitted.cost
     result = result._replace(fit=fitted._replace(bodies=replace(bodies, is_kind_certain=is_kind_certain)))
     change = _best_fit(problem, fitted, trials)
     return result, change if change and _is_supported(problem, fitted, change) else None
 
 
-def _trial_fit(problem: ShapeProblem, start: tuple[Bodies, Float[np.ndarray, " n"]]) -> Fit:
+def _trial_fit(problem: ShapeProblem, start: tuple[Bodies, Float[np.ndarray, " n"]]) -> ShapeFit:
     """Make a few steps of the fit of bodies from their coefficients `start`."""
     return problem.fit(*start, _TRIAL_STEPS, COARSE_TOLERANCE)
 
 
-def _best_fit(problem: ShapeProblem, fitted: Fit, trial_fits: Sequence[Fit]) -> Fit | None:
-    """Fit to convergence from the trial fit with the least cost, of those whose cost is at most `CERTAIN_RISE` times
-    that of `fitted` and that the data would support if their cost fell to zero. None if there are none."""
+def _best_fit(problem: ShapeProblem, fitted: ShapeFit, trial_fits: Sequence[ShapeFit]) -> ShapeFit | None:
+    """Fit to convergence from the trial fit with the least cost, of those whose cost is at most
+    `CERTAIN_OBJECTIVE_RATIO` times that of `fitted` and that the data would support if their cost fell to zero. None if
+    there are none."""
     possible_trials = [
         trial
         for trial in trial_fits
-        if trial.cost <= CERTAIN_RISE * fitted.cost
-        and problem.surprise(trial) - trial.cost + MIN_EVIDENCE_GAIN <= problem.surprise(fitted)
+        if trial.cost <= CERTAIN_OBJECTIVE_RATIO * fitted.cost
+        and problem.negative_log_evidence(trial) - trial.cost + MIN_EVIDENCE_GAIN
+        <= problem.negative_log_evidence(fitted)
     ]
     if not possible_trials:
         return None
@@ -145,33 +148,33 @@ def _best_fit(problem: ShapeProblem, fitted: Fit, trial_fits: Sequence[Fit]) -> 
     return problem.fit(best_trial.bodies, best_trial.coefficients, STEPS)
 
 
-def _is_supported(problem: ShapeProblem, simple_fit: Fit, other_fit: Fit) -> bool:
-    """Whether the log evidence of `other_fit` exceeds that of `simple_fit` by `MIN_EVIDENCE_GAIN`."""
-    return problem.surprise(other_fit) + MIN_EVIDENCE_GAIN <= problem.surprise(simple_fit)
+def _is_supported(problem: ShapeProblem, simpler_fit: ShapeFit, other_fit: ShapeFit) -> bool:
+    """Whether the log evidence of `other_fit` exceeds that of `simpler_fit` by `MIN_EVIDENCE_GAIN`."""
+    return problem.negative_log_evidence(other_fit) + MIN_EVIDENCE_GAIN <= problem.negative_log_evidence(simpler_fit)
 
 
 def improve_fit(problem: ShapeProblem, result: SearchResult, least_rise: float) -> SearchResult:
     """Search for likelier bodies, starting once with a change of kind and once with a split. Returns the likelier
     result, or `result` if the data support neither change. The second search is left out if even a perfect fit of more
     bodies of these kinds would be less likely than the result of the first."""
-    base_fit, doubtful = result.fit, result.doubtful
+    initial_fit, doubtful = result.fit, result.doubtful
     result, other_fit = alternative_fits(problem, result)
     results = [] if other_fit is None else [_search_until_stable(problem, doubtful, other_fit, least_rise)]
-    least_surprise = problem.surprise(base_fit) - base_fit.cost
-    if all(least_surprise <= problem.surprise(found.fit) for found in results):
-        split = _split_bodies(problem, base_fit, least_rise)
+    least_surprise = problem.negative_log_evidence(initial_fit) - initial_fit.cost
+    if all(least_surprise <= problem.negative_log_evidence(found.fit) for found in results):
+        split = _split_bodies(problem, initial_fit, least_rise)
         if split is not None:
             results.append(_search_until_stable(problem, doubtful, split, least_rise))
-    return min(results or [result], key=lambda candidate: problem.surprise(candidate.fit))
+    return min(results or [result], key=lambda candidate: problem.negative_log_evidence(candidate.fit))
 
 
 def _search_until_stable(
-    problem: ShapeProblem, doubtful: Sequence[Body], start: Fit, least_rise: float
+    problem: ShapeProblem, doubtful: Sequence[Body], start: ShapeFit, least_rise: float
 ) -> SearchResult:
     """Continue the search from the bodies `start`: remove ghosts, then split a body or, if no split is supported,
     change the kind of a body, until the data support no change. `doubtful`: bodies that were removed before."""
     result = remove_unsupported(problem, start, doubtful, least_rise)
-    for _ in range(_MAX_CHANGES):
+    for _ in range(_MAX_MODEL_CHANGES):
         next_fit = _split_bodies(problem, result.fit, least_rise)
         if next_fit is None:
             result, next_fit = alternative_fits(problem, result)

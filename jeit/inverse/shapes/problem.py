@@ -48,8 +48,8 @@ from jeit_solvers.engines import on_host
 
 # Levels of the other changes that are tried, in units of their prior standard deviations: of a smooth field, and of
 # changes of the electrodes.
-_FIELD_LEVELS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)
-_ELECTRODE_LEVELS = _FIELD_LEVELS[:-1]
+_SMOOTH_FIELD_LEVELS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)
+_MOVED_ELECTRODE_LEVELS = _SMOOTH_FIELD_LEVELS[:-1]
 # Standard deviation of the change of the logarithm of each contact impedance, at level 1.
 _CONTACT_DEVIATION = 0.3
 # Number of conductivities of which a problem keeps the fields.
@@ -73,7 +73,7 @@ class OtherChanges:
         """The problem of bodies with the changes of this `level` as additional noise."""
         return self.bodies_problem.with_errors(level * self.jacobian)
 
-    def likeliest_level(self, fit: Fit) -> float:
+    def most_likely_level(self, fit: ShapeFit) -> float:
         """Level of the changes with the largest evidence, given the voltages that the bodies of a `fit` do not
         explain."""
         residual = self._residual(fit)
@@ -84,22 +84,22 @@ class OtherChanges:
 
         return min(self.levels, key=surprise)
 
-    def conductivity(self, level: float, fit: Fit) -> Any:
+    def conductivity(self, level: float, fit: ShapeFit) -> Any:
         """Posterior mean of the part of the changes that is of conductivity, in log σ/σ₀ (m,), given the voltages that
         the bodies of a `fit` do not explain; 0 if no part is."""
         return 0.0
 
-    def voltages(self, level: float, fit: Fit, protocol: Protocol) -> Any:
+    def voltages(self, level: float, fit: ShapeFit, protocol: Protocol) -> Any:
         """Posterior mean of the changes of the voltages (M,) of a `protocol`, volts, that are not due to conductivity,
         given the voltages that the bodies of a `fit` do not explain; 0 if there are none."""
         return 0.0
 
-    def _mean_coefficients(self, level: float, fit: Fit) -> Any:
+    def _mean_coefficients(self, level: float, fit: ShapeFit) -> Any:
         """Posterior mean (n,) of the coefficients times the `level`."""
         precision = self.problem_at(level).data.precision
         return -(level**2) * self.jacobian.T @ (precision @ self._residual(fit))
 
-    def _residual(self, fit: Fit) -> Float[np.ndarray, " r"]:
+    def _residual(self, fit: ShapeFit) -> Float[np.ndarray, " r"]:
         """Residual of the weighted voltages: voltages predicted for the bodies of a `fit` minus measured voltages."""
         return fit.rows[0][: len(self.jacobian)]
 
@@ -128,9 +128,9 @@ class MovedElectrodes(OtherChanges):
         deviations = np.repeat([deviation, _CONTACT_DEVIATION], [len(derivatives) - num_contacts, num_contacts])
         changes = deviations[:, None, None] * derivatives
         jacobian = np.asarray(bodies_problem.data.weight)[:, None] * _channels_of(model.protocol, changes)
-        return cls(jacobian, bodies_problem, _ELECTRODE_LEVELS, changes)
+        return cls(jacobian, bodies_problem, _MOVED_ELECTRODE_LEVELS, changes)
 
-    def voltages(self, level: float, fit: Fit, protocol: Protocol) -> Float[np.ndarray, " M"]:
+    def voltages(self, level: float, fit: ShapeFit, protocol: Protocol) -> Float[np.ndarray, " M"]:
         """Posterior mean of the changes of the voltages (M,) of a `protocol`, volts, given the voltages that the bodies
         of a `fit` do not explain."""
         return _channels_of(protocol, self.impedance_changes) @ self._mean_coefficients(level, fit)
@@ -175,15 +175,15 @@ class SmoothField(OtherChanges):
         _, weighted_jacobian = image.inversion.linearise(zero_coefficients)
         weight_ratio = np.asarray(bodies_problem.data.weight) / image.inversion.data.weight
         scale = np.asarray(inversion.link.slope(inversion.reference)) / bodies_problem.background
-        return cls(weight_ratio[:, None] * weighted_jacobian, bodies_problem, _FIELD_LEVELS, image, scale)
+        return cls(weight_ratio[:, None] * weighted_jacobian, bodies_problem, _SMOOTH_FIELD_LEVELS, image, scale)
 
-    def conductivity(self, level: float, fit: Fit) -> Float[np.ndarray, " m"]:
+    def conductivity(self, level: float, fit: ShapeFit) -> Float[np.ndarray, " m"]:
         """Posterior mean (m,) of the smooth field, level · field in log σ/σ₀, given the voltages that the bodies of a
         `fit` do not explain."""
         return self.scale * np.asarray(self.image.inversion.basis.expand(self._mean_coefficients(level, fit)))
 
 
-class Fit(NamedTuple):
+class ShapeFit(NamedTuple):
     """Result of `ShapeProblem.fit`.
 
     **Fields**: `bodies`; `coefficients` (n,): coefficients of the bodies at the minimum; `cost`: objective at the
@@ -227,7 +227,7 @@ class ShapeProblem:
     rtol: float = 3e-3
     recent_fields: _RecentFields = field(default_factory=_RecentFields, compare=False)
 
-    def misfit(self, fit: Fit) -> float:
+    def misfit(self, fit: ShapeFit) -> float:
         """Misfit of the voltages of a `fit` in standard deviations of the data, errors of the data included."""
         residual = fit.rows[0][: len(self.data.voltages)]
         # The form is negative by rounding where errors that the model explains exceed all others many times.
@@ -272,11 +272,13 @@ class ShapeProblem:
             scipy.linalg.block_diag(self.data.precision, pair_identity),
         )
 
-    def fit(self, bodies: Bodies, start: Float[np.ndarray, " n"], max_steps: int, rtol: float | None = None) -> Fit:
+    def fit(
+        self, bodies: Bodies, start: Float[np.ndarray, " n"], max_steps: int, rtol: float | None = None
+    ) -> ShapeFit:
         """Minimise the cost of `bodies` from the coefficients `start` by the Levenberg-Marquardt method, in at most
         `max_steps` steps."""
         undefined_rows = np.full((len(self.data.voltages), 1 + len(start)), np.nan)
-        accepted: list[Any] = [undefined_rows[:, 0], undefined_rows[:, 1:]]
+        accepted_values: list[Any] = [undefined_rows[:, 0], undefined_rows[:, 1:]]
 
         def expand(coefficients, bodies) -> QuadraticModel:
             residual, jacobian, covariance, precision = self.linearise(coefficients, bodies)
@@ -284,14 +286,14 @@ class ShapeProblem:
 
             def step(damping):  # the Jacobian is computed only at points that are accepted
                 rows = jacobian()
-                accepted[:] = residual, rows
+                accepted_values[:] = residual, rows
                 return ridge_model(residual, rows, coefficients, covariance, precision)[1](damping)  # pyright: ignore
 
             return cost, step
 
         descent = Descent(rtol=rtol or self.rtol, damping=1.0, history=max_steps + 1)
         coefficients, state = descent.at_once(expand, start, bodies, max_steps)
-        return Fit(bodies, coefficients, float(state.cost), (accepted[0], accepted[1]))
+        return ShapeFit(bodies, coefficients, float(state.cost), (accepted_values[0], accepted_values[1]))
 
     @property
     def half_log_determinant(self) -> float:
@@ -299,20 +301,20 @@ class ShapeProblem:
         evidence."""
         return 0.5 * float(np.linalg.slogdet(np.asarray(self.data.covariance))[1])
 
-    def surprise(self, fit: Fit) -> float:
+    def negative_log_evidence(self, fit: ShapeFit) -> float:
         """Negative log evidence of the bodies of a `fit`, up to a constant, including the prior odds against their
         kinds."""
         return fit.cost + 0.5 * float(np.linalg.slogdet(self._hessian(fit))[1]) + fit.bodies.odds
 
-    def covariance(self, fit: Fit) -> Float[np.ndarray, "n n"]:
+    def covariance(self, fit: ShapeFit) -> Float[np.ndarray, "n n"]:
         """Posterior covariance (n, n) of the coefficients of the bodies of a `fit`, from Laplace's approximation."""
         return np.linalg.inv(self._hessian(fit))
 
-    def deviations(self, fit: Fit) -> Float[np.ndarray, " n"]:
+    def deviations(self, fit: ShapeFit) -> Float[np.ndarray, " n"]:
         """Posterior standard deviations (n,) of the coefficients of a `fit`, from Laplace's approximation."""
         return np.sqrt(np.diag(self.covariance(fit)))
 
-    def _hessian(self, fit: Fit) -> Float[np.ndarray, "n n"]:
+    def _hessian(self, fit: ShapeFit) -> Float[np.ndarray, "n n"]:
         """Hessian H (n, n) of the cost at its minimum."""
         _, rows = fit.rows
         num_channels = len(self.data.voltages)

@@ -22,9 +22,9 @@ from scipy.special import chdtri, ndtri
 
 from jeit.arguments.checks import Interval
 from jeit.inverse.placement import ModelError, Uncertainty
-from jeit.inverse.shapes.bodies import TINY, Bodies, Quantities, polarisation, results_for
+from jeit.inverse.shapes.bodies import MIN_POSITIVE_VALUE, Bodies, Quantities, polarisation, results_of_parts
 from jeit.inverse.shapes.ellipsoid import Ellipsoid
-from jeit.inverse.shapes.problem import Fit, ShapeProblem
+from jeit.inverse.shapes.problem import ShapeFit, ShapeProblem
 
 # Prior median of the contrast, and standard deviation and bounds of its logarithm; a contrast of 4.5 is a factor of 90.
 _MEDIAN_LOG_CONTRAST, _LOG_CONTRAST_DEVIATION, _LOG_CONTRAST_BOUNDS = (
@@ -33,17 +33,17 @@ _MEDIAN_LOG_CONTRAST, _LOG_CONTRAST_DEVIATION, _LOG_CONTRAST_BOUNDS = (
     (float(np.log(0.03)), float(np.log(4.5))),
 )
 # Maximum number of steps of the first fit.
-_STEPS = 8
+_MAX_FIT_STEPS = 8
 # Minimum and maximum of the first step along the logarithm of the contrast.
-_FIRST_STEP_LIMITS = (0.02, 0.35)
+_LOG_CONTRAST_STEP_LIMITS = (0.02, 0.35)
 # Factor by which each step along the logarithm of the contrast is longer than the last.
 _STEP_GROWTH = 1.6
 # By dimension of the mesh: maximum number of steps of each fit and its tolerance, and the drop of the log posterior at
 # which the exploration ends. A step of a fit in a solid takes a second.
-_FIT_LIMITS, _LOG_POSTERIOR_DROP = {2: (8, 1e-2), 3: (2, 5e-2)}, {2: 5.0, 3: 3.0}
+_MAX_STEPS_AND_TOLERANCE, _LOG_POSTERIOR_DROP = {2: (8, 1e-2), 3: (2, 5e-2)}, {2: 5.0, 3: 3.0}
 # The data do not determine a limit of the contrast if the -log likelihood at that bound of the contrast exceeds its
 # minimum by less than this number.
-_OPEN_END_RISE = 1.0
+_MIN_LIKELIHOOD_DROP_AT_BOUND = 1.0
 # Probabilities at the limits of a credible interval; number of values of the contrast, and number of standard normal
 # deviates for each of them, at which the posterior is evaluated.
 _INTERVAL_PROBABILITIES, _NUM_CONTRASTS, _NUM_NORMAL_DEVIATES = (0.16, 0.84), 240, 31
@@ -52,7 +52,7 @@ _CENTROID_PROBABILITY = 0.68
 # Standard deviation of a body's place due to an error of the fields, as a share of half the width of the domain times
 # the relative error: a body's voltages change by a factor of about e² over half the width, and a fifth of the error is
 # assumed to resemble a displacement.
-_FIELD_DISPLACEMENT = 0.1
+_RELATIVE_CENTROID_DEVIATION = 0.1
 
 
 class Accuracy(NamedTuple):
@@ -77,7 +77,7 @@ class Accuracy(NamedTuple):
 
 
 def with_quantities(
-    problem: ShapeProblem, fit: Fit, accuracy: Accuracy, unmodelled: Any, order: Any
+    problem: ShapeProblem, fit: ShapeFit, accuracy: Accuracy, unmodelled: Any, order: Any
 ) -> list[Quantities]:
     """Compute the quantities of the bodies of a `fit`, in the `order` of indices. `unmodelled` (k,): standard
     deviations of the contrasts of all k bodies due to errors that the problem does not contain.
@@ -89,13 +89,15 @@ def with_quantities(
         rows = accuracy.model_error.voltages(problem.model, conductivity, problem.background)
         problem = problem.with_errors(np.asarray(problem.data.weight)[:, None] * rows)
     shown_centroids = [fit.bodies.body(int(k), fit.coefficients).centroid for k in order]
-    fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
+    fit = problem.fit(fit.bodies, fit.coefficients, _MAX_FIT_STEPS)
     if (misfit := problem.misfit(fit)) > 1:  # the errors are larger than assumed, whatever their cause
         problem = problem.with_scaled_errors(misfit)
-        fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
+        fit = problem.fit(fit.bodies, fit.coefficients, _MAX_FIT_STEPS)
     materials = np.unique(fit.bodies.first).tolist()
     explored = dict(
-        zip(materials, results_for(fit.bodies, lambda k: explore_contrast(problem, fit, k), materials), strict=True)
+        zip(
+            materials, results_of_parts(fit.bodies, lambda k: explore_contrast(problem, fit, k), materials), strict=True
+        )
     )
     return [
         replace(
@@ -107,7 +109,7 @@ def with_quantities(
 
 
 def centroid_radius(
-    problem: ShapeProblem, fit: Fit, k: int, shown_centroid: Float[np.ndarray, " d"], accuracy: Accuracy
+    problem: ShapeProblem, fit: ShapeFit, k: int, shown_centroid: Float[np.ndarray, " d"], accuracy: Accuracy
 ) -> float:
     """Radius, metres, of the circle or ball about the `shown_centroid` of body k that contains the true centroid with a
     probability of 68 %.
@@ -123,7 +125,7 @@ def centroid_radius(
     slope = bodies.centroid_slope(k, fit.coefficients, np.sqrt(np.diag(coefficient_covariance)))
     points = np.asarray(problem.model.mesh.points)
     scaling_error = accuracy.size * (centroid - (points.min(axis=0) + points.max(axis=0)) / 2)
-    field_error = _FIELD_DISPLACEMENT * accuracy.strength * bodies.span / 2
+    field_error = _RELATIVE_CENTROID_DEVIATION * accuracy.strength * bodies.span / 2
     covariance = slope @ coefficient_covariance @ slope.T
     covariance += np.outer(scaling_error, scaling_error) + field_error**2 * np.eye(len(centroid))
     variance = np.trace(covariance)
@@ -134,19 +136,22 @@ def centroid_radius(
     return float(np.sqrt(squared_radius))
 
 
-def include_deviation(quantities: Quantities, body: Ellipsoid, other: Ellipsoid | None, deviation: float) -> Quantities:
-    """Widen the intervals of the `quantities` of a `body` so that they include the properties of the body's `other`
-    description, if there is one. `deviation`: standard deviation of the contrast of the other description."""
-    if other is None:
+def include_deviation(
+    quantities: Quantities, body: Ellipsoid, other_body: Ellipsoid | None, deviation: float
+) -> Quantities:
+    """Widen the intervals of the `quantities` of a `body` so that they include the properties of `other_body`, the
+    body's other description, if there is one. `deviation`: standard deviation of the contrast of the other
+    description."""
+    if other_body is None:
         return quantities
-    changes = np.expm1(other.sign * (other.contrast + deviation * np.array([-1, 1]))).tolist()
-    strength = float(other.volume * polarisation(other.sign * other.contrast, other.bounded_axes))
+    changes = np.expm1(other_body.sign * (other_body.contrast + deviation * np.array([-1, 1]))).tolist()
+    strength = float(other_body.volume * polarisation(other_body.sign * other_body.contrast, other_body.bounded_axes))
     return replace(
         quantities,
         change_interval=_interval_hull(quantities.change_interval, changes),
-        measure_interval=_interval_hull(quantities.measure_interval, [other.volume]),
+        measure_interval=_interval_hull(quantities.measure_interval, [other_body.volume]),
         strength_interval=_interval_hull(quantities.strength_interval, [strength]),
-        centroid_radius=max(quantities.centroid_radius, float(np.linalg.norm(other.centroid - body.centroid))),
+        centroid_radius=max(quantities.centroid_radius, float(np.linalg.norm(other_body.centroid - body.centroid))),
     )
 
 
@@ -161,7 +166,7 @@ class ExploredContrast(NamedTuple):
 
     log_contrast: float
     negative_log_likelihood: float
-    fit: Fit
+    fit: ShapeFit
 
     @property
     def negative_log_evidence(self) -> float:
@@ -180,7 +185,7 @@ class _FixedContrastFit(NamedTuple):
     deviation: float
 
 
-def explore_contrast(problem: ShapeProblem, fit: Fit, k: int) -> list[ExploredContrast]:
+def explore_contrast(problem: ShapeProblem, fit: ShapeFit, k: int) -> list[ExploredContrast]:
     """Explore the contrast of body k of a `fit`, and of all bodies of its material, in both directions until it is
     improbable or at a bound. Returns the fits in ascending order of contrast."""
     bodies = fit.bodies
@@ -192,7 +197,7 @@ def explore_contrast(problem: ShapeProblem, fit: Fit, k: int) -> list[ExploredCo
     max_drop = _LOG_POSTERIOR_DROP[bodies.dimension]
 
     def explore(direction: int) -> list[ExploredContrast]:
-        explored, step = [middle_fit], float(np.clip(deviation, *_FIRST_STEP_LIMITS))
+        explored, step = [middle_fit], float(np.clip(deviation, *_LOG_CONTRAST_STEP_LIMITS))
         while explored[-1].negative_log_evidence < min(one.negative_log_evidence for one in explored) + max_drop:
             last_fit = explored[-1]
             log_contrast = float(np.clip(last_fit.log_contrast + direction * step, *_LOG_CONTRAST_BOUNDS))
@@ -206,7 +211,7 @@ def explore_contrast(problem: ShapeProblem, fit: Fit, k: int) -> list[ExploredCo
             step *= _STEP_GROWTH
         return explored
 
-    lower, higher = results_for(bodies, explore, [-1, 1])
+    lower, higher = results_of_parts(bodies, explore, [-1, 1])
     return [*lower[:0:-1], *higher]
 
 
@@ -225,7 +230,7 @@ def quantify(
         )
         deviation = float(np.hypot(bodies.bounded_axes(k) * np.hypot(deviation, accuracy.size), accuracy.strength))
         measure = fit.bodies.body(k, fit.coefficients).measure
-        log_measure = float(np.log(max(measure, TINY)))
+        log_measure = float(np.log(max(measure, MIN_POSITIVE_VALUE)))
         fixed_fits.append(_FixedContrastFit(log_contrast, negative_log_likelihood, log_measure, deviation))
     return _summary(int(bodies.sign[k]), bodies.bounded_axes(k), unmodelled, fixed_fits)
 
@@ -249,8 +254,10 @@ def _fit_with_fixed_contrast(
         start[_radius_and_contrast_index(bodies, body_index)[0]] += np.log(ratio) / axes / bodies.prior.radius_spread
     start[_radius_and_contrast_index(bodies, k)[1]] = 0.0
     fixed_contrast = np.where(same_material, np.exp(log_contrast), bodies.fixed_contrast)
-    fixed_fit = problem.fit(replace(bodies, fixed_contrast=fixed_contrast), start, *_FIT_LIMITS[bodies.dimension])
-    return ExploredContrast(log_contrast, problem.surprise(fixed_fit), fixed_fit)
+    fixed_fit = problem.fit(
+        replace(bodies, fixed_contrast=fixed_contrast), start, *_MAX_STEPS_AND_TOLERANCE[bodies.dimension]
+    )
+    return ExploredContrast(log_contrast, problem.negative_log_evidence(fixed_fit), fixed_fit)
 
 
 def _contrast_prior(log_contrast):
@@ -277,11 +284,11 @@ def _summary(sign: int, axes: int, unmodelled: float, fixed_fits: Sequence[_Fixe
     min_negative_log_likelihood = negative_log_likelihoods.min()
     is_open_above = (
         log_contrasts[-1] == _LOG_CONTRAST_BOUNDS[1]
-        and negative_log_likelihoods[-1] < min_negative_log_likelihood + _OPEN_END_RISE
+        and negative_log_likelihoods[-1] < min_negative_log_likelihood + _MIN_LIKELIHOOD_DROP_AT_BOUND
     )
     is_open_below = (
         log_contrasts[0] == _LOG_CONTRAST_BOUNDS[0]
-        and negative_log_likelihoods[0] < min_negative_log_likelihood + _OPEN_END_RISE
+        and negative_log_likelihoods[0] < min_negative_log_likelihood + _MIN_LIKELIHOOD_DROP_AT_BOUND
     )
     # If the data do not determine the upper limit of the contrast, they do not determine the lower limit of the area or
     # volume either, and vice versa: a stronger body is smaller.

@@ -20,7 +20,7 @@ from jeit.inverse.shapes.alternatives import alternatives, contrast_deviations, 
 from jeit.inverse.shapes.bodies import Bodies, BodyPrior
 from jeit.inverse.shapes.ellipsoid import EllipsoidPrior, Ellipsoids
 from jeit.inverse.shapes.number_and_kinds import (
-    CERTAIN_RISE,
+    CERTAIN_OBJECTIVE_RATIO,
     COARSE_TOLERANCE,
     MIN_EVIDENCE_GAIN,
     STEPS,
@@ -30,7 +30,7 @@ from jeit.inverse.shapes.number_and_kinds import (
     improve_fit,
     remove_unsupported,
 )
-from jeit.inverse.shapes.problem import Fit, MovedElectrodes, OtherChanges, ShapeProblem, SmoothField
+from jeit.inverse.shapes.problem import MovedElectrodes, OtherChanges, ShapeFit, ShapeProblem, SmoothField
 from jeit.inverse.shapes.quantities import Accuracy, include_deviation, with_quantities
 from jeit.inverse.shapes.reconstruction import FinerImage, ShapeReconstruction
 from jeit.inverse.shapes.star import StarPrior, Stars
@@ -43,14 +43,14 @@ if TYPE_CHECKING:
 
 # A body is a ghost if the objective rises by less than this factor when the body is left out and all other bodies are
 # fitted again.
-LEAST_RISE = 1.4
-_FIRST_STEPS = 15
+MIN_OBJECTIVE_RATIO = 1.4
+_NUM_FIRST_STEPS = 15
 # Number of successive starts that the data do not support, after which the remaining, weaker starts are not tried.
-_MAX_UNSUPPORTED = 2
+_MAX_UNSUPPORTED_STARTS = 2
 # Maximum number of times that the mesh is refined at the bodies, which move as a result. Edge lengths on the bodies'
 # surfaces, in units of the shortest half axis, that are tried in turn: in the first refinement, when some bodies may
 # still be ghosts (false bodies), and in later refinements.
-_MAX_REFINEMENTS, _EDGE_LENGTHS = 3, ((0.7,), (0.7, 0.5, 0.35, 0.25))
+_MAX_REFINEMENTS, _RELATIVE_EDGE_LENGTHS_BY_REFINEMENT = 3, ((0.7,), (0.7, 0.5, 0.35, 0.25))
 
 
 @one_thread_of_blas()  # several threads would only wait for each other in its small products
@@ -63,7 +63,7 @@ def reconstruct_shapes(
     noise: Float[Array, " M"] | float | None = None,
     mask: Bool[Array, " M"] | None = None,
     prior: BodyPrior | None = None,
-    least_rise: float = LEAST_RISE,
+    least_rise: float = MIN_OBJECTIVE_RATIO,
     smooth: Reconstruction | None = None,
     accuracy: Accuracy | None = None,
     progress: Callable[[str], None] | None = None,
@@ -115,7 +115,7 @@ def reconstruct_shapes(
     check_flat(model.mesh, "star shapes")
     background = np.asarray(check_background(model, background))
     deviation = check_noise(noise, measured, used)
-    form, prior_type = (Stars, StarPrior) if model.mesh.dimension == 2 else (Ellipsoids, EllipsoidPrior)
+    bodies_type, prior_type = (Stars, StarPrior) if model.mesh.dimension == 2 else (Ellipsoids, EllipsoidPrior)
     prior = prior_type() if prior is None else prior
     check_kind("prior", prior, prior_type, f"one of bodies of that dimension, such as {prior_type.__name__}(modes=2)")
     if not (is_number(least_rise) and least_rise >= 1):
@@ -124,7 +124,7 @@ def reconstruct_shapes(
     independent_model, data = independent_data(model, measured, used, deviation, at_once=True)
     is_solid = model.mesh.dimension == 3
     problem = ShapeProblem(independent_model, data, background, COARSE_TOLERANCE if is_solid else ShapeProblem.rtol)
-    bodies = form.create(model.mesh, prior, centre, sign)
+    bodies = bodies_type.create(model.mesh, prior, centre, sign)
     coefficients = bodies.of_radii(radius)
     if isinstance(prior, EllipsoidPrior) and prior.kinds == "columns":
         bodies, coefficients = bodies.with_other_kind(range(len(radius)), coefficients)
@@ -140,16 +140,16 @@ def reconstruct_shapes(
         states.append(_fit_bodies(setting, 0.0, bodies, coefficients, least_rise))
     if other_changes is not None:
         level, ball_fit, _ = _add_bodies(setting, *bodies.with_modes(1, coefficients))
-        grown = ball_fit.bodies.with_modes(prior.modes, ball_fit.coefficients)
-        states.append(_fit_bodies(setting, level, *grown, least_rise))
-    state = min(states, key=lambda state: state.surprise)
+        bodies_with_modes = ball_fit.bodies.with_modes(prior.modes, ball_fit.coefficients)
+        states.append(_fit_bodies(setting, level, *bodies_with_modes, least_rise))
+    state = min(states, key=lambda state: state.negative_log_evidence)
     if is_solid:
         state, finer_model = _refine_meshes(state, least_rise, report)
         report("bodies, of which kind")
     else:
         report("bodies, how many")
         state = state._replace(found=improve_fit(setting.problem(state.level), state.found, least_rise))
-    (setting, level, (free_fit, rises, doubtful)), other_changes = state, state.setting.other_changes
+    (setting, level, (free_fit, objective_ratios, doubtful)), other_changes = state, state.setting.other_changes
     problem = setting.problem(level)
     fitted = _with_common_contrast(problem, free_fit)
     bodies, coefficients = fitted.bodies, fitted.coefficients
@@ -164,10 +164,10 @@ def reconstruct_shapes(
         )
     if other_changes is not None:
         predicted = predicted + other_changes.voltages(level, fitted, model.protocol)
-    alternates, deviations = alternatives(problem, fitted), contrast_deviations(problem, fitted, free_fit)
+    alternative_bodies, deviations = alternatives(problem, fitted), contrast_deviations(problem, fitted, free_fit)
     normalised_residual = ((predicted - np.asarray(measured)) / np.asarray(deviation))[used]
-    order = np.argsort(-np.asarray(rises), kind="stable")
-    found_bodies = [bodies.body(int(k), coefficients, rises[k]) for k in order]
+    order = np.argsort(-np.asarray(objective_ratios), kind="stable")
+    bodies_of_fit = [bodies.body(int(k), coefficients, objective_ratios[k]) for k in order]
     if accuracy is not None:
         report("bodies, how large and how strong")
         exact_data = independent_data(model, measured, used, accuracy.noise, at_once=True)[1]
@@ -176,20 +176,20 @@ def reconstruct_shapes(
         unmodelled = unmodelled_deviations(problem, fitted, free_fit)
         quantities = with_quantities(setting.weighted(exact_data).problem(level), fitted, accuracy, unmodelled, order)
         quantities = [
-            include_deviation(values, body, *alternates[k])
-            for values, body, k in zip(quantities, found_bodies, order, strict=True)
+            include_deviation(values, body, *alternative_bodies[k])
+            for values, body, k in zip(quantities, bodies_of_fit, order, strict=True)
         ]
-        found_bodies = [body.with_quantities(values) for body, values in zip(found_bodies, quantities, strict=True)]
+        bodies_of_fit = [body.with_quantities(values) for body, values in zip(bodies_of_fit, quantities, strict=True)]
     return ShapeReconstruction(
-        bodies=tuple(found_bodies),
+        bodies=tuple(bodies_of_fit),
         conductivity=as_array(conductivity),
         voltages=as_array(predicted),
         misfit=as_array(np.sqrt(np.mean(normalised_residual**2))),
         drift=float(np.expm1(prior.drift * coefficients[0])),
         doubtful=doubtful,
         contrast_deviations=tuple(deviations[k] for k in order),
-        alternatives=tuple(alternates[k][0] for k in order),
-        alternative_deviations=tuple(alternates[k][1] for k in order),
+        alternatives=tuple(alternative_bodies[k][0] for k in order),
+        alternative_deviations=tuple(alternative_bodies[k][1] for k in order),
         finer=image,
     )
 
@@ -235,7 +235,7 @@ class _FitSetting(NamedTuple):
             )
         return _FitSetting(bodies_problem, other_changes)
 
-    def fit_level(self, bodies: Bodies, coefficients, level: float, steps: int) -> tuple[float, Fit, float]:
+    def fit_level(self, bodies: Bodies, coefficients, level: float, steps: int) -> tuple[float, ShapeFit, float]:
         """Alternate between fitting the bodies and lowering the level of other changes, until no lower one is likelier.
 
         Returns the level, the fit of the bodies and -log evidence. The level decreases from `level`, because bodies
@@ -244,31 +244,41 @@ class _FitSetting(NamedTuple):
         while True:
             problem = self.problem(level)
             fitted = problem.fit(bodies, coefficients, steps, COARSE_TOLERANCE)
-            best_level = level if self.other_changes is None else self.other_changes.likeliest_level(fitted)
+            best_level = level if self.other_changes is None else self.other_changes.most_likely_level(fitted)
             if best_level >= level:
-                return level, fitted, problem.surprise(fitted) + problem.half_log_determinant
+                return level, fitted, problem.negative_log_evidence(fitted) + problem.half_log_determinant
             level, coefficients = best_level, fitted.coefficients
 
 
-def _add_bodies(setting: _FitSetting, bodies: Bodies, coefficients, num_sure: int = 0) -> tuple[float, Fit, list[int]]:
+def _add_bodies(
+    setting: _FitSetting, bodies: Bodies, coefficients, num_certain: int = 0
+) -> tuple[float, ShapeFit, list[int]]:
     """Add bodies one by one to other changes, and retain each body that the data support in addition to earlier ones.
 
-    Returns the level of the other changes, the fit, and the indices of the retained bodies. The first `num_sure` bodies
-    are beyond doubt and are fitted together, because one of two bodies, fitted alone, would move to a place between the
-    two.
+    Returns the level of the other changes, the fit, and the indices of the retained bodies. The first `num_certain`
+    bodies are beyond doubt and are fitted together, because one of two bodies, fitted alone, would move to a place
+    between the two.
     """
     rows = bodies.rows(coefficients)
-    supported, num_refused = list(range(num_sure)), 0
-    start = np.append(coefficients[0], rows[:num_sure])
-    level, fit, min_surprise = setting.fit_level(bodies.subset(supported), start, 1.0, _FIRST_STEPS)
-    for k in range(num_sure, len(rows)):
+    supported_indices, num_refused = list(range(num_certain)), 0
+    start = np.append(coefficients[0], rows[:num_certain])
+    level, fit, min_surprise = setting.fit_level(bodies.subset(supported_indices), start, 1.0, _NUM_FIRST_STEPS)
+    for k in range(num_certain, len(rows)):
         start = np.append(fit.coefficients, rows[k])
-        new_level, new_fit, surprise = setting.fit_level(bodies.subset([*supported, k]), start, level, _FIRST_STEPS)
+        new_level, new_fit, surprise = setting.fit_level(
+            bodies.subset([*supported_indices, k]), start, level, _NUM_FIRST_STEPS
+        )
         if surprise + MIN_EVIDENCE_GAIN <= min_surprise:
-            level, fit, min_surprise, supported, num_refused = new_level, new_fit, surprise, [*supported, k], 0
-        elif (num_refused := num_refused + 1) == _MAX_UNSUPPORTED:
+            level, fit, min_surprise, supported_indices, num_refused = (
+                new_level,
+                new_fit,
+                surprise,
+                [*supported_indices, k],
+                0,
+            )
+        elif (num_refused := num_refused + 1) == _MAX_UNSUPPORTED_STARTS:
             break
-    return level, fit, supported
+    return level, fit, supported_indices
 
 
 class _SearchState(NamedTuple):
@@ -280,16 +290,16 @@ class _SearchState(NamedTuple):
     found: SearchResult
 
     @property
-    def surprise(self) -> float:
+    def negative_log_evidence(self) -> float:
         """Negative log evidence of the bodies and of the level, up to a constant."""
         problem = self.setting.problem(self.level)
-        return problem.surprise(self.found.fit) + problem.half_log_determinant
+        return problem.negative_log_evidence(self.found.fit) + problem.half_log_determinant
 
 
 def _fit_bodies(setting: _FitSetting, level: float, bodies: Bodies, coefficients, least_rise: float) -> _SearchState:
     """Fit all bodies together, with other changes at their `level`, and remove those that are not supported."""
     problem = setting.problem(level)
-    fitted = problem.fit(*grow_bodies(problem, bodies, coefficients, _FIRST_STEPS), STEPS)
+    fitted = problem.fit(*grow_bodies(problem, bodies, coefficients, _NUM_FIRST_STEPS), STEPS)
     return _SearchState(setting, level, remove_unsupported(problem, fitted, (), least_rise))
 
 
@@ -306,28 +316,33 @@ def _refine_meshes(
 
     base_setting, finer_model = state.setting, None
     for refinement in range(_MAX_REFINEMENTS):
-        _, level, (last_fit, rises, doubtful) = state
+        _, level, (last_fit, objective_ratios, doubtful) = state
         if not len(last_fit.bodies.sign):
             break
         report(f"bodies, finer mesh {refinement + 1}")
-        finer_model = refine_at_surfaces(base_setting.bodies_problem, last_fit, _EDGE_LENGTHS[refinement > 0])
+        finer_model = refine_at_surfaces(
+            base_setting.bodies_problem, last_fit, _RELATIVE_EDGE_LENGTHS_BY_REFINEMENT[refinement > 0]
+        )
         setting, bodies, coefficients = (
             base_setting.on(finer_model.problem),
             finer_model.bodies,
             last_fit.coefficients,
         )
-        costs = np.array(rises) * last_fit.cost
+        costs = np.array(objective_ratios) * last_fit.cost
         if refinement:
             level, fit, _ = setting.fit_level(bodies, coefficients, level, STEPS)
         else:
             order = np.argsort(-costs)
             start = np.append(coefficients[0], bodies.rows(coefficients)[order])
-            num_sure = int((costs > CERTAIN_RISE * last_fit.cost).sum())
-            level, fit, supported = _add_bodies(setting, bodies.subset(order), start, num_sure)
-            unsupported = np.setdiff1d(np.arange(len(order)), supported)
-            doubtful = (*doubtful, *(bodies.body(k, coefficients, rises[k]) for k in order[unsupported]))
-            costs = costs[order[supported]]
-            coefficients = np.append(coefficients[0], bodies.rows(coefficients)[order[supported]])
+            num_certain = int((costs > CERTAIN_OBJECTIVE_RATIO * last_fit.cost).sum())
+            level, fit, supported_indices = _add_bodies(setting, bodies.subset(order), start, num_certain)
+            unsupported_indices = np.setdiff1d(np.arange(len(order)), supported_indices)
+            doubtful = (
+                *doubtful,
+                *(bodies.body(k, coefficients, objective_ratios[k]) for k in order[unsupported_indices]),
+            )
+            costs = costs[order[supported_indices]]
+            coefficients = np.append(coefficients[0], bodies.rows(coefficients)[order[supported_indices]])
         problem = setting.problem(level)
         fit = problem.fit(fit.bodies, fit.coefficients, STEPS)
         result = remove_unsupported(problem, fit, doubtful, least_rise, costs)
@@ -344,11 +359,11 @@ def _refine_meshes(
     return state, finer_model
 
 
-def _with_common_contrast(problem: ShapeProblem, fitted: Fit) -> Fit:
+def _with_common_contrast(problem: ShapeProblem, fitted: ShapeFit) -> ShapeFit:
     """Fit one material for all ellipsoids of a sign, if this is likelier than a material for each ellipsoid."""
     for sign in (1, -1):
         bodies = fitted.bodies
         if isinstance(bodies, Ellipsoids) and ((bodies.sign == sign) & ~bodies.same_material).sum() > 1:
             common_fit = problem.fit(*bodies.of_one_material(sign, fitted.coefficients), STEPS)
-            fitted = min(fitted, common_fit, key=problem.surprise)
+            fitted = min(fitted, common_fit, key=problem.negative_log_evidence)
     return fitted

@@ -13,19 +13,19 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from jeit.inverse.shapes.bodies import TINY, Bodies, BodyPrior, Covered, Quantities
+from jeit.inverse.shapes.bodies import MIN_POSITIVE_VALUE, Bodies, BodyPrior, CellCoverage, Quantities
 from jeit.mesh import Mesh, measures
 from jeit_solvers.module import Module
 
 # Barycentric coordinates of the six points at which a cell is sampled.
-_SAMPLES = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4], [2.5, 2.5, 1], [2.5, 1, 2.5], [1, 2.5, 2.5]]) / 6
+_BARYCENTRIC_SAMPLES = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4], [2.5, 2.5, 1], [2.5, 1, 2.5], [1, 2.5, 2.5]]) / 6
 # Width of the blur of an outline, in units of the cell size: large enough for the coverage to be differentiable.
-_BLUR = 0.2
+_RELATIVE_BLUR_WIDTH = 0.2
 # Distance from an outline, in widths of the blur, beyond which the covered share of a cell is less than 1e-12.
-_REACH = 30
+_MAX_BLUR_DISTANCE = 30
 _NUM_OUTLINE_POINTS = 128
 # Minimum effect of a star on the electric field, relative to that of a weak star of the same size.
-_MIN_STRENGTH = 0.01
+_MIN_RELATIVE_EFFECT = 0.01
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,9 @@ class Star(Module):
     def with_quantities(self, known: Quantities) -> Star:
         """Copy of the body with the quantities `known`. Area and contrast become the medians, but the fitted outline
         does not change if the data do not determine how small a strong body is."""
-        scale = 1.0 if known.measure_interval[0] is None else np.sqrt(known.measure / max(self.area, TINY))
+        scale = (
+            1.0 if known.measure_interval[0] is None else np.sqrt(known.measure / max(self.area, MIN_POSITIVE_VALUE))
+        )
         outline = self.centroid + (self.outline - self.centroid) * scale
         return replace(self, outline=outline, contrast=float(np.abs(np.log1p(known.change))), quantities=known)
 
@@ -192,10 +194,10 @@ class Stars(Bodies):
         span = float(np.ptp(np.asarray(mesh.points), axis=0).max())
         area = np.asarray(measures(mesh))
         start = np.reshape(np.asarray(start, float), (-1, 2))
-        width, weight = _BLUR * np.sqrt(area), area / area.sum()
+        width, weight = _RELATIVE_BLUR_WIDTH * np.sqrt(area), area / area.sum()
         sign, false = np.asarray(sign, float), np.zeros(len(start), bool)
         nans = np.full(len(start), np.nan)
-        points = corners @ _SAMPLES.T
+        points = corners @ _BARYCENTRIC_SAMPLES.T
         return cls(prior, weight, span, start, sign, false, false, false, nans, points, width, edges)
 
     @property
@@ -214,12 +216,12 @@ class Stars(Bodies):
         rows, is_weak = self.rows(coefficients), self.is_other_kind.copy()
         for k in indices:
             strength = np.tanh(self.contrast(k, rows[k])[0] / 2) / np.tanh(self.prior.weak_contrast / 2)
-            strength = max(strength, _MIN_STRENGTH)  # of a star fitted with the other sign, it is negative
+            strength = max(strength, _MIN_RELATIVE_EFFECT)  # of a star fitted with the other sign, it is negative
             rows[k, 2] += np.log(strength) / 2 / self.prior.radius_spread
             rows[k, 3], is_weak[k] = 0, True
         return replace(self, is_other_kind=is_weak), np.append(coefficients[0], rows)
 
-    def mixture(self, share, contrast):
+    def mixed_log_conductivity(self, share, contrast):
         """log σ/σ₀ of partly covered cells, 2 artanh(share · tanh(contrast / 2)), by Maxwell Garnett's formula: a
         partly covered cell has `share` times the effect of a covered cell on the electric field. Also the derivatives
         with respect to `share` and `contrast`."""
@@ -267,20 +269,20 @@ class Stars(Bodies):
         sums = np.tensordot(np.stack([waves, 1j * mode_numbers * waves]), powers, 1)
         return sums[0].real, sums[1].real, powers
 
-    def coverage(self, k: int, row) -> Covered:
+    def coverage(self, k: int, row) -> CellCoverage:
         """Coverage of cells by star k, whose coefficients are `row`."""
         centre, log_radius, waves = self._values(k, row)
         # Upper limit of the distance of the outline from the centre. The star does not cover cells that lie farther
-        # outside than `_REACH` times the width of its blurred edge.
+        # outside than `_MAX_BLUR_DISTANCE` times the width of its blurred edge.
         max_distance = np.exp(np.minimum(log_radius + np.abs(waves).sum(), np.log(10 * self.span)))
-        cells = np.flatnonzero(np.abs(self.points[:, 0] - centre) < max_distance + _REACH * self.width)
+        cells = np.flatnonzero(np.abs(self.points[:, 0] - centre) < max_distance + _MAX_BLUR_DISTANCE * self.width)
         offset, width = self.points[cells] - centre, self.width[cells, None]
         distance = np.maximum(np.abs(offset), 1e-9 * self.span)
         direction = offset / distance
         wave, slope, powers = self._wave(waves, direction)
         radius = np.exp(np.minimum(log_radius + wave, np.log(10 * self.span)))
         inside = 0.5 * (1 + np.tanh(0.5 * (radius - distance) / width))
-        share_slope = inside * (1 - inside) / width / len(_SAMPLES)  # d share / d(r - distance)
+        share_slope = inside * (1 - inside) / width / len(_BARYCENTRIC_SAMPLES)  # d share / d(r - distance)
         # If the centre moves by dz, the distance decreases by Re(dz/u) and θ by Im(dz/u) / distance; u is `direction`.
         centre_slopes = (share_slope * (1 - 1j * radius * slope / distance) * direction).sum(axis=1)
         radius_slopes = share_slope * radius
@@ -288,7 +290,7 @@ class Stars(Bodies):
         share = inside.mean(axis=1)
         columns = [centre_slopes.real, centre_slopes.imag, radius_slopes.sum(axis=1), np.zeros_like(share)]
         columns += [part for mode in mode_slopes.T for part in (mode.real, mode.imag)]
-        return Covered(cells, share, np.stack(columns, axis=1) * self.prior.deviation(self.span))
+        return CellCoverage(cells, share, np.stack(columns, axis=1) * self.prior.deviation(self.span))
 
 
 def _first_crossing_distances(centre: complex, direction, edges) -> tuple[Float[np.ndarray, " k"], bool]:
@@ -301,9 +303,9 @@ def _first_crossing_distances(centre: complex, direction, edges) -> tuple[Float[
             _cross_products(edge_starts, edge_vectors) / denominators,
             _cross_products(edge_starts, direction[:, None]) / denominators,
         )
-    is_crossed = (distance > 0) & (edge_fraction >= 0) & (edge_fraction < 1)
-    return np.where(is_crossed, distance, np.inf).min(axis=1), bool((is_crossed.sum(axis=1) % 2).mean() > 0.5)
+    is_edge_crossed = (distance > 0) & (edge_fraction >= 0) & (edge_fraction < 1)
+    return np.where(is_edge_crossed, distance, np.inf).min(axis=1), bool((is_edge_crossed.sum(axis=1) % 2).mean() > 0.5)
 
 
-def _cross_products(first, second):
-    return (np.conj(first) * second).imag
+def _cross_products(first_vectors, second_vectors):
+    return (np.conj(first_vectors) * second_vectors).imag

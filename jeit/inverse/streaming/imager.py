@@ -19,20 +19,20 @@ from numpy.typing import ArrayLike
 from jeit.arguments import counted, describe, is_number, object_text
 from jeit.electrodes.point import IntegratedElectrodes
 from jeit.forward import ForwardModel
-from jeit.inverse.channels import IndependentChannels, Weighing
+from jeit.inverse.channels import ChannelWeighting, IndependentChannels
 from jeit.inverse.hyperparameter.rules import Rule
 from jeit.inverse.nonlinear.parametrisation import Parametrisation, as_parametrisation
 from jeit.inverse.nonlinear.problem import Inversion, check_background, check_frame, check_noise, keep_informed_shapes
-from jeit.inverse.nonlinear.reconstruct import pose
+from jeit.inverse.nonlinear.reconstruct import pose_least_squares
 from jeit.inverse.nonlinear.solvers import AbstractSolver, GaussNewton, as_solver, expand, residual
 from jeit.inverse.prior.bases import expand_rows
 from jeit.inverse.prior.matern import smooth_prior
 from jeit.inverse.prior.priors import AbstractPrior, check_prior
 from jeit_solvers.dense import inverse_cholesky
-from jeit_solvers.engines import as_array, either_engine, namespace
+from jeit_solvers.engines import as_array, namespace, numpy_or_compiled
 from jeit_solvers.module import Module
 
-FRAME_STEPS = 4
+MAX_STEPS_PER_FRAME = 4
 """Default maximum number of iterations per frame."""
 # Default tolerance of the solver.
 _RTOL = 1e-3
@@ -153,7 +153,7 @@ class Imager(Module):
         """
         check_memory(memory)
         frame_solver = as_solver(GaussNewton() if solver is None else solver, frames=True).for_frames(
-            FRAME_STEPS, _RTOL
+            MAX_STEPS_PER_FRAME, _RTOL
         )
         prior = smooth_prior(float(np.ptp(np.asarray(model.mesh.points), axis=0).max())) if prior is None else prior
         check_prior(prior)
@@ -166,7 +166,7 @@ class Imager(Module):
         deviation = check_noise(noise, frame, is_used)
         channels = IndependentChannels.create(model.protocol)
         independent_model = model.with_protocol(model.protocol.subset(np.asarray(channels.index)))
-        inversion, _ = pose(
+        inversion, _ = pose_least_squares(
             eqx.tree_at(
                 lambda forward_model: forward_model.electrodes,
                 independent_model,
@@ -228,18 +228,20 @@ class Imager(Module):
     @property
     def steps(self) -> int:
         """Maximum number of iterations per frame."""
-        return 1 if self.solver.is_linear else self.solver.descent(FRAME_STEPS, _RTOL).history - 1
+        return 1 if self.solver.is_linear else self.solver.descent(MAX_STEPS_PER_FRAME, _RTOL).history - 1
 
-    def weighing(self, usable: Bool[Array, " M"]) -> Weighing:
-        """`Weighing` that maps frames to data in which only the `usable` channels have an effect."""
+    def weighing(self, usable: Bool[Array, " M"]) -> ChannelWeighting:
+        """`ChannelWeighting` that maps frames to data in which only the `usable` channels have an effect."""
         return self.channels.weigh(_masked_noise(self.noise, self.mask & usable))
 
-    def linear_map(self, weighing: Weighing) -> LinearMap:
+    def linear_map(self, weighing: ChannelWeighting) -> LinearMap:
         """Linear map from frames to images for a `weighing` of the channels: one Gauss-Newton step from the
         background."""
         return _compute_linear_map(self.inversion, weighing, self.offset, self.persistence)
 
-    def estimate(self, frame: Float[Array, " M"], weighing: Weighing, start: Float[Array, " n"]) -> FrameEstimate:
+    def estimate(
+        self, frame: Float[Array, " M"], weighing: ChannelWeighting, start: Float[Array, " n"]
+    ) -> FrameEstimate:
         """Image of a frame (M,) in volts, computed by at most `steps` iterations from the coefficients `start`.
 
         With a memory, `start` is also the prior mean, `persistence` times the last image's coefficients. Unused
@@ -271,14 +273,14 @@ def _check_reference(measured, predicted) -> None:
         )
 
 
-@either_engine
+@numpy_or_compiled
 def _masked_noise(noise, is_used) -> Float[Array, " M"]:
     xp = namespace(noise, is_used)
     return xp.where(is_used, noise, _MASKED_NOISE_RATIO * xp.max(xp.where(is_used, noise, 0)))
 
 
-@either_engine
-def _compute_linear_map(inversion: Inversion, weighing: Weighing, offset, persistence: float) -> LinearMap:
+@numpy_or_compiled
+def _compute_linear_map(inversion: Inversion, weighing: ChannelWeighting, offset, persistence: float) -> LinearMap:
     xp = namespace(inversion, weighing, offset)
     start = xp.zeros(inversion.num_coefficients)
     problem = eqx.tree_at(lambda inverse_problem: inverse_problem.data, inversion, weighing.combine(offset))
@@ -287,17 +289,19 @@ def _compute_linear_map(inversion: Inversion, weighing: Weighing, offset, persis
     gain = (inverse_factor.T @ (inverse_factor @ jacobian)).T
     if inversion.num_coefficients <= len(residual):
         shapes = xp.eye(inversion.num_coefficients)
-        carry_matrix = persistence * (shapes - gain @ jacobian)
+        carried_estimate_matrix = persistence * (shapes - gain @ jacobian)
     else:  # not reached with a memory: there are then no more shapes than data
         shapes, gain = gain.T, xp.eye(len(residual))
-        carry_matrix = xp.zeros_like(gain)
+        carried_estimate_matrix = xp.zeros_like(gain)
     matrix = expand_rows(inversion.basis, shapes).T * inversion.link.slope(inversion.reference)[:, None]
     constant_image = inversion.link.conductivity(inversion.reference) - matrix @ (gain @ residual)
-    return LinearMap(matrix, gain @ (weighing.weight[:, None] * weighing.estimator), constant_image, carry_matrix)
+    return LinearMap(
+        matrix, gain @ (weighing.weight[:, None] * weighing.estimator), constant_image, carried_estimate_matrix
+    )
 
 
 @jax.jit
-def _estimate_frame(imager: Imager, frame, weighing: Weighing, start) -> FrameEstimate:
+def _estimate_frame(imager: Imager, frame, weighing: ChannelWeighting, start) -> FrameEstimate:
     data = weighing.combine(frame + imager.offset)
     inversion = eqx.tree_at(lambda inverse_problem: inverse_problem.data, imager.inversion, data)
     zero_mean = jnp.zeros_like(start)
@@ -306,7 +310,7 @@ def _estimate_frame(imager: Imager, frame, weighing: Weighing, start) -> FrameEs
         inversion = eqx.tree_at(
             lambda inverse_problem: inverse_problem.reference, inversion, inversion.estimate(zero_mean)
         )
-    descent = imager.solver.descent(FRAME_STEPS, _RTOL)
+    descent = imager.solver.descent(MAX_STEPS_PER_FRAME, _RTOL)
     solution = optx.least_squares(
         residual, descent, start, inversion, options={"expand": expand}, max_steps=imager.steps, throw=False
     )

@@ -19,23 +19,23 @@ from jeit_solvers import Status
 from jeit_solvers.module import Module
 
 # Relative difference from an undisturbed frame above which a frame is faulty or from a different sensor.
-_LARGEST_DIFFERENCE = 0.5
+_MAX_RELATIVE_DIFFERENCE = 0.5
 # Relative difference from an undisturbed frame above which a frame is checked for dead electrodes and saturation. An
 # electrode is dead if at most `_MAX_REMAINING_SHARE` of the difference is left without the electrode's channels, and if
 # the median relative change of these channels exceeds `_MIN_DEAD_CHANGE`.
-_SUSPECT_FACTOR, _MAX_REMAINING_SHARE, _MIN_DEAD_CHANGE = 0.15, 0.5, 0.5
+_SUSPICIOUS_RELATIVE_DIFFERENCE, _MAX_REMAINING_SHARE, _MIN_DEAD_CHANGE = 0.15, 0.5, 0.5
 # Minimum number of channels with valid readings, as a fraction of the channels in use.
-_MIN_CHANNELS = 0.5
+_MIN_VALID_CHANNEL_SHARE = 0.5
 # Minimum number of channels with equal readings, above or below all others, that count as saturated.
-_MIN_SATURATED = 3
+_MIN_SATURATED_CHANNELS = 3
 # Relative difference within which the undisturbed voltages of these channels count as equal.
-_EQUAL_EXPECTED = 1e-6
+_EXPECTED_EQUALITY_TOLERANCE = 1e-6
 # Minimum evidence that a frame differs from an undisturbed frame by more than noise, in standard deviations; minimum
 # number of pairs; relative change below which a frame counts as equal to an undisturbed frame.
-_MIN_EVIDENCE, _MIN_PAIRS, _EQUAL_TOLERANCE = 3.0, 10, 1e-12
+_MIN_EVIDENCE_DEVIATIONS, _MIN_RECIPROCAL_PAIRS, _EQUALITY_TOLERANCE = 3.0, 10, 1e-12
 # Noise, as a share of the voltages, above which a noisy electrode is searched for, and a frame without a change that
 # exceeds the noise is refused. Instruments have less than 0.01, skins up to 0.08.
-_LARGEST_NOISE = 0.1
+_MAX_RELATIVE_NOISE = 0.1
 
 
 class FrameStatus(StrEnum):
@@ -82,7 +82,7 @@ class FrameCheck:
         self.ratio = reciprocal_channels[1]
         self.pair_weights = 1 / np.hypot(noise[self.first], noise[self.second] / self.ratio)
         self.expected_norm = np.linalg.norm(expected_voltages[mask])
-        self.max_ordinary_square = (_SUSPECT_FACTOR * self.expected_norm) ** 2
+        self.max_ordinary_square = (_SUSPICIOUS_RELATIVE_DIFFERENCE * self.expected_norm) ** 2
 
     @np.errstate(over="ignore")  # a frame whose square overflows is treated as faulty
     def __call__(self, frame):
@@ -92,16 +92,16 @@ class FrameCheck:
         if status == FrameStatus.REFUSED:
             return values, usable, status, reason
         change = np.where(usable, values - self.expected_voltages, 0)
-        if np.linalg.norm(change) <= _EQUAL_TOLERANCE * self.expected_norm:
+        if np.linalg.norm(change) <= _EQUALITY_TOLERANCE * self.expected_norm:
             return values, usable, FrameStatus.UNCHANGED, f"{reason} It equals an undisturbed frame.".lstrip()
-        usable, noise_status, noise = self.judge_noise(change, usable)
+        usable, noise_status, noise = self.check_reciprocal_noise(change, usable)
         return values, usable, noise_status or status, f"{reason} {noise}".strip()
 
-    def judge_noise(self, change, usable) -> tuple[Bool[np.ndarray, " M"], FrameStatus | None, str]:
+    def check_reciprocal_noise(self, change, usable) -> tuple[Bool[np.ndarray, " M"], FrameStatus | None, str]:
         """Compare the changes of reciprocal channels, which noise alone makes unequal. Returns the usable channels, and
         a status and a sentence if a noisy electrode is left out, if noise hides every change, or if there is none."""
-        is_pair = usable[self.first] & usable[self.second]
-        if np.count_nonzero(is_pair) < _MIN_PAIRS:
+        is_usable_pair = usable[self.first] & usable[self.second]
+        if np.count_nonzero(is_usable_pair) < _MIN_RECIPROCAL_PAIRS:
             return usable, None, ""
         first_changes, second_changes = (
             self.pair_weights * change[self.first],
@@ -109,21 +109,21 @@ class FrameCheck:
         )
         # As in `jeit.data.quality.signal_evidence`: differences of reciprocal channels contain noise, sums also signal.
         noise, power = (
-            np.where(is_pair, (first_changes - second_changes) ** 2, 0),
-            np.sum((first_changes + second_changes)[is_pair] ** 2),
+            np.where(is_usable_pair, (first_changes - second_changes) ** 2, 0),
+            np.sum((first_changes + second_changes)[is_usable_pair] ** 2),
         )
-        noise_power, num_pairs = noise.sum(), np.count_nonzero(is_pair)
-        has_signal = (power - noise_power) * np.sqrt(num_pairs) > 2 * _MIN_EVIDENCE * noise_power
-        level = 2 * np.sum((self.pair_weights * self.expected_voltages[self.first])[is_pair] ** 2)
-        if noise_power > _LARGEST_NOISE**2 * level:
+        noise_power, num_pairs = noise.sum(), np.count_nonzero(is_usable_pair)
+        has_signal = (power - noise_power) * np.sqrt(num_pairs) > 2 * _MIN_EVIDENCE_DEVIATIONS * noise_power
+        level = 2 * np.sum((self.pair_weights * self.expected_voltages[self.first])[is_usable_pair] ** 2)
+        if noise_power > _MAX_RELATIVE_NOISE**2 * level:
             noise_fractions = np.sqrt(noise_power / level)
-            num_pairs_of_others = np.maximum((is_pair & ~self.touching[:, self.first]).sum(axis=1), 1)
+            num_pairs_of_others = np.maximum((is_usable_pair & ~self.touching[:, self.first]).sum(axis=1), 1)
             noise_of_others = (noise * ~self.touching[:, self.first]).sum(axis=1) / num_pairs_of_others
             electrode = int(np.argmin(noise_of_others))
             remaining_channels = usable & ~self.touching[electrode]
             if noise_of_others[electrode] < _MAX_REMAINING_SHARE**2 * noise_power / num_pairs and np.count_nonzero(
                 remaining_channels
-            ) >= _MIN_CHANNELS * np.count_nonzero(self.mask):
+            ) >= _MIN_VALID_CHANNEL_SHARE * np.count_nonzero(self.mask):
                 reason = f"Electrode {electrode + 1} breaks reciprocity: its contact is bad. Its channels are left out."
                 return remaining_channels, FrameStatus.PARTIAL, reason
             if not has_signal:
@@ -155,8 +155,10 @@ class FrameCheck:
                 f"The frame is text, not {self.mask.size} real voltages.",
             )
         if values.shape != self.mask.shape or values.dtype.kind not in "iuf":
-            is_row = values.ndim == 1 and values.dtype.kind in "iuf"
-            shape_text = f"has {values.size} numbers" if is_row else f"is {values.dtype} of shape {values.shape}"
+            is_real_vector = values.ndim == 1 and values.dtype.kind in "iuf"
+            shape_text = (
+                f"has {values.size} numbers" if is_real_vector else f"is {values.dtype} of shape {values.shape}"
+            )
             reason = f"The frame {shape_text}, not {self.mask.size} real voltages."
             return values, no_usable_channels, FrameStatus.REFUSED, reason
         change = (values - self.expected_voltages)[self.mask]
@@ -165,7 +167,7 @@ class FrameCheck:
         finite = np.isfinite(values)
         usable = self.mask if finite.all() else self.mask & finite
         num_usable = np.count_nonzero(usable)
-        if num_usable < _MIN_CHANNELS * np.count_nonzero(self.mask):
+        if num_usable < _MIN_VALID_CHANNEL_SHARE * np.count_nonzero(self.mask):
             return (
                 values,
                 usable,
@@ -181,13 +183,13 @@ class FrameCheck:
             )
         difference = np.where(usable, values - self.expected_voltages, 0)
         relative_change = np.linalg.norm(difference) / self.expected_norm
-        if relative_change > _SUSPECT_FACTOR:
+        if relative_change > _SUSPICIOUS_RELATIVE_DIFFERENCE:
             usable, reason = self._remove_dead_electrode(difference, usable)
             if reason:
                 return values, usable, FrameStatus.PARTIAL, reason
             if (is_saturated := self._saturated_channels(values, usable)).any():
                 return self._remove_saturated_channels(values, difference, usable, is_saturated)
-            if relative_change > _LARGEST_DIFFERENCE:
+            if relative_change > _MAX_RELATIVE_DIFFERENCE:
                 reason = f"It differs by {relative_change:.0%} from an undisturbed frame: another sensor's, or a fault."
                 return values, no_usable_channels, FrameStatus.REFUSED, reason
         if num_usable < np.count_nonzero(self.mask):
@@ -202,7 +204,7 @@ class FrameCheck:
         total_change = np.linalg.norm(difference)
         remaining_changes = np.array([np.linalg.norm(difference[usable & ~touching]) for touching in self.touching])
         # An electrode whose removal leaves too few channels, such as a common reference, cannot be left out.
-        remaining_changes[(usable & ~self.touching).sum(axis=1) < _MIN_CHANNELS * self.mask.sum()] = np.inf
+        remaining_changes[(usable & ~self.touching).sum(axis=1) < _MIN_VALID_CHANNEL_SHARE * self.mask.sum()] = np.inf
         electrode = int(np.argmin(remaining_changes))
         if not np.isfinite(remaining_changes[electrode]):
             return usable, ""
@@ -214,7 +216,7 @@ class FrameCheck:
             > _MIN_DEAD_CHANGE
         )
         explains_change = remaining_changes[electrode] <= min(
-            _MAX_REMAINING_SHARE * total_change, _LARGEST_DIFFERENCE * self.expected_norm
+            _MAX_REMAINING_SHARE * total_change, _MAX_RELATIVE_DIFFERENCE * self.expected_norm
         )
         if not (is_dead and explains_change):
             return usable, ""
@@ -222,18 +224,20 @@ class FrameCheck:
 
     def _saturated_channels(self, values, usable):
         """Mask (M,) of the channels at which the amplifier is saturated."""
-        is_far = np.abs(values - self.expected_voltages) > _SUSPECT_FACTOR * np.abs(self.expected_voltages)
+        is_far_from_expected = np.abs(values - self.expected_voltages) > _SUSPICIOUS_RELATIVE_DIFFERENCE * np.abs(
+            self.expected_voltages
+        )
         is_saturated = np.zeros_like(usable)
         for extreme_value in (values[usable].max(), values[usable].min()):
             is_at_extreme = usable & (values == extreme_value)
-            if np.count_nonzero(is_at_extreme) < _MIN_SATURATED or not extreme_value:
+            if np.count_nonzero(is_at_extreme) < _MIN_SATURATED_CHANNELS or not extreme_value:
                 continue
             # Channels whose readings are equal by symmetry, as in simulated frames, are also equal in the undisturbed
             # frame.
             if (
-                is_far[is_at_extreme].all()
+                is_far_from_expected[is_at_extreme].all()
                 and np.ptp(self.expected_voltages[is_at_extreme])
-                > _EQUAL_EXPECTED * np.abs(self.expected_voltages[is_at_extreme]).max()
+                > _EXPECTED_EQUALITY_TOLERANCE * np.abs(self.expected_voltages[is_at_extreme]).max()
             ):
                 is_saturated |= is_at_extreme
         return is_saturated
@@ -243,14 +247,14 @@ class FrameCheck:
             usable & ~is_saturated,
             counted(int(np.count_nonzero(is_saturated)), "channel"),
         )
-        if np.count_nonzero(remaining_channels) < _MIN_CHANNELS * np.count_nonzero(self.mask):
+        if np.count_nonzero(remaining_channels) < _MIN_VALID_CHANNEL_SHARE * np.count_nonzero(self.mask):
             return (
                 values,
                 remaining_channels,
                 FrameStatus.REFUSED,
                 f"Saturated: {channel_count} at the ends of the range.",
             )
-        if np.linalg.norm(difference[remaining_channels]) > _LARGEST_DIFFERENCE * self.expected_norm:
+        if np.linalg.norm(difference[remaining_channels]) > _MAX_RELATIVE_DIFFERENCE * self.expected_norm:
             return (
                 values,
                 remaining_channels,

@@ -14,15 +14,15 @@ from typing import Annotated
 import typer
 
 from jeit.cli.options import (
-    AsIs,
-    Contact,
-    Description,
-    Format,
-    Quiet,
-    ReferenceKey,
+    AsIsOption,
+    ContactOption,
+    DescriptionOption,
+    FormatOption,
+    QuietOption,
+    ReferenceKeyOption,
     check_positive,
-    naming_options,
-    number_or_name,
+    convert_to_number_if_possible,
+    naming_options_in_errors,
     read_file,
 )
 
@@ -45,9 +45,9 @@ def live(
             show_default=False,
         ),
     ] = None,
-    reference_key: ReferenceKey = None,
-    format: Format = None,
-    description: Description = None,
+    reference_key: ReferenceKeyOption = None,
+    format: FormatOption = None,
+    description: DescriptionOption = None,
     model: Annotated[
         Path | None,
         typer.Option(
@@ -79,9 +79,9 @@ def live(
         float | None,
         typer.Option(help="Frames over which an image changes: smooths in time (Kalman). 0 (default): none."),
     ] = None,
-    contact: Contact = None,
+    contact: ContactOption = None,
     num_points: Annotated[int | None, typer.Option(help="Nodes of the mesh, about (default 1200).")] = None,
-    as_is: AsIs = False,
+    as_is: AsIsOption = False,
     rate: Annotated[
         float | None,
         typer.Option(help="Frames in a second of a recording or of the demonstration, unless as recorded."),
@@ -101,7 +101,7 @@ def live(
     until_end: Annotated[
         bool, typer.Option("--until-end", help="Stop when the source ends, not on Ctrl-C alone.")
     ] = False,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Image frames as they arrive, on a page in the browser; 'jeit live demo' needs no device.
 
@@ -110,7 +110,7 @@ def live(
     record frames, mark events, pause, and step back. Ctrl-C ends the session.
     """
     from jeit.arguments import counted
-    from jeit.arguments.extras import need_extra
+    from jeit.arguments.extras import require_extra
     from jeit.cli.console import Steps, plain_console
     from jeit.imaging.stream_preparation import StreamSettings
     from jeit.live.preparation import prepare
@@ -118,12 +118,12 @@ def live(
     from jeit.live.server import check_port, serve
     from jeit.live.session import Session
 
-    need_extra("live", "a page in the browser")
+    require_extra("live", "a page in the browser")
     check_positive({"--untouched": untouched} | ({} if rate is None else {"--rate": rate}))
     options = {
         "solver": method,
         "max_steps": steps,
-        "hyperparameter": None if hyperparameter is None else number_or_name(hyperparameter),
+        "hyperparameter": None if hyperparameter is None else convert_to_number_if_possible(hyperparameter),
         "memory": memory,
         "contact": contact,
         "num_points": num_points,
@@ -133,12 +133,12 @@ def live(
     _check_unused_options(options, model, calibration, contacts)
     if source.partition(":")[0] == "demo" and steps is None:
         options.setdefault("solver", "one-step")  # compiles in half the time
-    with naming_options(_OPTION_NAMES):
+    with naming_options_in_errors(_OPTION_NAMES):
         settings = StreamSettings(**options)
     console = plain_console()
     check_port(host, port)
     _check_folder(output)
-    with Steps(console, quiet=quiet) as step, naming_options(_ARGUMENT_OPTIONS):
+    with Steps(console, quiet=quiet) as step, naming_options_in_errors(_ARGUMENT_OPTIONS):
         step("read")
         # With a model, the reference is a file of frames without a protocol, as `jeit touch predict` reads it.
         reference_input = reference

@@ -21,7 +21,7 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from jeit.live.page.hub import Hub, Viewer
+from jeit.live.page.hub import PageHub, Viewer
 from jeit.live.page.wire import (
     Command,
     Drawn,
@@ -80,23 +80,23 @@ def _host_name(host_header: str) -> str:
         return ""
 
 
-def host_allowed(header: str, listening: str) -> bool:
-    """Whether the host that a request names in its `header` is a name or address of the server at `listening`.
+def is_host_allowed(header: str, server_host: str) -> bool:
+    """Whether the host that a request names in its `header` is a name or address of the server at `server_host`.
 
     The domain name of another site can resolve to this machine, and the scripts of that site then reach this server
     under this domain name (DNS rebinding). Such a domain name is neither an address nor the name of this machine, so
     the request is refused. Any port is allowed, so that a tunnel works.
     """
     name = _host_name(header)
-    if is_loopback(name) or name == listening.lower():
+    if is_loopback(name) or name == server_host.lower():
         return True
-    if not _is_unspecified(listening):
+    if not _is_unspecified(server_host):
         return False
     host_name = socket.gethostname().lower()
     return _is_address(name) or name in (host_name, f"{host_name.split('.')[0]}.local")
 
 
-class Guard:
+class RequestGuard:
     """Middleware that refuses requests for another host, WebSockets from another origin, and requests without the
     token.
 
@@ -124,7 +124,7 @@ class Guard:
             await PlainTextResponse(problem + "\n", 403, headers=_HEADERS)(scope, receive, send)
 
     def _find_problem(self, scope: Scope, host: str) -> str | None:
-        if not host_allowed(host, self._host):
+        if not is_host_allowed(host, self._host):
             return "This host name is not one of this server: open the address that `jeit live` prints."
         origin = Headers(scope=scope).get("origin")
         if (origin is not None or scope["type"] == "websocket") and origin not in (f"http://{host}", f"https://{host}"):
@@ -139,7 +139,7 @@ class Guard:
     def _with_security_headers(send: Send, host: str) -> Send:
         """Add headers to a response that make the browser run only the page's own files, and not show the page in a
         frame of another site."""
-        policy = (
+        content_security_policy = (
             "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; media-src blob:; "
             f"connect-src 'self' ws://{host} wss://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
         )
@@ -147,7 +147,7 @@ class Guard:
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
-                headers.update({**_HEADERS, "Content-Security-Policy": policy})
+                headers.update({**_HEADERS, "Content-Security-Policy": content_security_policy})
             await send(message)
 
         return send_with_headers
@@ -160,8 +160,8 @@ def page_files() -> dict[str, bytes]:
     return {file.name: file.read_bytes() for file in folder.iterdir() if file.name.rpartition(".")[2] in _MEDIA_TYPES}
 
 
-def make_application(hub: Hub, *, host: str, token: str | None) -> Starlette:
-    """Return the web application that shows a session's pictures; `host`, `token`: as in `Guard`."""
+def make_application(hub: PageHub, *, host: str, token: str | None) -> Starlette:
+    """Return the web application that shows a session's pictures; `host`, `token`: as in `RequestGuard`."""
     files = page_files()
 
     def file(request: Request) -> Response:
@@ -183,12 +183,12 @@ def make_application(hub: Hub, *, host: str, token: str | None) -> Starlette:
 
     return Starlette(
         routes=[Route("/", file), WebSocketRoute("/socket", serve_socket), Route("/{name}", file)],
-        middleware=[Middleware(Guard, host=host, token=token)],
+        middleware=[Middleware(RequestGuard, host=host, token=token)],
         lifespan=lifespan,
     )
 
 
-async def _serve_viewer(hub: Hub, websocket: WebSocket) -> None:
+async def _serve_viewer(hub: PageHub, websocket: WebSocket) -> None:
     """Send pictures and states to one open page, and execute its commands, until the page disconnects."""
     await websocket.accept()
     if len(hub.viewers) >= MAX_VIEWERS:
@@ -207,7 +207,7 @@ async def _serve_viewer(hub: Hub, websocket: WebSocket) -> None:
             await send_task
 
 
-async def _send_pictures(hub: Hub, viewer: Viewer, websocket: WebSocket) -> None:
+async def _send_pictures(hub: PageHub, viewer: Viewer, websocket: WebSocket) -> None:
     await websocket.send_text(hub.scene)
     while True:
         await viewer.wake_event.wait()
@@ -220,7 +220,7 @@ async def _send_pictures(hub: Hub, viewer: Viewer, websocket: WebSocket) -> None
             await websocket.send_bytes(newest_picture[1])
 
 
-async def _receive_commands(hub: Hub, viewer: Viewer, websocket: WebSocket) -> None:
+async def _receive_commands(hub: PageHub, viewer: Viewer, websocket: WebSocket) -> None:
     faults = 0
     while True:
         message = await websocket.receive()
@@ -238,7 +238,7 @@ async def _receive_commands(hub: Hub, viewer: Viewer, websocket: WebSocket) -> N
         await _execute_command(command, hub, viewer, websocket)
 
 
-async def _execute_command(command: Command, hub: Hub, viewer: Viewer, websocket: WebSocket) -> None:
+async def _execute_command(command: Command, hub: PageHub, viewer: Viewer, websocket: WebSocket) -> None:
     match command:
         case Drawn(number=number, hidden=hidden):
             viewer.record_drawn(number, hidden=hidden)
@@ -251,9 +251,9 @@ async def _execute_command(command: Command, hub: Hub, viewer: Viewer, websocket
             viewer.wake_event.set()
             return
         case Show(number=number, direction=direction):
-            past_message = hub.past_message(number, direction)
-            if past_message is not None:
-                await websocket.send_bytes(past_message)
+            past_picture_message = hub.past_picture_message(number, direction)
+            if past_picture_message is not None:
+                await websocket.send_bytes(past_picture_message)
                 return
             reply = ("show", "that picture is no longer kept: the last minute is")
         case _:
@@ -261,7 +261,7 @@ async def _execute_command(command: Command, hub: Hub, viewer: Viewer, websocket
     await websocket.send_text(to_json("answer", {"to": reply[0], "problem": reply[1]}))
 
 
-async def _execute_session_command(command: Command, hub: Hub) -> tuple[str, str | None]:
+async def _execute_session_command(command: Command, hub: PageHub) -> tuple[str, str | None]:
     """Execute a command of the page that changes the session, in another thread, because the command may write to disk.
     Returns the name of the command, and the error message or None."""
     session = hub.session

@@ -14,11 +14,11 @@ import numpy as np
 from jeit.live.page.wire import picture_message, scene_message, to_json
 from jeit.live.session import Result, Session
 
-_MAX_IN_FLIGHT = 2
+_MAX_SENT_UNDRAWN_PICTURES = 2
 """Maximum number of pictures that are sent to a page and not yet drawn: one is on its way while another is drawn."""
 
-_STATE_PERIOD = 0.5
-_LATENCY_SPAN = 10.0
+_STATE_MESSAGE_PERIOD = 0.5
+_LATENCY_TIME_SPAN = 10.0
 """Seconds over which a page's latency is computed."""
 
 
@@ -40,7 +40,7 @@ class Viewer:
 
     def is_ready_for(self, number: int) -> bool:
         """Whether the picture with the frame number `number` may be sent to the page now."""
-        return self.following and number > self._last_sent and len(self._undrawn_pictures) < _MAX_IN_FLIGHT
+        return self.following and number > self._last_sent and len(self._undrawn_pictures) < _MAX_SENT_UNDRAWN_PICTURES
 
     def record_sent(self, number: int, arrival_time: float) -> None:
         """Record that the picture with the frame number `number`, whose frame arrived at the time `arrival_time`, was
@@ -51,11 +51,11 @@ class Viewer:
     def record_drawn(self, number: int, *, hidden: bool) -> None:
         """Record that the page has drawn the picture with the frame number `number`; earlier pictures that were sent
         and not reported as drawn were skipped."""
-        now = time.monotonic()
+        current_time = time.monotonic()
         while self._undrawn_pictures and self._undrawn_pictures[0][0] <= number:
             sent_number, arrival_time = self._undrawn_pictures.popleft()
             if sent_number == number and not hidden:
-                self._drawn_latencies.append((now, now - arrival_time))
+                self._drawn_latencies.append((current_time, current_time - arrival_time))
         self.wake_event.set()
 
     def is_state_due(self) -> bool:
@@ -76,16 +76,18 @@ class Viewer:
 
         The latency includes the transmission of the report, so that all times are from the same clock.
         """
-        now = time.monotonic()
-        latencies = [latency for draw_time, latency in self._drawn_latencies if now - draw_time <= _LATENCY_SPAN]
-        num_recent_pictures = sum(now - draw_time <= 2.0 for draw_time, _ in self._drawn_latencies)
+        current_time = time.monotonic()
+        latencies = [
+            latency for draw_time, latency in self._drawn_latencies if current_time - draw_time <= _LATENCY_TIME_SPAN
+        ]
+        num_recent_pictures = sum(current_time - draw_time <= 2.0 for draw_time, _ in self._drawn_latencies)
         if not latencies:
             return {"rate": 0.0, "latency_median": None, "latency_99": None}
         median, latency_99 = np.percentile(latencies, [50, 99])
         return {"rate": num_recent_pictures / 2.0, "latency_median": float(median), "latency_99": float(latency_99)}
 
 
-class Hub:
+class PageHub:
     """Waits for a session's pictures in a thread, and wakes the pages in the server's event loop."""
 
     def __init__(self, session: Session) -> None:
@@ -127,7 +129,7 @@ class Hub:
         """Return the state of the session and of a page as JSON text."""
         return to_json("state", {**self._state, "drawn": viewer.summary(), "viewers": len(self.viewers)})
 
-    def past_message(self, number: int, direction: int) -> bytes | None:
+    def past_picture_message(self, number: int, direction: int) -> bytes | None:
         """Return the message with a past picture as bytes: the picture of the frame `number`, or else of the nearest
         frame in the `direction` (-1: earlier, 1: later) that has a picture."""
         for candidate in range(number, max(-1, number + 600 * direction), direction):
@@ -140,13 +142,13 @@ class Hub:
         last_number, state_time = -1, 0.0
         while not self._closing.is_set():
             result = self.session.newest(last_number, 0.1)
-            now = time.monotonic()
+            current_time = time.monotonic()
             if result is not None:
                 last_number = result.frame.number
                 self._newest_result = result
                 self._wake_pages()
-            if now - state_time >= _STATE_PERIOD:
-                state_time = now
+            if current_time - state_time >= _STATE_MESSAGE_PERIOD:
+                state_time = current_time
                 self._state = self.session.state()
                 if self._state.get("connection") == "ended":
                     self.ended.set()

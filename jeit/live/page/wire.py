@@ -14,7 +14,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, 
 
 from jeit.live.pictures import LiveFrame, Picture, Scene
 
-NO_PIXEL = -32768
+OUTSIDE_PIXEL_VALUE = -32768
 """Value of a pixel outside the body, in 16-bit integers."""
 
 MAX_COMMAND_LENGTH = 4096
@@ -89,7 +89,10 @@ class Record(Command):
 
 
 _COMMANDS: TypeAdapter[Any] = TypeAdapter(
-    Annotated[Drawn | Seen | Follow | Show | Reference | Mark | Record, Field(discriminator="do")]
+    Annotated[
+        Drawn | Seen | Follow | Show | Reference | Mark | Record,
+        Field(discriminator="do"),
+    ]
 )
 
 
@@ -170,9 +173,9 @@ def _encode_pixels(picture: Picture) -> _EncodedArray:
     is_valid = np.isfinite(pixels)
     largest_magnitude = float(np.abs(pixels, where=is_valid, out=np.zeros_like(pixels)).max())
     scale = largest_magnitude / 32767 if largest_magnitude > 0 else 1.0
-    integers = np.full(pixels.shape, NO_PIXEL, "<i2")
-    integers[is_valid] = np.rint(pixels[is_valid] / scale)
-    return _EncodedArray({"shape": list(pixels.shape), "scale": scale}, integers.tobytes())
+    pixel_integers = np.full(pixels.shape, OUTSIDE_PIXEL_VALUE, "<i2")
+    pixel_integers[is_valid] = np.rint(pixels[is_valid] / scale)
+    return _EncodedArray({"shape": list(pixels.shape), "scale": scale}, pixel_integers.tobytes())
 
 
 def picture_message(frame: LiveFrame, picture: Picture, *, latency: float, is_past: bool = False) -> bytes:

@@ -204,7 +204,7 @@ class ConductivityView(AbstractView):
         self._strongest = StrongestRegion(model.mesh)
         self._state = StreamState(imager)
         self._electrode_changes = None if as_is else ElectrodeChangeFilter(imager, calibration)
-        is_plane = model.mesh.dimension == 2
+        is_plane_mesh = model.mesh.dimension == 2
         self.scene = create_scene(
             model.mesh,
             model.electrodes,
@@ -212,9 +212,9 @@ class ConductivityView(AbstractView):
             self.grid,
             title=title,
             quantity="conductivity change",
-            unit="S" if is_plane else "S/m",
+            unit="S" if is_plane_mesh else "S/m",
             diverging=True,
-            notes=(*notes, *(() if is_plane else ("The image is a slice at half the height of the body.",))),
+            notes=(*notes, *(() if is_plane_mesh else ("The image is a slice at half the height of the body.",))),
         )
 
     @classmethod

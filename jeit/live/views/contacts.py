@@ -30,7 +30,7 @@ _MIN_FRAMES = 10
 # Minimum difference in seconds of the times of successive frames in tracking, since frames may have equal times.
 _MIN_TIME_STEP = 1e-6
 # Time in seconds for which the name of a gesture is shown on the image.
-_LABEL_TIME = 1.5
+_LABEL_DURATION = 1.5
 
 Item = TypeVar("Item")
 Output = TypeVar("Output")
@@ -94,7 +94,7 @@ class ContactsView(AbstractView):
             return picture
         contacts = self.contacts(frame_image.conductivity - self.images.background)
         self._track_contacts(frame.second, contacts)
-        tracks = {tuple(touch.position): touch.number for touch in self._tracker.open}
+        number_by_position = {tuple(touch.position): touch.number for touch in self._tracker.open}
         background = self.images.background
         markers = tuple(
             Marker(
@@ -102,7 +102,7 @@ class ContactsView(AbstractView):
                 float(contact.centroid[1]),
                 label=f"{100 * contact.peak / background:+.0f} %",
                 radius=contact.deviation,
-                track=tracks.get(tuple(contact.centroid)),
+                track=number_by_position.get(tuple(contact.centroid)),
             )
             for contact in contacts
         )
@@ -195,14 +195,14 @@ class GestureView(AbstractView):
         """Compute the image of a frame with a marker for the touch, and name the gesture of a touch that has ended; see
         `AbstractView.picture`."""
         self._second = max(frame.second, self._second)
-        observation = self._watch_frame((self._second, frame.values))
-        image = observation.image
+        watched_frame = self._watch_frame((self._second, frame.values))
+        image = watched_frame.image
         events = tuple(
             sentence
             for sentence in (
-                self._classified_sentence(observation.named),
-                *map(_held_touch_sentence, observation.ended),
-                observation.note,
+                self._classified_sentence(watched_frame.named),
+                *map(_held_touch_sentence, watched_frame.ended),
+                watched_frame.note,
             )
             if sentence
         )
@@ -210,9 +210,9 @@ class GestureView(AbstractView):
             reason = "" if image is None else image.reason
             return Picture(None, status=FrameStatus.REFUSED, reason=reason, events=events)
         change = image.conductivity - self.watch.images.background
-        markers = () if observation.second > self._gesture_label[1] else (self._gesture_label[0],)
-        if observation.touched:
-            time_course = self.watch.level.course(np.array([observation.second]), self._sign * change[None])
+        markers = () if watched_frame.second > self._gesture_label[1] else (self._gesture_label[0],)
+        if watched_frame.touched:
+            time_course = self.watch.level.course(np.array([watched_frame.second]), self._sign * change[None])
             x, y = time_course.centroid[0].tolist()
             markers = (Marker(x, y, track=self._touch_number + 1),)
         return Picture(self.grid(change), markers, image.status, image.reason, events)
@@ -241,7 +241,7 @@ class GestureView(AbstractView):
         time_course = touch.touch.course
         x, y = time_course.centroid[int(time_course.peak.argmax())].tolist()
         name = "unlike any gesture" if touch.unlike else f"{touch.gesture} {100 * touch.probability:.0f} %"
-        self._gesture_label = Marker(x, y, name), self._second + _LABEL_TIME
+        self._gesture_label = Marker(x, y, name), self._second + _LABEL_DURATION
         return f"{name} at ({1e3 * x:+.0f}, {1e3 * y:+.0f}) mm, {touch.touch.offset - touch.touch.onset:.2f} s long"
 
 

@@ -20,13 +20,13 @@ from jeit.touch.networks.linear_channels import depth_centroids
 from jeit.touch.simulate.contact.indent_sets import pixel_places
 
 # Radius that contains 68 % of an isotropic normal distribution of standard deviation 1.
-_RADIUS_68 = float(np.sqrt(-2 * np.log(1 - 0.68)))
+_RADIUS_OF_68_PERCENT = float(np.sqrt(-2 * np.log(1 - 0.68)))
 # Number of nodes of a mesh that is only drawn.
 _NUM_NODES = 400
 # Number of frames for which a label or key must last to be reported as an event.
 _MIN_STEADY_FRAMES = 2
 # Half the side in metres of a skin of unknown size.
-_HALF_SIZE = 0.05
+_HALF_SKIN_SIDE = 0.05
 
 
 class LearntSkinView(AbstractView):
@@ -200,7 +200,7 @@ def _touch_markers(touches: Touches) -> tuple[Marker, ...]:
         deviation_text = "" if touches.force_std is None else f" ± {touches.force_std[0]:.2g}"
         texts.insert(0, f"{touches.force[0]:.2g}{deviation_text} N")
     x, y = position.tolist()
-    return (Marker(x, y, ", ".join(texts), _RADIUS_68 * float(np.sqrt(np.mean(deviation**2)))),)
+    return (Marker(x, y, ", ".join(texts), _RADIUS_OF_68_PERCENT * float(np.sqrt(np.mean(deviation**2)))),)
 
 
 def _has_force(touches: Touches) -> bool:
@@ -234,7 +234,7 @@ def _skin_scene(skin: LearntSkin, description: Description | None) -> Scene:
         outline = closed_outline(mesh)
         electrodes = electrode_curves(mesh, description.electrodes)
     else:
-        low, high = np.full(2, -_HALF_SIZE), np.full(2, _HALF_SIZE)
+        low, high = np.full(2, -_HALF_SKIN_SIDE), np.full(2, _HALF_SKIN_SIDE)
         if "place" in skin.standing:
             positions = np.asarray(skin.standing["place"].right)[:, :2]
             low, high = np.nanmin(positions, axis=0), np.nanmax(positions, axis=0)

@@ -17,7 +17,7 @@ from jeit.live.views.conductivity import mean_frame
 # Number of pixels along the longer side of the map.
 _NUM_PIXELS = 100
 # Radius that contains 68 % of an isotropic normal distribution of standard deviation 1.
-_RADIUS_68 = float(np.sqrt(-2 * np.log(1 - 0.68)))
+_RADIUS_OF_68_PERCENT = float(np.sqrt(-2 * np.log(1 - 0.68)))
 _LIKELIHOOD = "likelihood"
 
 
@@ -66,12 +66,12 @@ class SoundView(AbstractView):
         outline = np.asarray(array.surface.outline.loops()[0])
         positions = np.asarray(array.surface.project(array.microphones.T)).T
         names = [str(number) for number in range(1, len(positions) + 1)]
-        is_likelihood = method == _LIKELIHOOD
+        is_likelihood_method = method == _LIKELIHOOD
         (x_min, y_min), (x_max, y_max) = low.tolist(), high.tolist()
         self.scene = Scene(
             title=f"Touches located by {len(positions)} microphones, {calibration.name}",
-            quantity="distance from the most likely place" if is_likelihood else "loss",
-            unit="σ" if is_likelihood else "",
+            quantity="distance from the most likely place" if is_likelihood_method else "loss",
+            unit="σ" if is_likelihood_method else "",
             diverging=False,
             extent=(x_min, x_max, y_min, y_max),
             outline=[np.concatenate([outline, outline[:1]])],
@@ -132,7 +132,10 @@ class SoundView(AbstractView):
         """Markers of the touch, and of the second touch if there are two."""
         project = self._localiser.microphone_array.surface.project
         deviation = float(np.sqrt(np.trace(locations.covariance[0]) / 2))
-        positions_and_radii = [(locations.position[0], _RADIUS_68 * deviation), (locations.second[0], float("nan"))]
+        positions_and_radii = [
+            (locations.position[0], _RADIUS_OF_68_PERCENT * deviation),
+            (locations.second[0], float("nan")),
+        ]
         return tuple(
             Marker(*np.asarray(project(position[:, None]))[:, 0].tolist(), radius=radius)
             for position, radius in positions_and_radii

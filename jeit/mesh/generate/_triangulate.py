@@ -19,11 +19,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.spatial import Delaunay, KDTree
 
-from jeit.mesh.generate.curve import Curve, Size, divide, is_inside_curves
+from jeit.mesh.generate.curve import Curve, SizeFunction, divide, is_inside_curves
 
 
 @dataclass
-class Front:
+class GeneratorState:
     """State of the mesh generator: arc lengths of the nodes on every boundary curve, and positions of the fixed and
     free nodes inside.
 
@@ -76,18 +76,18 @@ class Front:
         """Insert a node in the middle of each of the outline segments with the indices `segments`."""
         offset = 0
         for k, arc_lengths in enumerate(self.node_arc_lengths):
-            own_segments = segments[(segments >= offset) & (segments < offset + len(arc_lengths))] - offset
+            segments_of_curve = segments[(segments >= offset) & (segments < offset + len(arc_lengths))] - offset
             length = self.curves[k].length
             next_stops = np.append(arc_lengths[1:], arc_lengths[0] + length)
             self.node_arc_lengths[k] = np.sort(
-                np.concatenate([arc_lengths, (0.5 * (arc_lengths + next_stops))[own_segments] % length])
+                np.concatenate([arc_lengths, (0.5 * (arc_lengths + next_stops))[segments_of_curve] % length])
             )
             offset += len(arc_lengths)
 
 
-def triangulate(front: Front, points: np.ndarray) -> np.ndarray:
+def triangulate(state: GeneratorState, points: np.ndarray) -> np.ndarray:
     """Delaunay triangles (m, 3) inside the outline, counter-clockwise."""
-    outline = points[: front.num_outline]
+    outline = points[: state.num_outline]
     # With distant auxiliary nodes, the outline is not part of the convex hull, where collinear nodes would produce
     # slivers.
     largest_side = np.ptp(outline, axis=0).max()
@@ -96,9 +96,9 @@ def triangulate(front: Front, points: np.ndarray) -> np.ndarray:
     cells = Delaunay(np.concatenate([points, auxiliary_nodes])).simplices
     cells = cells[(cells < len(points)).all(axis=1)]
     # A cell with a node in the interior lies inside; only cells whose nodes are all on the outline need a test.
-    outline_cells = np.flatnonzero((cells < front.num_outline).all(axis=1))
+    outline_cells = np.flatnonzero((cells < state.num_outline).all(axis=1))
     is_inside = np.ones(len(cells), bool)
-    is_inside[outline_cells] = is_inside_curves(front.curves, points[cells[outline_cells]].mean(axis=1))
+    is_inside[outline_cells] = is_inside_curves(state.curves, points[cells[outline_cells]].mean(axis=1))
     cells = cells[is_inside]
     is_clockwise = doubled_areas(points, cells) < 0
     cells[is_clockwise] = cells[is_clockwise][:, [0, 2, 1]]
@@ -153,12 +153,12 @@ def select_spaced_points(points: np.ndarray, radius: np.ndarray, priority: np.nd
     return priority_order[is_selected]
 
 
-def is_clear_of_outline(front: Front, nodes: np.ndarray, points: np.ndarray, gap: np.ndarray) -> np.ndarray:
+def is_away_from_outline(state: GeneratorState, nodes: np.ndarray, points: np.ndarray, gap: np.ndarray) -> np.ndarray:
     """Whether each of `points` lies inside the outline, at a distance of more than `gap` from the outline. `nodes` are
-    the nodes of `front`."""
+    the nodes of `state`."""
     if not len(points):
         return np.zeros(0, bool)
-    segments = front.segments()
+    segments = state.segments()
     start, end = nodes[segments[:, 0]], nodes[segments[:, 1]]
     tree = KDTree(0.5 * (start + end))
     _, nearest_segments = tree.query(points, k=min(3, len(segments)))
@@ -167,65 +167,65 @@ def is_clear_of_outline(front: Front, nodes: np.ndarray, points: np.ndarray, gap
         direction, offset = end[column] - start[column], points - start[column]
         fraction = np.clip((offset * direction).sum(1) / (direction**2).sum(1), 0.0, 1.0)
         distances = np.minimum(distances, np.linalg.norm(offset - fraction[:, None] * direction, axis=1))
-    is_clear = distances > gap
-    is_clear[is_clear] = is_inside_curves(front.curves, points[is_clear])
-    return is_clear
+    is_away = distances > gap
+    is_away[is_away] = is_inside_curves(state.curves, points[is_away])
+    return is_away
 
 
 # Angles in degrees: the guaranteed minimum angle; the minimum that `repair` aims at, which is slightly larger; and the
 # angle below which `improve_worst_cells` improves a cell. Last, the maximum number of rounds of `repair`.
-PROMISED_ANGLE = 25.0
-_REPAIR_ANGLE = 25.5
-_POLISH_ANGLE = 31.0
+GUARANTEED_MIN_ANGLE = 25.0
+_MIN_ANGLE_OF_REPAIR = 25.5
+_IMPROVEMENT_ANGLE = 31.0
 _MAX_REPAIR_ROUNDS = 120
 
 _STEP_ANGLES = 2 * np.pi * np.arange(8) / 8
 _STEP_DIRECTIONS = np.stack([np.cos(_STEP_ANGLES), np.sin(_STEP_ANGLES)], axis=1)
-_TRIAL_STEPS = np.concatenate([length * _STEP_DIRECTIONS for length in (0.02, 0.06, 0.15, 0.3)])
+_TRIAL_DISPLACEMENTS = np.concatenate([length * _STEP_DIRECTIONS for length in (0.02, 0.06, 0.15, 0.3)])
 
 
-def is_improvable(front: Front, cells: np.ndarray) -> np.ndarray:
+def is_improvable(state: GeneratorState, cells: np.ndarray) -> np.ndarray:
     """Whether each cell can be improved; a cell at a sharp corner cannot, since the outline determines its shape."""
-    is_sharp = np.zeros(cells.max() + 1, bool)
-    is_sharp[: front.num_outline] = front.is_sharp_corner()
-    return np.logical_not(is_sharp[cells].any(axis=1))
+    is_sharp_node = np.zeros(cells.max() + 1, bool)
+    is_sharp_node[: state.num_outline] = state.is_sharp_corner()
+    return np.logical_not(is_sharp_node[cells].any(axis=1))
 
 
-def missing_segments(front: Front, cells: np.ndarray, num_points: int) -> np.ndarray:
+def missing_segments(state: GeneratorState, cells: np.ndarray, num_points: int) -> np.ndarray:
     """Indices of the outline segments that are not edges of cells."""
     edges = np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]]).astype(np.int64)
-    segments = front.segments().astype(np.int64)
-    is_present = np.isin(segments[:, 0] * num_points + segments[:, 1], edges[:, 0] * num_points + edges[:, 1])
-    return np.flatnonzero(~is_present)
+    segments = state.segments().astype(np.int64)
+    is_edge = np.isin(segments[:, 0] * num_points + segments[:, 1], edges[:, 0] * num_points + edges[:, 1])
+    return np.flatnonzero(~is_edge)
 
 
-def improve_worst_cells(front: Front, passes: int = 4) -> None:
+def improve_worst_cells(state: GeneratorState, num_passes: int = 4) -> None:
     """Move the free nodes of the worst cells so that the smallest angle around each of these nodes grows.
 
     Steps in eight directions are tried for each node, because the smallest angle is not differentiable where two cells
     have equal smallest angles.
     """
-    num_immovable_nodes = front.num_immovable_nodes
-    for _ in range(passes):
-        points = front.points()
-        cells = triangulate(front, points)
+    num_immovable_nodes = state.num_immovable_nodes
+    for _ in range(num_passes):
+        points = state.points()
+        cells = triangulate(state, points)
         angle = smallest_angles(points[cells])
-        bad_cells = np.flatnonzero((angle < _POLISH_ANGLE) & is_improvable(front, cells))
-        movable = np.unique(cells[bad_cells])
-        movable = movable[movable >= num_immovable_nodes]
-        if not movable.size:
+        bad_cells = np.flatnonzero((angle < _IMPROVEMENT_ANGLE) & is_improvable(state, cells))
+        movable_nodes = np.unique(cells[bad_cells])
+        movable_nodes = movable_nodes[movable_nodes >= num_immovable_nodes]
+        if not movable_nodes.size:
             return
         sort_order = np.argsort(cells.ravel(), kind="stable")
         bounds = np.searchsorted(cells.ravel()[sort_order], np.arange(len(points) + 1))
         has_moved = False
-        for node in movable.tolist():
+        for node in movable_nodes.tolist():
             star_corners = sort_order[bounds[node] : bounds[node + 1]]
             corner = star_corners % 3
             star_cells = cells[star_corners // 3]
             second_corners = points[star_cells[np.arange(len(star_corners)), (corner + 1) % 3]]
             third_corners = points[star_cells[np.arange(len(star_corners)), (corner + 2) % 3]]
             mean_length = np.linalg.norm(second_corners - points[node], axis=1).mean()
-            trial_points = points[node] + np.concatenate([np.zeros((1, 2)), mean_length * _TRIAL_STEPS])
+            trial_points = points[node] + np.concatenate([np.zeros((1, 2)), mean_length * _TRIAL_DISPLACEMENTS])
             shape = (len(trial_points), len(star_corners), 2)
             corners = np.stack(
                 [
@@ -240,12 +240,12 @@ def improve_worst_cells(front: Front, passes: int = 4) -> None:
             if min_angles[best_index] > min_angles[0] + 1e-3:
                 points[node] = trial_points[best_index]
                 has_moved = True
-        front.free_nodes = points[num_immovable_nodes:]
+        state.free_nodes = points[num_immovable_nodes:]
         if not has_moved:
             return
 
 
-def repair(front: Front) -> bool:
+def repair(state: GeneratorState) -> bool:
     """Insert nodes until all outline segments are edges and every cell has the required minimum angle. Returns False if
     some cell or segment is still bad after the maximum number of rounds.
 
@@ -254,126 +254,126 @@ def repair(front: Front) -> bool:
     are treated at once.
     """
     for round_number in range(_MAX_REPAIR_ROUNDS):
-        points = front.points()
-        cells = triangulate(front, points)
-        missing_indices = missing_segments(front, cells, len(points))
+        points = state.points()
+        cells = triangulate(state, points)
+        missing_indices = missing_segments(state, cells, len(points))
         if missing_indices.size:
-            _recover(front, points, missing_indices, remove=round_number < 10)
+            _recover(state, points, missing_indices, removes_nodes=round_number < 10)
             continue
         angle = smallest_angles(points[cells])
-        bad_cells = np.flatnonzero((angle < _REPAIR_ANGLE) & is_improvable(front, cells))
+        bad_cells = np.flatnonzero((angle < _MIN_ANGLE_OF_REPAIR) & is_improvable(state, cells))
         if not bad_cells.size:
             return True
-        _insert_circumcentres(front, points, cells[bad_cells], angle[bad_cells])
+        _insert_circumcentres(state, points, cells[bad_cells], angle[bad_cells])
         if round_number % 3 == 2:
-            improve_worst_cells(front, passes=2)
+            improve_worst_cells(state, num_passes=2)
     return False
 
 
-def _diametral_circles(front: Front, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    end_points = points[front.segments()]
+def _diametral_circles(state: GeneratorState, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    end_points = points[state.segments()]
     return end_points.mean(axis=1), 0.5 * np.linalg.norm(end_points[:, 1] - end_points[:, 0], axis=1)
 
 
-def _is_divisible(front: Front) -> np.ndarray:
+def _is_divisible(state: GeneratorState) -> np.ndarray:
     """Whether each outline segment may be divided: neither of its ends is a sharp corner."""
-    return np.logical_not(front.is_sharp_corner()[front.segments()].any(axis=1))
+    return np.logical_not(state.is_sharp_corner()[state.segments()].any(axis=1))
 
 
-def _recover(front: Front, points: np.ndarray, missing_indices: np.ndarray, *, remove: bool) -> None:
+def _recover(state: GeneratorState, points: np.ndarray, missing_indices: np.ndarray, *, removes_nodes: bool) -> None:
     """Make missing outline segments appear as edges of cells: remove the free nodes close to them or, if there are
     none, halve the segments."""
-    centres, radii = _diametral_circles(front, points)
-    if remove and len(front.free_nodes):
-        neighbours = KDTree(front.free_nodes).query_ball_point(centres[missing_indices], radii[missing_indices])
+    centres, radii = _diametral_circles(state, points)
+    if removes_nodes and len(state.free_nodes):
+        neighbours = KDTree(state.free_nodes).query_ball_point(centres[missing_indices], radii[missing_indices])
         removed_nodes = np.unique(np.concatenate([np.asarray(indices, dtype=int) for indices in neighbours]))
         if removed_nodes.size:
-            front.free_nodes = np.delete(front.free_nodes, removed_nodes, axis=0)
+            state.free_nodes = np.delete(state.free_nodes, removed_nodes, axis=0)
             return
-    is_divisible = _is_divisible(front)[missing_indices]
-    front.divide(missing_indices[is_divisible])
+    is_divisible = _is_divisible(state)[missing_indices]
+    state.divide(missing_indices[is_divisible])
 
 
-def _insert_circumcentres(front: Front, points: np.ndarray, bad_cells: np.ndarray, angle: np.ndarray) -> None:
+def _insert_circumcentres(state: GeneratorState, points: np.ndarray, bad_cells: np.ndarray, angle: np.ndarray) -> None:
     centre, radius = circumcircles(points, bad_cells)
     selected = select_spaced_points(centre, radius, -angle)
     centre = centre[selected]
-    centres, radii = _diametral_circles(front, points)
-    is_divisible = _is_divisible(front)
+    centres, radii = _diametral_circles(state, points)
+    is_divisible = _is_divisible(state)
     # A segment is encroached upon if a new node lies in the circle whose diameter is the segment.
     neighbours = KDTree(centre).query_ball_point(centres, radii * (1 - 1e-9))
     is_encroached = np.array([len(indices) > 0 for indices in neighbours])
     is_affected = np.zeros(len(centre), bool)
     for cell_index in np.flatnonzero(is_encroached):
         is_affected[neighbours[cell_index]] = True
-    is_outside = ~is_inside_curves(front.curves, centre)
-    lost_centres = np.flatnonzero(is_outside & ~is_affected)
-    if lost_centres.size:
-        is_encroached[KDTree(centres).query(centre[lost_centres])[1]] = True
+    is_outside = ~is_inside_curves(state.curves, centre)
+    outside_centres = np.flatnonzero(is_outside & ~is_affected)
+    if outside_centres.size:
+        is_encroached[KDTree(centres).query(centre[outside_centres])[1]] = True
     accepted = centre[~is_affected & ~is_outside]
     if len(accepted):
-        accepted = accepted[is_clear_of_outline(front, points, accepted, np.zeros(len(accepted)))]
+        accepted = accepted[is_away_from_outline(state, points, accepted, np.zeros(len(accepted)))]
     halved_segments = np.flatnonzero(is_encroached & is_divisible)
-    front.free_nodes = np.concatenate([front.free_nodes, accepted])
-    front.divide(halved_segments)
+    state.free_nodes = np.concatenate([state.free_nodes, accepted])
+    state.divide(halved_segments)
 
 
 # Maximum ratio of circumradius to cell size, chosen so that the mean edge equals the cell size (the ratio of an
 # equilateral triangle is 0.577).
-_RADIUS_PER_SIZE = 0.74
+_MAX_CIRCUMRADIUS_RATIO = 0.74
 _SMOOTHING_STEPS = 14
 # Angle below which a corner is cut off by a single isosceles cell: two cells there would be too thin.
-_SHARP_CORNER = np.radians(75.0)
+_MAX_SHARP_CORNER_ANGLE = np.radians(75.0)
 
 
 def outline_nodes(
-    curves: list[Curve], arc_lengths: list[np.ndarray], fixed_nodes: np.ndarray, size: Size, guard_ratio: float
-) -> Front:
+    curves: list[Curve], arc_lengths: list[np.ndarray], fixed_nodes: np.ndarray, size: SizeFunction, guard_ratio: float
+) -> GeneratorState:
     """Place nodes on the outline and cut off sharp corners at a distance of `guard_ratio` times the local cell size."""
-    all_stops, guarded_lengths = [], []
+    stops_of_curves, guarded_lengths = [], []
     for curve, required_stops in zip(curves, arc_lengths, strict=True):
         stop_lengths = np.unique(np.concatenate([curve.corners, required_stops % curve.length]))
-        sharp_corners = np.flatnonzero(curve.angles < _SHARP_CORNER)
+        sharp_corners = np.flatnonzero(curve.angles < _MAX_SHARP_CORNER_ANGLE)
         added_stops = []
         for corner in sharp_corners:
             corner_length = curve.corners[corner]
-            gap_ahead = np.min((stop_lengths - corner_length - 1e-12 * curve.length) % curve.length)
-            gap_behind = np.min((corner_length - stop_lengths - 1e-12 * curve.length) % curve.length)
+            gap_to_next = np.min((stop_lengths - corner_length - 1e-12 * curve.length) % curve.length)
+            gap_to_previous = np.min((corner_length - stop_lengths - 1e-12 * curve.length) % curve.length)
             cut_length = min(
                 guard_ratio * float(size(curve.points_at(np.array([corner_length])))[0]),
-                0.45 * gap_ahead,
-                0.45 * gap_behind,
+                0.45 * gap_to_next,
+                0.45 * gap_to_previous,
             )
             added_stops += [(corner_length + cut_length) % curve.length, (corner_length - cut_length) % curve.length]
-        all_stops.append(divide(curve, np.concatenate([stop_lengths, added_stops]), size))
+        stops_of_curves.append(divide(curve, np.concatenate([stop_lengths, added_stops]), size))
         guarded_lengths.append(curve.corners[sharp_corners])
-    return Front(curves, all_stops, guarded_lengths, fixed_nodes, np.zeros((0, 2)))
+    return GeneratorState(curves, stops_of_curves, guarded_lengths, fixed_nodes, np.zeros((0, 2)))
 
 
-def insert_nodes(front: Front, size: Size) -> None:
+def insert_nodes(state: GeneratorState, size: SizeFunction) -> None:
     """Insert nodes until no cell is larger than `size` allows."""
     for _ in range(200):
-        points = front.points()
-        cells = triangulate(front, points)
+        points = state.points()
+        cells = triangulate(state, points)
         centre, radius = circumcircles(points, cells)
         sizes = size(centre)
-        is_large = radius > _RADIUS_PER_SIZE * sizes
+        is_large = radius > _MAX_CIRCUMRADIUS_RATIO * sizes
         centre, ratio, sizes = centre[is_large], (radius / sizes)[is_large], sizes[is_large]
-        is_clear = is_clear_of_outline(front, points, centre, 0.5 * sizes)
-        if not is_clear.any():
+        is_away = is_away_from_outline(state, points, centre, 0.5 * sizes)
+        if not is_away.any():
             return
-        centre, ratio, sizes = centre[is_clear], ratio[is_clear], sizes[is_clear]
-        front.free_nodes = np.concatenate([front.free_nodes, centre[select_spaced_points(centre, 0.95 * sizes, ratio)]])
+        centre, ratio, sizes = centre[is_away], ratio[is_away], sizes[is_away]
+        state.free_nodes = np.concatenate([state.free_nodes, centre[select_spaced_points(centre, 0.95 * sizes, ratio)]])
 
 
-def smooth_nodes(front: Front, size: Size, steps: int = _SMOOTHING_STEPS) -> None:
+def smooth_nodes(state: GeneratorState, size: SizeFunction, steps: int = _SMOOTHING_STEPS) -> None:
     """Move the free nodes towards the optimal Delaunay triangulation for the requested cell sizes."""
-    num_immovable_nodes = front.num_immovable_nodes
-    if not len(front.free_nodes):
+    num_immovable_nodes = state.num_immovable_nodes
+    if not len(state.free_nodes):
         return
     for _ in range(steps):
-        points = front.points()
-        cells = triangulate(front, points)
+        points = state.points()
+        cells = triangulate(state, points)
         corners = points[cells]
         centroids = corners.mean(axis=1)
         offset = circumcircles(points, cells)[0] - centroids
@@ -391,37 +391,41 @@ def smooth_nodes(front: Front, size: Size, steps: int = _SMOOTHING_STEPS) -> Non
         )[num_immovable_nodes:]
         has_cells = node_sums[:, 2] > 0
         target = np.where(
-            has_cells[:, None], node_sums[:, :2] / np.where(has_cells, node_sums[:, 2], 1.0)[:, None], front.free_nodes
+            has_cells[:, None], node_sums[:, :2] / np.where(has_cells, node_sums[:, 2], 1.0)[:, None], state.free_nodes
         )
-        is_clear = is_clear_of_outline(front, points, target, 0.45 * size(target))
-        front.free_nodes = np.where(is_clear[:, None], target, front.free_nodes)
+        is_away = is_away_from_outline(state, points, target, 0.45 * size(target))
+        state.free_nodes = np.where(is_away[:, None], target, state.free_nodes)
 
 
 def generate(
-    curves: list[Curve], arc_lengths: list[np.ndarray], fixed_nodes: np.ndarray, size: Size, front: Front | None = None
+    curves: list[Curve],
+    arc_lengths: list[np.ndarray],
+    fixed_nodes: np.ndarray,
+    size: SizeFunction,
+    state: GeneratorState | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mesh the region inside the first of `curves` and outside the other curves, which are holes: points (n, 2) and
     cells (m, 3).
 
     Nodes are placed at `arc_lengths`, arc lengths on each curve, and at `fixed_nodes`, points (f, 2) inside the region.
-    `size` returns the requested edge length at points (p, 2). If `front` is specified, it must already be filled for
+    `size` returns the requested edge length at points (p, 2). If `state` is specified, it must already be filled for
     this size, and the steps `outline_nodes` and `insert_nodes` are skipped. Node 0 is the first node of the first
     curve. Raises `ValueError` if no mesh with the guaranteed minimum angle is found.
     """
     for guard_ratio in (1.0, 0.5, 0.25):
-        if front is None:
-            front = outline_nodes(curves, arc_lengths, fixed_nodes, size, guard_ratio)
-            insert_nodes(front, size)
-        smooth_nodes(front, size)
-        improve_worst_cells(front)
-        is_repaired = repair(front)
-        improve_worst_cells(front, passes=1)
-        points = front.points()
-        cells = triangulate(front, points)
+        if state is None:
+            state = outline_nodes(curves, arc_lengths, fixed_nodes, size, guard_ratio)
+            insert_nodes(state, size)
+        smooth_nodes(state, size)
+        improve_worst_cells(state)
+        is_repaired = repair(state)
+        improve_worst_cells(state, num_passes=1)
+        points = state.points()
+        cells = triangulate(state, points)
         angle = smallest_angles(points[cells])
-        if is_repaired and angle[is_improvable(front, cells)].min(initial=90.0) >= PROMISED_ANGLE:
+        if is_repaired and angle[is_improvable(state, cells)].min(initial=90.0) >= GUARANTEED_MIN_ANGLE:
             return order_nodes(points, cells)
-        front = None
+        state = None
     raise ValueError(
         "refine: no mesh with angles of at least 25° was found for this outline and these cell sizes. Ask for smaller "
         "cells near narrow places and nodes that lie close together, or for slower growth."

@@ -10,7 +10,7 @@ import numpy as np
 
 from jeit.mesh import topology
 
-Size = Callable[[np.ndarray], np.ndarray]
+SizeFunction = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,9 @@ def create_smooth_curve(length: float, points_at: Callable[[np.ndarray], np.ndar
 
     The functions `inside` and `distance` of the curve use a polygon of `num_chords` chords.
     """
-    chords = points_at(length * np.arange(num_chords) / num_chords)
-    inscribed = closed_line(chords)
-    return Curve(length, points_at, inscribed.contains, inscribed.distance, np.zeros(0), np.zeros(0))
+    chord_ends = points_at(length * np.arange(num_chords) / num_chords)
+    inscribed_polygon = closed_line(chord_ends)
+    return Curve(length, points_at, inscribed_polygon.contains, inscribed_polygon.distance, np.zeros(0), np.zeros(0))
 
 
 def closed_line(vertices: np.ndarray) -> Curve:
@@ -100,7 +100,7 @@ def is_inside_curves(curves: list[Curve], points: np.ndarray) -> np.ndarray:
     return result
 
 
-def divide(curve: Curve, arc_lengths: np.ndarray, size: Size) -> np.ndarray:
+def divide(curve: Curve, arc_lengths: np.ndarray, size: SizeFunction) -> np.ndarray:
     """Arc lengths of nodes along a curve, which include `arc_lengths` and are spaced by the cell size that `size`
     requests."""
     arc_lengths = np.unique(arc_lengths)
@@ -115,13 +115,19 @@ def divide(curve: Curve, arc_lengths: np.ndarray, size: Size) -> np.ndarray:
         samples = np.sort(np.concatenate([samples, midpoints[is_long]]))
     density = 1.0 / size(curve.points_at(0.5 * (samples[1:] + samples[:-1]) % curve.length))
     cumulative_count = np.concatenate([[0.0], np.cumsum(np.diff(samples) * density)])
-    stop_counts = np.interp(np.append(arc_lengths, arc_lengths[0] + curve.length), samples, cumulative_count)
+    cumulative_counts_at_stops = np.interp(
+        np.append(arc_lengths, arc_lengths[0] + curve.length), samples, cumulative_count
+    )
     min_pieces = max(1, -(-3 // len(arc_lengths)))
     node_lengths = []
-    for start, start_count, end_count in zip(arc_lengths, stop_counts[:-1], stop_counts[1:], strict=True):
-        num_pieces = max(min_pieces, round(end_count - start_count))
-        inner_stops = np.interp(
-            start_count + (end_count - start_count) * np.arange(1, num_pieces) / num_pieces, cumulative_count, samples
+    for start, start_count, count_at_end in zip(
+        arc_lengths, cumulative_counts_at_stops[:-1], cumulative_counts_at_stops[1:], strict=True
+    ):
+        num_pieces = max(min_pieces, round(count_at_end - start_count))
+        stops_between_ends = np.interp(
+            start_count + (count_at_end - start_count) * np.arange(1, num_pieces) / num_pieces,
+            cumulative_count,
+            samples,
         )
-        node_lengths.append(np.append(start, inner_stops))
+        node_lengths.append(np.append(start, stops_between_ends))
     return np.sort(np.concatenate(node_lengths) % curve.length)

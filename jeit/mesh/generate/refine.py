@@ -13,14 +13,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
-from jeit.mesh.generate.curve import Curve, Size, is_inside_curves
+from jeit.mesh.generate.curve import Curve, SizeFunction, is_inside_curves
 from jeit_solvers.module import Module
 
 # Factor between successive trial numbers of nodes, and maximum number of nodes tried.
-_TRIAL_FACTOR, _MAX_TRIAL_NODES = 1.1, 2e6
+_NODE_NUMBER_TRIAL_FACTOR, _MAX_TRIAL_NODES = 1.1, 2e6
 
 
-class TooFewNodes(ValueError):
+class TooFewNodesError(ValueError):
     """Raised if a plane mesh needs about `min_points` nodes, more than requested.
 
     `solid` is the message for a plane mesh that is the base of a solid, without the leading "num_points: "; {asked} and
@@ -34,7 +34,7 @@ class TooFewNodes(ValueError):
 
 @contextmanager
 def nodes_of_solid(num_requested: int | None, count_base_nodes: Callable[[int], int]) -> Iterator[None]:
-    """Convert a `TooFewNodes` error raised inside this context into a `ValueError` about the number of nodes of a
+    """Convert a `TooFewNodesError` error raised inside this context into a `ValueError` about the number of nodes of a
     solid.
 
     `num_requested`: number of nodes requested for the solid; `count_base_nodes`: function that returns how many of a
@@ -42,19 +42,19 @@ def nodes_of_solid(num_requested: int | None, count_base_nodes: Callable[[int], 
     """
     try:
         yield
-    except TooFewNodes as error:
+    except TooFewNodesError as error:
         if num_requested is None:
             raise
         num_points = float(num_requested)
         while count_base_nodes(round(num_points)) < error.min_points and num_points < _MAX_TRIAL_NODES:
-            num_points *= _TRIAL_FACTOR
+            num_points *= _NODE_NUMBER_TRIAL_FACTOR
         min_points = float(f"{num_points:.2g}")
         raise ValueError(f"num_points: {error.solid.format(asked=num_requested, least=f'{min_points:.0f}')}") from None
 
 
 # Maximum increase of the edge length per unit of distance, away from nodes that lie close together and in a user's size
 # function.
-_USER_SIZE_GROWTH = 0.45
+_MAX_EDGE_LENGTH_GROWTH = 0.45
 
 
 class Refine(Module):
@@ -144,7 +144,7 @@ class SizeField:
         Raises `ValueError` if `refine` contains anything but `Refine` objects.
         """
         self._terms: list[tuple[Callable[[np.ndarray], np.ndarray], Refine]] = []
-        self._user_size: Size | None = None
+        self._user_size: SizeFunction | None = None
         if callable(refine):
             self._user_size = limit_growth(curves, refine)
         elif refine is not None:
@@ -187,7 +187,7 @@ def _distance_function(curves: list[Curve], points: np.ndarray | None) -> Callab
     return lambda positions: tree.query(positions)[0]
 
 
-def _size_at_close_nodes(required_nodes: np.ndarray, spacing: np.ndarray) -> Size:
+def _size_at_close_nodes(required_nodes: np.ndarray, spacing: np.ndarray) -> SizeFunction:
     """Size function that limits the edge length at each required node to its `spacing` and lets it grow away from the
     node."""
     if not len(required_nodes):
@@ -198,7 +198,7 @@ def _size_at_close_nodes(required_nodes: np.ndarray, spacing: np.ndarray) -> Siz
         # Propagate the spacing of distant nodes, so that the nearest few nodes suffice to evaluate the size.
         for _ in range(4):
             distances, neighbours = tree.query(required_nodes, k=num_neighbours)
-            spacing = np.min(spacing[neighbours] + _USER_SIZE_GROWTH * distances, axis=1)
+            spacing = np.min(spacing[neighbours] + _MAX_EDGE_LENGTH_GROWTH * distances, axis=1)
 
     def size(points: np.ndarray) -> np.ndarray:
         distances, neighbours = tree.query(points, k=num_neighbours)
@@ -206,13 +206,13 @@ def _size_at_close_nodes(required_nodes: np.ndarray, spacing: np.ndarray) -> Siz
             distances.reshape(len(points), num_neighbours),
             neighbours.reshape(len(points), num_neighbours),
         )
-        return np.min(spacing[neighbours] + _USER_SIZE_GROWTH * distances, axis=1)
+        return np.min(spacing[neighbours] + _MAX_EDGE_LENGTH_GROWTH * distances, axis=1)
 
     return size
 
 
-def limit_growth(curves: list[Curve], function: Callable[[np.ndarray], Any], resolution: int = 128) -> Size:
-    """Limit the growth of a user's size function f to g = `_USER_SIZE_GROWTH`: the size at a point x becomes the
+def limit_growth(curves: list[Curve], function: Callable[[np.ndarray], Any], resolution: int = 128) -> SizeFunction:
+    """Limit the growth of a user's size function f to g = `_MAX_EDGE_LENGTH_GROWTH`: the size at a point x becomes the
     minimum over y of f(y) + g |x − y|.
 
     The minimum is computed on a grid by Dijkstra's algorithm; where f(x) itself is smaller than the minimum on the
@@ -246,7 +246,9 @@ def limit_growth(curves: list[Curve], function: Callable[[np.ndarray], Any], res
     ]
     start = np.concatenate([a.ravel() for a, _, _ in grid_links] + [np.full(len(inside_nodes), len(grid_points))])
     end = np.concatenate([b.ravel() for _, b, _ in grid_links] + [inside_nodes])
-    weight = np.concatenate([np.full(a.size, _USER_SIZE_GROWTH * length) for a, _, length in grid_links] + [values])
+    weight = np.concatenate(
+        [np.full(a.size, _MAX_EDGE_LENGTH_GROWTH * length) for a, _, length in grid_links] + [values]
+    )
     graph = coo_array((weight, (start, end)), shape=(len(grid_points) + 1,) * 2).tocsr()
     field = dijkstra(graph, directed=False, indices=len(grid_points))[:-1].reshape(shape)
     interpolate = scipy.interpolate.RegularGridInterpolator(axes, field)

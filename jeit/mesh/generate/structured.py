@@ -11,11 +11,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from jeit.mesh.generate.refine import TooFewNodes
+from jeit.mesh.generate.refine import TooFewNodesError
 
 # Height of a row divided by the mean edge length along it: a value between 1 for squares and 0.87 for equilateral
 # triangles.
-_ROW_HEIGHT = 0.93
+_RELATIVE_ROW_HEIGHT = 0.93
 
 
 def triangulate_between_chains(outer_chain: np.ndarray, inner_chain: np.ndarray, *, is_closed: bool) -> np.ndarray:
@@ -30,29 +30,29 @@ def triangulate_between_chains(outer_chain: np.ndarray, inner_chain: np.ndarray,
         (len(outer_chain), len(inner_chain)) if is_closed else (len(outer_chain) - 1, len(inner_chain) - 1)
     )
     # Midpoints multiplied by 2 N_outer N_inner, as integers, so that ties are exact.
-    outer_middle = (2 * np.arange(num_outer) + 1) * num_inner
-    inner_middle = (2 * np.arange(num_inner) + 1) * num_outer
-    facing_inner = np.searchsorted(inner_middle, outer_middle, side="left")
-    facing_outer = np.searchsorted(outer_middle, inner_middle, side="right")
-    step_outer, step_inner = np.arange(num_outer), np.arange(num_inner)
+    outer_edge_middles = (2 * np.arange(num_outer) + 1) * num_inner
+    inner_edge_middles = (2 * np.arange(num_inner) + 1) * num_outer
+    facing_inner_nodes = np.searchsorted(inner_edge_middles, outer_edge_middles, side="left")
+    facing_outer_nodes = np.searchsorted(outer_edge_middles, inner_edge_middles, side="right")
+    outer_indices, inner_indices = np.arange(num_outer), np.arange(num_inner)
     lower_triangles = np.stack(
         [
-            outer_chain[step_outer],
-            outer_chain[(step_outer + 1) % len(outer_chain)],
-            inner_chain[facing_inner % len(inner_chain)],
+            outer_chain[outer_indices],
+            outer_chain[(outer_indices + 1) % len(outer_chain)],
+            inner_chain[facing_inner_nodes % len(inner_chain)],
         ],
         axis=1,
     )
     upper_triangles = np.stack(
         [
-            inner_chain[(step_inner + 1) % len(inner_chain)],
-            inner_chain[step_inner],
-            outer_chain[facing_outer % len(outer_chain)],
+            inner_chain[(inner_indices + 1) % len(inner_chain)],
+            inner_chain[inner_indices],
+            outer_chain[facing_outer_nodes % len(outer_chain)],
         ],
         axis=1,
     )
     return np.concatenate([lower_triangles, upper_triangles])[
-        np.argsort(np.concatenate([outer_middle, inner_middle]), kind="stable")
+        np.argsort(np.concatenate([outer_edge_middles, inner_edge_middles]), kind="stable")
     ]
 
 
@@ -92,9 +92,9 @@ def ring_disk(num_rings: int, num_boundary: int) -> tuple[np.ndarray, np.ndarray
     radius = np.repeat(np.arange(num_rings, 0, -1) / num_rings, counts)
     angle = np.concatenate([2 * np.pi * np.arange(count) / count for count in counts])
     points = np.concatenate([radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1), np.zeros((1, 2))])
-    rings = [np.arange(offsets[k], offsets[k + 1]) for k in range(num_rings)]
-    cells = [triangulate_between_chains(a, b, is_closed=True) for a, b in pairwise(rings)]
-    innermost = rings[-1]
+    nodes_of_rings = [np.arange(offsets[k], offsets[k + 1]) for k in range(num_rings)]
+    cells = [triangulate_between_chains(a, b, is_closed=True) for a, b in pairwise(nodes_of_rings)]
+    innermost = nodes_of_rings[-1]
     cells.append(np.stack([innermost, np.roll(innermost, -1), np.full(len(innermost), offsets[-1])], axis=1))
     return points, np.concatenate(cells)
 
@@ -107,9 +107,9 @@ def choose_rows(width: float, height: float, num_points: int, cell_size: float |
     if cell_size is not None:
         # A cell with base b and height 0.93 b has the area of an equilateral triangle with edge 1.036 b.
         cell_size = min(cell_size, width, height) / 1.036
-        return max(1, round(width / cell_size - 0.5)), max(1, round(height / (_ROW_HEIGHT * cell_size)))
-    edge = np.sqrt(width * height / (_ROW_HEIGHT * num_points))
-    guessed_rows = height / (_ROW_HEIGHT * edge)
+        return max(1, round(width / cell_size - 0.5)), max(1, round(height / (_RELATIVE_ROW_HEIGHT * cell_size)))
+    edge = np.sqrt(width * height / (_RELATIVE_ROW_HEIGHT * num_points))
+    guessed_rows = height / (_RELATIVE_ROW_HEIGHT * edge)
     # With few nodes, accept a larger deviation from the requested number rather than stretched cells.
     max_deviation = 0.03 if num_points > 200 else 0.1
     best_choice = None
@@ -123,13 +123,13 @@ def choose_rows(width: float, height: float, num_points: int, cell_size: float |
                 continue
             num_nodes = (num_rows + 1) * (num_columns + 1) + num_wide_rows
             deviation = abs(num_nodes / num_points - 1.0)
-            stretch = abs(np.log(height / num_rows / (_ROW_HEIGHT * width / (num_columns + 0.5))))
-            cost = (stretch > 0.6, max(0.0, deviation - max_deviation), stretch)
+            row_stretch = abs(np.log(height / num_rows / (_RELATIVE_ROW_HEIGHT * width / (num_columns + 0.5))))
+            cost = (row_stretch > 0.6, max(0.0, deviation - max_deviation), row_stretch)
             if best_choice is None or cost < best_choice[0]:
                 best_choice = (cost, num_columns, num_rows)
     if best_choice is None or best_choice[0][0]:
         min_points = 2 * max(width / height, height / width) + 3
-        raise TooFewNodes(
+        raise TooFewNodesError(
             f"num_points: {num_points} nodes in a rectangle of {width:g} by {height:g} m make flat cells. Ask for at "
             f"least about {min_points:.0f}.",
             round(min_points),

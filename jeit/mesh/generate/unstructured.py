@@ -16,14 +16,14 @@ from scipy.spatial import KDTree
 from jeit.arguments import check_metres
 from jeit.mesh import topology
 from jeit.mesh.generate import _triangulate
-from jeit.mesh.generate._triangulate import Front, doubled_areas, triangulate
-from jeit.mesh.generate.curve import Curve, Size, is_inside_curves
-from jeit.mesh.generate.refine import Refinement, SizeField, TooFewNodes
+from jeit.mesh.generate._triangulate import GeneratorState, doubled_areas, triangulate
+from jeit.mesh.generate.curve import Curve, SizeFunction, is_inside_curves
+from jeit.mesh.generate.refine import Refinement, SizeField, TooFewNodesError
 from jeit.mesh.mesh import Mesh
 
 DEFAULT_NUM_POINTS = 1200
 # Maximum number of nodes of a mesh.
-MOST_POINTS = 1_000_000
+MAX_POINTS = 1_000_000
 # Minimum distance between required nodes, relative to the length of the outline.
 _MIN_NODE_DISTANCE = 1e-6
 # Tolerated relative error of the number of nodes before smoothing and repair, which may change the number slightly.
@@ -31,7 +31,7 @@ _NODE_COUNT_TOLERANCE = 0.02
 
 
 @dataclass(frozen=True)
-class Target:
+class MeshTarget:
     """Target size of a mesh.
 
     **Fields**: `num_points`: number of nodes; `cell_size`: cell size in metres, or None to use `num_points`;
@@ -43,7 +43,7 @@ class Target:
     is_requested: bool
 
     @staticmethod
-    def create(num_points: int | None, cell_size: float | None) -> Target:
+    def create(num_points: int | None, cell_size: float | None) -> MeshTarget:
         """Create a target from the two arguments of a mesh function. Raises `ValueError` if both arguments are
         specified or one of them is out of range."""
         if num_points is not None and cell_size is not None:
@@ -52,7 +52,7 @@ class Target:
             check_metres("cell_size", cell_size)
         num_nodes = DEFAULT_NUM_POINTS if num_points is None else check_count("num_points", num_points, 4)
         check_total(num_nodes, "num_points")
-        return Target(num_nodes, cell_size, num_points is not None)
+        return MeshTarget(num_nodes, cell_size, num_points is not None)
 
 
 def check_count(name: str, value: int, minimum: int) -> int:
@@ -64,9 +64,9 @@ def check_count(name: str, value: int, minimum: int) -> int:
 
 def check_total(num_points: float, name: str) -> None:
     """Raise `ValueError` if the mesh would have more than the maximum number of nodes."""
-    if num_points > MOST_POINTS:
+    if num_points > MAX_POINTS:
         raise ValueError(
-            f"{name}: this would make about {num_points:.2g} nodes; the limit is {MOST_POINTS:.0e}. Lengths are in "
+            f"{name}: this would make about {num_points:.2g} nodes; the limit is {MAX_POINTS:.0e}. Lengths are in "
             "metres: check the units, or ask for larger cells."
         )
 
@@ -86,7 +86,7 @@ def check_positions(name: str, positions: ArrayLike) -> np.ndarray:
 def mesh_within(
     curves: list[Curve],
     area: float,
-    target: Target,
+    target: MeshTarget,
     refine: Refinement = None,
     boundary_points: ArrayLike | None = None,
     interior_points: ArrayLike | None = None,
@@ -102,7 +102,7 @@ def mesh_within(
     ]
     fixed_nodes = _check_interior(interior_points, curves)
     field = SizeField(curves, refine, *_required_spacing(curves, arc_lengths, fixed_nodes))
-    front = None
+    state = None
     if target.cell_size is not None:
         size = partial(_capped_size_at if field.is_user_function else _size_at, field, target.cell_size)
         check_total(_estimate_num_nodes(curves, size, area), "cell_size")
@@ -110,8 +110,8 @@ def mesh_within(
         size = partial(_size_at, field, 1.0)
         check_total(_estimate_num_nodes(curves, size, area), "refine")
     else:
-        size, front = _fit_cell_size(curves, arc_lengths, fixed_nodes, field, target.num_points, area)
-    return Mesh.create(*_triangulate.generate(curves, arc_lengths, fixed_nodes, size, front))
+        size, state = _fit_cell_size(curves, arc_lengths, fixed_nodes, field, target.num_points, area)
+    return Mesh.create(*_triangulate.generate(curves, arc_lengths, fixed_nodes, size, state))
 
 
 def _required_positions(curves: list[Curve], boundary_points: ArrayLike | None) -> list[np.ndarray]:
@@ -127,8 +127,8 @@ def _size_at(field: SizeField, background: float, points: np.ndarray) -> np.ndar
     return field.at(points)(background)
 
 
-def _capped_size_at(field: SizeField, cap: float, points: np.ndarray) -> np.ndarray:
-    return np.minimum(field.at(points)(1.0), cap)
+def _capped_size_at(field: SizeField, max_size: float, points: np.ndarray) -> np.ndarray:
+    return np.minimum(field.at(points)(1.0), max_size)
 
 
 def _merge_with_corners(curve: Curve, positions: np.ndarray) -> np.ndarray:
@@ -148,15 +148,15 @@ def _merge_with_corners(curve: Curve, positions: np.ndarray) -> np.ndarray:
         )
     is_distinct = gaps > 1e-9
     # Replace a position that coincides with a corner by the corner, so that corners are not moved.
-    distinct_stops = arc_lengths[is_distinct]
+    distinct_arc_lengths = arc_lengths[is_distinct]
     if len(curve.corners):
-        corner_distances = np.abs(distinct_stops[:, None] - curve.corners)
+        corner_distances = np.abs(distinct_arc_lengths[:, None] - curve.corners)
         corner_distances = np.minimum(corner_distances, curve.length - corner_distances)
         nearest_corner = corner_distances.argmin(axis=1)
-        distinct_stops = np.where(
-            corner_distances.min(axis=1) < 2e-9 * curve.length, curve.corners[nearest_corner], distinct_stops
+        distinct_arc_lengths = np.where(
+            corner_distances.min(axis=1) < 2e-9 * curve.length, curve.corners[nearest_corner], distinct_arc_lengths
         )
-    return np.unique(distinct_stops)
+    return np.unique(distinct_arc_lengths)
 
 
 def _check_interior(interior_points: ArrayLike | None, curves: list[Curve]) -> np.ndarray:
@@ -189,26 +189,28 @@ def _required_spacing(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions (k, 2) of required nodes, and the distance (k,) of each required node to the nearest other required
     node, or to the nearest side that the node does not lie on, whichever is smaller."""
-    chains = [curve.points_at(curve_arc_lengths) for curve, curve_arc_lengths in zip(curves, arc_lengths, strict=True)]
-    required_nodes = np.concatenate([*chains, fixed_nodes])
-    if len(required_nodes) < 2:
+    node_chains = [
+        curve.points_at(curve_arc_lengths) for curve, curve_arc_lengths in zip(curves, arc_lengths, strict=True)
+    ]
+    required_positions = np.concatenate([*node_chains, fixed_nodes])
+    if len(required_positions) < 2:
         distances = np.array([curves[0].distance(point[None])[0] for point in fixed_nodes])
-        return (required_nodes, distances) if len(fixed_nodes) else (np.zeros((0, 2)), np.zeros(0))
-    spacing = KDTree(required_nodes).query(required_nodes, k=2)[0][:, 1]
+        return (required_positions, distances) if len(fixed_nodes) else (np.zeros((0, 2)), np.zeros(0))
+    spacing = KDTree(required_positions).query(required_positions, k=2)[0][:, 1]
     offset = 0
-    for chain in chains:
+    for chain in node_chains:
         num_nodes = len(chain)
         for k, (start, end) in enumerate(pairwise(np.concatenate([chain, chain[:1]]))):
             if num_nodes < 2 or (start == end).all():
                 continue
-            distances = topology.distance(required_nodes, start[None], end[None])[:, 0]
+            distances = topology.distance(required_positions, start[None], end[None])[:, 0]
             distances[[offset + k, offset + (k + 1) % num_nodes]] = np.inf
             spacing = np.minimum(spacing, np.where(distances > 0, distances, np.inf))
         offset += num_nodes
     for curve in curves:
         if len(fixed_nodes):
             spacing[offset:] = np.minimum(spacing[offset:], curve.distance(fixed_nodes))
-    return required_nodes, spacing
+    return required_positions, spacing
 
 
 def _interior_samples(curves: list[Curve]) -> np.ndarray:
@@ -219,7 +221,7 @@ def _interior_samples(curves: list[Curve]) -> np.ndarray:
     return grid[is_inside_curves(curves, grid)]
 
 
-def _estimate_num_nodes(curves: list[Curve], size: Size, area: float) -> float:
+def _estimate_num_nodes(curves: list[Curve], size: SizeFunction, area: float) -> float:
     """Estimate the number of nodes of a mesh whose cell sizes are the values of the function `size`, from samples
     inside the domain and along its outline."""
     num_nodes = area * float(np.mean(1.0 / size(_interior_samples(curves)) ** 2))
@@ -235,7 +237,7 @@ def _fit_cell_size(
     field: SizeField,
     num_points: int,
     area: float,
-) -> tuple[Size, Front]:
+) -> tuple[SizeFunction, GeneratorState]:
     """Scale the background cell size, or the user's size function, so that the mesh has about `num_points` nodes.
     Returns the size function and the outline filled with nodes.
 
@@ -246,18 +248,18 @@ def _fit_cell_size(
     background = float(np.sqrt(1.1 * area / first_num_points))
     if field.is_user_function:
         background *= float(np.sqrt(np.mean(1.0 / field.at(_interior_samples(curves))(1.0) ** 2)))
-    best_fit: tuple[float, Size, Front] | None = None
+    best_fit: tuple[float, SizeFunction, GeneratorState] | None = None
     for _ in range(6):
         size = partial(_size_at, field, background)
-        front = _triangulate.outline_nodes(curves, arc_lengths, fixed_nodes, size, 1.0)
-        _triangulate.insert_nodes(front, size)
-        points = front.points()
+        state = _triangulate.outline_nodes(curves, arc_lengths, fixed_nodes, size, 1.0)
+        _triangulate.insert_nodes(state, size)
+        points = state.points()
         relative_excess = len(points) / num_points - 1.0
         if best_fit is None or abs(relative_excess) < best_fit[0]:
-            best_fit = (abs(relative_excess), size, front)
+            best_fit = (abs(relative_excess), size, state)
         if abs(relative_excess) < _NODE_COUNT_TOLERANCE:
             break
-        cells = triangulate(front, points)
+        cells = triangulate(state, points)
         background = _correct_background(
             field.at(points[cells].mean(axis=1)), doubled_areas(points, cells), background, relative_excess, num_points
         )
@@ -278,7 +280,7 @@ def _correct_background(
     target_total = density_integral(background) / (1.0 + relative_excess)
     if density_integral(1e3 * background) > 1.1 * target_total:
         min_points = round(num_points * density_integral(1e3 * background) / target_total)
-        raise TooFewNodes(
+        raise TooFewNodesError(
             f"num_points: the outline and refinement alone need about {min_points} nodes, more than the {num_points} "
             "asked. Ask for more nodes, less refinement (larger cell_size, smaller factor) or faster growth.",
             min_points,

@@ -28,18 +28,18 @@ from jeit_solvers.module import Module
 
 # Minimum relative decrease of a distance that is propagated, and number of sources processed together, which limits the
 # memory for distances (s, n).
-_MIN_DECREASE, _SOURCES_PER_BATCH = 1e-10, 128
+_MIN_DISTANCE_DECREASE, _SOURCES_PER_BATCH = 1e-10, 128
 # Maximum length of a path on a sphere, in radians: near the antipode the wave converges to a point.
-_MAX_SPHERE_ANGLE = 2.6
+_MAX_PATH_ANGLE_ON_SPHERE = 2.6
 # Maximum disagreement, as a fraction of the side of a triangle, between distances at its corners that belong to the
 # same wave.
-_WAVE_TOLERANCE = 0.02
+_MAX_RELATIVE_WAVE_MISMATCH = 0.02
 # Maximum distance of a user's points from the surface, relative to the surface's extent, chosen so that points on the
 # other side of a thick skin are accepted.
-_MAX_OFF_SURFACE = 0.25
+_MAX_RELATIVE_DISTANCE_OFF_SURFACE = 0.25
 
 
-class _Corners(NamedTuple):
+class _TriangleCorners(NamedTuple):
     """All corners of all triangles, each in the plane of its triangle: the opposite side starts at the origin and runs
     along x."""
 
@@ -67,7 +67,7 @@ class Geodesics(Module):
     """
 
     surface: Triangles
-    corners: _Corners
+    corners: _TriangleCorners
     curvature: Float[np.ndarray, " n"]
     first: Int[np.ndarray, " n1"]
     touching: Int[np.ndarray, " q"]
@@ -83,7 +83,7 @@ class Geodesics(Module):
         end_nodes = np.concatenate([start, end])
         sort_order = np.argsort(end_nodes, kind="stable")
         first_indices = np.concatenate([[0], np.cumsum(np.bincount(end_nodes, minlength=len(points)))])
-        corners = _Corners(node, start, end, *corner_coordinates)
+        corners = _TriangleCorners(node, start, end, *corner_coordinates)
         return cls(triangles, corners, _gaussian_curvature(triangles, corners), first_indices, sort_order % len(node))
 
     def distances(
@@ -127,12 +127,12 @@ class Geodesics(Module):
         from the surface."""
         projected = self.surface.nearest(places)
         largest_side = float(np.ptp(self.surface.points, axis=0).max())
-        off_surface = np.flatnonzero(~(projected.away <= _MAX_OFF_SURFACE * largest_side))
-        if off_surface.size:
+        off_surface_indices = np.flatnonzero(~(projected.away <= _MAX_RELATIVE_DISTANCE_OFF_SURFACE * largest_side))
+        if off_surface_indices.size:
             raise ValueError(
-                f"{name}: {off_surface.size} of {len(projected.away)} lie off the surface, the first, at "
-                f"{np.asarray(places, float)[off_surface[0]].tolist()} m, by "
-                f"{1e3 * projected.away[off_surface[0]]:.3g} mm; give places on it, in metres."
+                f"{name}: {off_surface_indices.size} of {len(projected.away)} lie off the surface, the first, at "
+                f"{np.asarray(places, float)[off_surface_indices[0]].tolist()} m, by "
+                f"{1e3 * projected.away[off_surface_indices[0]]:.3g} mm; give places on it, in metres."
             )
         return projected
 
@@ -193,15 +193,17 @@ class Geodesics(Module):
             )
             node = self.corners.node[corner]
             entries = source + node
-            is_lower = (new_lengths < (1 - _MIN_DECREASE) * lengths[entries]) & (new_lengths <= 2 * max_distance)
-            entries, new_lengths, node = entries[is_lower], new_lengths[is_lower], node[is_lower]
-            previous_lengths = np.where(is_by_start, lengths[start], lengths[end])[is_lower]
+            is_shorter = (new_lengths < (1 - _MIN_DISTANCE_DECREASE) * lengths[entries]) & (
+                new_lengths <= 2 * max_distance
+            )
+            entries, new_lengths, node = entries[is_shorter], new_lengths[is_shorter], node[is_shorter]
+            previous_lengths = np.where(is_by_start, lengths[start], lengths[end])[is_shorter]
             np.minimum.at(lengths, entries, new_lengths)
             with np.errstate(invalid="ignore"):
                 fraction = np.where(new_lengths > 0, np.clip(previous_lengths / new_lengths, 0, 1), 0.0)
             is_smallest = new_lengths == lengths[entries]
             curvatures[entries[is_smallest]] = (
-                fraction * mean_curvature[is_lower] + (1 - fraction) * self.curvature[node]
+                fraction * mean_curvature[is_shorter] + (1 - fraction) * self.curvature[node]
             )[is_smallest]
             # Nodes beyond the limit are not propagated.
             changed_entries = np.unique(entries[lengths[entries] <= max_distance])
@@ -252,24 +254,32 @@ class Geodesics(Module):
         corners = self.surface.points[cells]
         source_rows = np.arange(len(lengths))[:, None] if source is None else source
         shortest = np.inf
-        for first, second, third in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            ends = (source_rows, cells[:, first]), (source_rows, cells[:, second])
+        for first_corner, second_corner, third_corner in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            ends = (source_rows, cells[:, first_corner]), (source_rows, cells[:, second_corner])
             start, end = (lengths[end_index] for end_index in ends)
-            side, x, y = _triangle_coordinates(corners[:, first], corners[:, second], targets.points)
-            across_side, _ = _distances_across(
+            side, x, y = _triangle_coordinates(corners[:, first_corner], corners[:, second_corner], targets.points)
+            distances_across_side, _ = _distances_across(
                 start, end, side, x, y, curvature=(curvatures[ends[0]] + curvatures[ends[1]]) / 2
             )
             # Where paths from two directions meet, the distances at the ends of a side belong to different waves, and
             # contradict the distance at the third corner. In that case the path passes through a corner.
             with np.errstate(invalid="ignore", over="ignore"):
                 source_x, source_depth, _ = _virtual_source(start, end, side)
-                _, corner_x, corner_y = _triangle_coordinates(corners[:, first], corners[:, second], corners[:, third])
-                mismatch = (
-                    np.hypot(corner_x - source_x, corner_y + source_depth) - lengths[source_rows, cells[:, third]]
+                _, corner_x, corner_y = _triangle_coordinates(
+                    corners[:, first_corner], corners[:, second_corner], corners[:, third_corner]
+                )
+                distance_mismatch = (
+                    np.hypot(corner_x - source_x, corner_y + source_depth)
+                    - lengths[source_rows, cells[:, third_corner]]
                 )
             through_corner = start + np.sqrt(x**2 + y**2)
             shortest = np.minimum(
-                shortest, np.where(np.abs(mismatch) < _WAVE_TOLERANCE * side, across_side, through_corner)
+                shortest,
+                np.where(
+                    np.abs(distance_mismatch) < _MAX_RELATIVE_WAVE_MISMATCH * side,
+                    distances_across_side,
+                    through_corner,
+                ),
             )
         straight_lengths = np.linalg.norm(sources.points[source_rows] - targets.points, axis=-1)
         return np.where(sources.triangle[source_rows] == targets.triangle, straight_lengths, shortest)
@@ -292,8 +302,8 @@ def _distances_across(start, end, side, x, y, *, same_source: Any = True, curvat
     only where `same_source` is True, i.e. where the distances at both ends of the side are from the same source.
     `curvature`: mean Gaussian curvature along the path, 1/m²."""
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        through_start = np.sqrt(x**2 + y**2) + start
-        through_end = np.sqrt((side - x) ** 2 + y**2) + end
+        distance_through_start = np.sqrt(x**2 + y**2) + start
+        distance_through_end = np.sqrt((side - x) ** 2 + y**2) + end
         source_x, source_depth, squared_depth = _virtual_source(start, end, side)
         crossing_position = (source_x * y + x * source_depth) / np.where(source_depth + y > 0, source_depth + y, 1.0)
         crosses_side = (
@@ -316,7 +326,9 @@ def _distances_across(start, end, side, x, y, *, same_source: Any = True, curvat
             * crossing_position
             * (side - crossing_position)
         )
-    return np.where(crosses_side, length, np.minimum(through_start, through_end)), through_start <= through_end
+    return np.where(
+        crosses_side, length, np.minimum(distance_through_start, distance_through_end)
+    ), distance_through_start <= distance_through_end
 
 
 def _virtual_source(start, end, side):
@@ -333,18 +345,18 @@ def _front_flattening(curvature, length):
     surface of Gaussian curvature K = `curvature`, 1/m²: κ = √K cot(√K length), with the hyperbolic cotangent for
     negative K."""
     angle = np.sqrt(np.abs(curvature)) * length
-    is_small, spherical_angle, hyperbolic_angle = (
+    is_small_angle, spherical_angle, hyperbolic_angle = (
         angle < 1e-3,
-        np.clip(angle, 1e-3, _MAX_SPHERE_ANGLE),
+        np.clip(angle, 1e-3, _MAX_PATH_ANGLE_ON_SPHERE),
         np.clip(angle, 1e-3, 10.0),
     )
     relative_flattening = np.where(
         curvature > 0, 1 - spherical_angle / np.tan(spherical_angle), 1 - hyperbolic_angle / np.tanh(hyperbolic_angle)
     )
-    return np.where(is_small, curvature * length / 3, relative_flattening / np.where(is_small, 1.0, length))
+    return np.where(is_small_angle, curvature * length / 3, relative_flattening / np.where(is_small_angle, 1.0, length))
 
 
-def _gaussian_curvature(surface: Triangles, corners: _Corners) -> Float[np.ndarray, " n"]:
+def _gaussian_curvature(surface: Triangles, corners: _TriangleCorners) -> Float[np.ndarray, " n"]:
     """Gaussian curvature (n,) at the nodes, 1/m²: the angle defect, i.e. 2π minus the sum of the angles at the node,
     divided by a third of the area of its triangles. Defect and area are averaged over two rings of neighbours. Nodes on
     the border do not contribute."""
@@ -364,15 +376,15 @@ def _gaussian_curvature(surface: Triangles, corners: _Corners) -> Float[np.ndarr
     return np.where(areas > 0, angle_defect / np.where(areas > 0, areas, 1.0), 0.0)
 
 
-def _lower_distances(lengths, nearest_sources, nodes, new_lengths, owner_index) -> np.ndarray:
+def _lower_distances(lengths, nearest_sources, nodes, new_lengths, source_index) -> np.ndarray:
     """Lower the distances of `nodes` to the minimum of the new distances `new_lengths`, and store the corresponding
-    entry of `owner_index` as their owner. Returns the nodes whose distance has decreased."""
-    is_lower = new_lengths < (1 - _MIN_DECREASE) * lengths[nodes]
-    nodes, new_lengths, owner_index = nodes[is_lower], new_lengths[is_lower], owner_index[is_lower]
+    entry of `source_index` as their owner. Returns the nodes whose distance has decreased."""
+    is_lower = new_lengths < (1 - _MIN_DISTANCE_DECREASE) * lengths[nodes]
+    nodes, new_lengths, source_index = nodes[is_lower], new_lengths[is_lower], source_index[is_lower]
     sort_order = np.lexsort((new_lengths, nodes))
-    changed_nodes, first_entries = np.unique(nodes[sort_order], return_index=True)
+    changed_nodes, first_entry_indices = np.unique(nodes[sort_order], return_index=True)
     lengths[changed_nodes], nearest_sources[changed_nodes] = (
-        new_lengths[sort_order][first_entries],
-        owner_index[sort_order][first_entries],
+        new_lengths[sort_order][first_entry_indices],
+        source_index[sort_order][first_entry_indices],
     )
     return changed_nodes

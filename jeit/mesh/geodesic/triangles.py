@@ -14,7 +14,7 @@ from jeit.mesh.mesh import Mesh
 from jeit_solvers.module import Module
 
 # Number of triangles, by nearest centroids, among which the nearest triangle is searched.
-_CANDIDATES = 16
+_NUM_CANDIDATE_TRIANGLES = 16
 
 
 class SurfacePlaces(Module):
@@ -130,7 +130,7 @@ class Triangles(Module):
     def nearest(self, places: ArrayLike) -> SurfacePlaces:
         """Points on the surface nearest to `places` (p, 3), metres."""
         positions = np.asarray(places, float)
-        num_candidates = min(_CANDIDATES, len(self.cells))
+        num_candidates = min(_NUM_CANDIDATE_TRIANGLES, len(self.cells))
         candidates = self._centroid_tree.query(positions, num_candidates)[1].reshape(len(positions), num_candidates)
         corners = self.points[self.cells[candidates]]
         weights = _nearest_in_triangles(corners, positions[:, None])
@@ -152,10 +152,10 @@ class Triangles(Module):
 
     def distance_to_border(self, places: ArrayLike) -> Float[np.ndarray, " p"]:
         """Straight-line distances (p,) of points (p, 3) from the border, metres; infinite for a closed surface."""
-        border, positions = self.border, np.asarray(places, float)
-        if not len(border):
+        border_edges, positions = self.border, np.asarray(places, float)
+        if not len(border_edges):
             return np.full(len(positions), np.inf)
-        start, end = self.points[border[:, 0]], self.points[border[:, 1]]
+        start, end = self.points[border_edges[:, 0]], self.points[border_edges[:, 1]]
         fractions = (np.arange(16) / 16)[:, None, None]
         border_points = ((1 - fractions) * start + fractions * end).reshape(-1, 3)
         return KDTree(border_points).query(positions)[0]

@@ -23,7 +23,7 @@ from jeit_solvers.engines import has_values, namespace, on_host, sum_into, undif
 _ANGLE_TOLERANCE = 1e-4
 # Number of times that the length of the paths is doubled by composing their transforms: paths of up to 2⁷ = 128
 # triangles.
-_MAX_DOUBLINGS = 7
+_MAX_PATH_DOUBLINGS = 7
 
 
 class Unfolding(NamedTuple):
@@ -94,13 +94,13 @@ def unfold(mesh: Mesh, places: Float[Array, "L 3"], max_distance: Float[Array, "
         opposite_side_indices // 3, squared_distance <= undifferentiated(max_distance) ** 2, root_triangles
     )
     side_index = 3 * cell + side
-    previous = xp.where(side < 0, cell, opposite_side_indices[side_index] // 3)
+    previous_cells = xp.where(side < 0, cell, opposite_side_indices[side_index] // 3)
     turn, shift = (
         transform[side_index] for transform in _transforms_across_sides(plane_corners, opposite_side_indices)
     )
     has_previous = (side >= 0)[..., None]
     turn, shift = xp.where(has_previous, turn, xp.array([1.0, 0.0])), xp.where(has_previous, shift, 0.0)
-    turn, shift, end_triangle = _compose_transforms(previous, turn, shift)
+    turn, shift, end_triangle = _compose_transforms(previous_cells, turn, shift)
     place = xp.einsum("ld,lad->la", places - corners[root_triangles, 0], axes[root_triangles])
     is_curved = _is_curved(undifferentiated(plane_corners), mesh.cells, opposite_side_indices, mesh.num_points)
     is_invalid = reached & (is_curved | (end_triangle != root_triangles[:, None]))
@@ -135,15 +135,15 @@ def _opposite_sides(cells) -> Int[Array, " h"]:
     side's own index. The index of side k (0, 1, 2) of triangle c is 3 c + k."""
     xp = namespace(cells)
     start, end = cells.reshape(-1), xp.roll(cells, -1, axis=1).reshape(-1)
-    lower_nodes, upper_nodes = xp.minimum(start, end), xp.maximum(start, end)
-    sort_order = xp.lexsort((upper_nodes, lower_nodes))
-    is_same_as_next = (xp.diff(lower_nodes[sort_order]) == 0) & (xp.diff(upper_nodes[sort_order]) == 0)
-    false_entry = xp.zeros(1, bool)
-    step = xp.where(xp.concatenate([is_same_as_next, false_entry]), 1, 0) - xp.where(
-        xp.concatenate([false_entry, is_same_as_next]), 1, 0
+    smaller_nodes, larger_nodes = xp.minimum(start, end), xp.maximum(start, end)
+    sort_order = xp.lexsort((larger_nodes, smaller_nodes))
+    is_same_as_next = (xp.diff(smaller_nodes[sort_order]) == 0) & (xp.diff(larger_nodes[sort_order]) == 0)
+    false_element = xp.zeros(1, bool)
+    step = xp.where(xp.concatenate([is_same_as_next, false_element]), 1, 0) - xp.where(
+        xp.concatenate([false_element, is_same_as_next]), 1, 0
     )
-    opposite = sort_order[xp.arange(len(sort_order)) + step]
-    return opposite[xp.argsort(sort_order)]
+    opposite_sides = sort_order[xp.arange(len(sort_order)) + step]
+    return opposite_sides[xp.argsort(sort_order)]
 
 
 def _find_connected_triangles(neighbour, is_near: Bool[Array, "L m"], root_triangles):
@@ -153,7 +153,7 @@ def _find_connected_triangles(neighbour, is_near: Bool[Array, "L m"], root_trian
     xp = namespace(neighbour, is_near)
     cell = xp.arange(is_near.shape[1])
     neighbour = neighbour.reshape(-1, 3)
-    is_root = cell == root_triangles[:, None]
+    is_root_triangle = cell == root_triangles[:, None]
 
     def add_neighbours(state):
         reached, side, _ = state
@@ -163,7 +163,7 @@ def _find_connected_triangles(neighbour, is_near: Bool[Array, "L m"], root_trian
 
     has_changed = xp.ones((), bool)
     reached, side, _ = while_loop(
-        lambda state: state[2], add_neighbours, (is_root, xp.full(is_near.shape, -1, int), has_changed)
+        lambda state: state[2], add_neighbours, (is_root_triangle, xp.full(is_near.shape, -1, int), has_changed)
     )
     return reached, side
 
@@ -188,7 +188,7 @@ def _compose_transforms(previous, turn, shift):
     where it ends."""
     xp = namespace(previous, turn)
     row = xp.arange(len(previous))[:, None]
-    for _ in range(_MAX_DOUBLINGS):
+    for _ in range(_MAX_PATH_DOUBLINGS):
         next_turn, next_shift = turn[row, previous], shift[row, previous]
         turn, shift = _rotate(next_turn, turn), _rotate(next_turn, shift) + next_shift
         previous = previous[row, previous]

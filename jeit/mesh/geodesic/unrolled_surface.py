@@ -23,7 +23,7 @@ from jeit.mesh.geodesic.triangles import SurfacePlaces, Triangles
 from jeit.mesh.mesh import Mesh
 from jeit_solvers.module import Module
 
-_RIGID_ITERATIONS = 60
+_NUM_RIGID_ITERATIONS = 60
 # Minimum slope of a coordinate in space, in metres per metre on the flat surface, for its use as the upward direction.
 _MIN_UPWARD_SLOPE = 0.3
 
@@ -107,18 +107,21 @@ def unroll(surface: Triangles | Mesh, face: str | None = None, *, cut: ArrayLike
     points = _conformal_map(cells, plane_corners, len(nodes))
     points = _flatten_rigidly(cells, plane_corners, points)
     points = _turn_upright(points, triangles.points[nodes])
-    deformation = _edges(points[cells]) @ np.linalg.inv(_edges(plane_corners))
-    return Unrolled(triangles, cells, points, nodes, np.linalg.svd(deformation, compute_uv=False)[:, ::-1])
+    deformation_gradients = _edges(points[cells]) @ np.linalg.inv(_edges(plane_corners))
+    return Unrolled(triangles, cells, points, nodes, np.linalg.svd(deformation_gradients, compute_uv=False)[:, ::-1])
 
 
 def _plane_corners(corners: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3 2"]:
     """Corners of each triangle in its own plane."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     length = np.linalg.norm(a, axis=1)
-    third_x = (a * b).sum(axis=1) / length
-    third_y = np.linalg.norm(np.cross(a, b), axis=1) / length
-    zero = np.zeros_like(length)
-    return np.stack([np.stack([zero, zero], 1), np.stack([length, zero], 1), np.stack([third_x, third_y], 1)], axis=1)
+    third_corner_x = (a * b).sum(axis=1) / length
+    third_corner_y = np.linalg.norm(np.cross(a, b), axis=1) / length
+    zeros = np.zeros_like(length)
+    return np.stack(
+        [np.stack([zeros, zeros], 1), np.stack([length, zeros], 1), np.stack([third_corner_x, third_corner_y], 1)],
+        axis=1,
+    )
 
 
 def _edges(triangles: Float[np.ndarray, "m 3 2"]) -> Float[np.ndarray, "m 2 2"]:
@@ -139,21 +142,22 @@ def _conformal_map(cells, plane_corners, num_nodes: int) -> np.ndarray:
     )
     side_vectors = side_vectors / np.sqrt(np.abs(np.linalg.det(_edges(plane_corners))))[:, None, None]
     row = np.repeat(np.arange(len(cells)), 3)
-    real, imaginary = (
+    real_part, imaginary_part = (
         scipy.sparse.csr_array((component.ravel(), (row, cells.ravel())), shape=(len(cells), num_nodes))
         for component in (side_vectors[..., 0], side_vectors[..., 1])
     )
-    matrix = scipy.sparse.block_array([[real, -imaginary], [imaginary, real]]).tocsc()
+    matrix = scipy.sparse.block_array([[real_part, -imaginary_part], [imaginary_part, real_part]]).tocsc()
     fixed_coordinates = np.array(
         [fixed_nodes[0], fixed_nodes[1], fixed_nodes[0] + num_nodes, fixed_nodes[1] + num_nodes]
     )
     values = np.array([0.0, fixed_nodes[2], 0.0, 0.0])
     free_coordinates = np.setdiff1d(np.arange(2 * num_nodes), fixed_coordinates)
-    free_columns, right_side = matrix[:, free_coordinates], -(matrix[:, fixed_coordinates] @ values)
+    columns_of_free_coordinates, right_hand_side = matrix[:, free_coordinates], -(matrix[:, fixed_coordinates] @ values)
     coordinates = np.zeros(2 * num_nodes)
     coordinates[fixed_coordinates] = values
     coordinates[free_coordinates] = scipy.sparse.linalg.spsolve(
-        (free_columns.T @ free_columns).tocsc(), free_columns.T @ right_side
+        (columns_of_free_coordinates.T @ columns_of_free_coordinates).tocsc(),
+        columns_of_free_coordinates.T @ right_hand_side,
     )
     return coordinates.reshape(2, -1).T
 
@@ -189,17 +193,17 @@ def _flatten_rigidly(cells, plane_corners, points: np.ndarray) -> np.ndarray:
         shape=(num_nodes, num_nodes),
     )
     solve = factorized(matrix[1:, 1:].tocsc())
-    for _ in range(_RIGID_ITERATIONS):
+    for _ in range(_NUM_RIGID_ITERATIONS):
         flat_edges = points[end] - points[start]
-        moment = np.einsum("mk,mki,mkj->mij", weight, flat_edges, edge)
-        u, _, v = np.linalg.svd(moment)
+        moment_matrix = np.einsum("mk,mki,mkj->mij", weight, flat_edges, edge)
+        u, _, v = np.linalg.svd(moment_matrix)
         u[:, :, 1] *= np.sign(np.linalg.det(u @ v))[:, None]
         rotated_edges = weight[..., None] * np.einsum("mij,mkj->mki", u @ v, edge)
-        right_side = np.zeros_like(points)
-        np.add.at(right_side, end, rotated_edges)
-        np.subtract.at(right_side, start, rotated_edges)
+        right_hand_side = np.zeros_like(points)
+        np.add.at(right_hand_side, end, rotated_edges)
+        np.subtract.at(right_hand_side, start, rotated_edges)
         new_points = np.zeros_like(points)
-        new_points[1:] = np.column_stack([solve(right_side[1:, axis]) for axis in range(2)])
+        new_points[1:] = np.column_stack([solve(right_hand_side[1:, axis]) for axis in range(2)])
         has_converged = np.abs((new_points - points) - (new_points - points).mean(axis=0)).max() < 1e-7 * np.ptp(points)
         points = new_points
         if has_converged:
@@ -235,8 +239,8 @@ def _cut_to_disk(surface: Triangles, is_cut_edge) -> tuple[np.ndarray, np.ndarra
     """Cut a surface so that it becomes topologically a disk. Returns the triangles after the cut, and for each new node
     the original node."""
     cells, num_nodes = surface.cells, len(surface.points)
-    border = surface.border
-    num_loops, label = _border_loops(border, num_nodes)
+    border_edges = surface.border
+    num_loops, label = _border_loops(border_edges, num_nodes)
     edges = np.unique(np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
     euler_characteristic = num_nodes - len(edges) + len(cells)
     graph = scipy.sparse.csr_array((np.ones(len(edges)), edges.T), shape=(num_nodes, num_nodes))
@@ -251,11 +255,11 @@ def _cut_to_disk(surface: Triangles, is_cut_edge) -> tuple[np.ndarray, np.ndarra
         )
     points = surface.points
     if num_loops == 2:
-        end_nodes = np.unique(border[label == 0]), np.unique(border[label == 1])
+        end_nodes = np.unique(border_edges[label == 0]), np.unique(border_edges[label == 1])
     else:
         axis = int(np.argmax(np.ptp(points, axis=0)))
         end_nodes = np.array([points[:, axis].argmin()]), np.array([points[:, axis].argmax()])
-    path = _path_along_edges(points, edges, end_nodes, is_cut_edge, border)
+    path = _path_along_edges(points, edges, end_nodes, is_cut_edge, border_edges)
     return _split_along_path(cells, path, num_nodes, is_closed=num_loops == 0)
 
 
@@ -269,11 +273,11 @@ def _border_loops(border, num_nodes: int):
     return len(distinct_labels), label
 
 
-def _path_along_edges(points, edges, end_nodes, cut, border) -> list[int]:
-    """Nodes of a path along edges from the first of the two `end_nodes` to the second, near the point `cut` and off the
-    border."""
+def _path_along_edges(points, edges, end_nodes, cut_position, border) -> list[int]:
+    """Nodes of a path along edges from the first of the two `end_nodes` to the second, near the point `cut_position`
+    and off the border."""
     centre = points.mean(axis=0)
-    cut_position = np.asarray(cut, float) if cut is not None else None
+    cut_position = np.asarray(cut_position, float) if cut_position is not None else None
     largest_side = np.ptp(points, axis=0).max()
     midpoints = points[edges].mean(axis=1)
     if cut_position is None:
@@ -312,14 +316,14 @@ def _split_along_path(cells, path: list[int], num_nodes: int, *, is_closed: bool
             if node in triangles_at:
                 triangles_at[int(node)].append(int(triangle))
     cells = cells.copy()
-    original = cells.copy()
+    original_node = cells.copy()
     for node in doubled_nodes:
         # The triangles around the node, joined across edges that are not on the path, form two parts; one side is the
         # part that contains a triangle traversing the path forwards.
         surrounding_triangles = triangles_at[node]
         side_triangles = set()
         for triangle in surrounding_triangles:
-            corners = original[triangle].tolist()
+            corners = original_node[triangle].tolist()
             sides = zip(corners, corners[1:] + corners[:1], strict=True)
             if any(edge in path_edges and node in edge for edge in sides):
                 side_triangles.add(triangle)
@@ -330,13 +334,15 @@ def _split_along_path(cells, path: list[int], num_nodes: int, *, is_closed: bool
                 if triangle in side_triangles:
                     continue
                 for side_triangle in tuple(side_triangles):
-                    shared_nodes = set(original[triangle].tolist()) & set(original[side_triangle].tolist()) - {node}
+                    shared_nodes = set(original_node[triangle].tolist()) & set(
+                        original_node[side_triangle].tolist()
+                    ) - {node}
                     if any(not _is_on_path(node, other_node, path_nodes, path_edges) for other_node in shared_nodes):
                         side_triangles.add(triangle)
                         has_grown = True
                         break
         for triangle in side_triangles:
-            cells[triangle][original[triangle] == node] = new_nodes[node]
+            cells[triangle][original_node[triangle] == node] = new_nodes[node]
     return cells, np.concatenate([np.arange(num_nodes), np.array(doubled_nodes, int)])
 
 

@@ -13,9 +13,9 @@ from jeit.mesh.checks import size_checked
 from jeit.mesh.generate import structured
 from jeit.mesh.generate.curve import circle
 from jeit.mesh.generate.refine import Refine, Refinement
-from jeit.mesh.generate.unstructured import Target, check_count, check_positions, check_total, mesh_within
+from jeit.mesh.generate.unstructured import MeshTarget, check_count, check_positions, check_total, mesh_within
 from jeit.mesh.mesh import Mesh
-from jeit.mesh.outline.domain import Domain, Pen, check_length, check_near_origin, check_position, numerics
+from jeit.mesh.outline.domain import Domain, Pen, array_module, check_length, check_near_origin, check_position
 from jeit_solvers.engines import as_array
 
 
@@ -63,7 +63,7 @@ class Disk(Domain):
 
     def boundary(self, arc_length: ArrayLike) -> Float[Array, "... 2"]:
         """Points (…, 2) on the circle at `arc_length` (…) in metres, counter-clockwise from angle 0."""
-        xp = numerics(self, arc_length)
+        xp = array_module(self, arc_length)
         angle = xp.asarray(arc_length) / self.radius
         return as_array(xp.asarray(self.centre) + self.radius * xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1))
 
@@ -73,7 +73,7 @@ class Disk(Domain):
 
     def contains(self, points: ArrayLike) -> Bool[Array, "..."]:
         """Whether each of `points` (…, 2), in metres, lies in the disk or on its edge."""
-        xp = numerics(self, points)
+        xp = array_module(self, points)
         offset = xp.asarray(points) - xp.asarray(self.centre)
         return as_array((offset**2).sum(axis=-1) <= self.radius**2 * (1 + 1e-12))
 
@@ -85,12 +85,12 @@ class Disk(Domain):
     def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
         """Move the `points` (p, 2), metres, that lie outside the disk radially onto the circle."""
         offset, distance = self._from_centre(points)
-        xp = numerics(self, points)
+        xp = array_module(self, points)
         return as_array(xp.asarray(self.centre) + offset * xp.minimum(1, self.radius / distance[:, None]))
 
     def _from_centre(self, points: ArrayLike) -> tuple[Any, Any]:
         """Offsets (p, 2) and distances (p,) from the centre; the distances are differentiable at the centre, too."""
-        xp = numerics(self, points)
+        xp = array_module(self, points)
         offset = xp.asarray(points) - xp.asarray(self.centre)
         return offset, xp.sqrt((offset**2).sum(axis=1) + 1e-24)
 
@@ -120,12 +120,18 @@ class Disk(Domain):
         if refine is None and boundary_points is None and interior_points is None:
             points, cells = structured.ring_disk(*self._choose_rings(num_points, cell_size))
             return Mesh.create(centre + self.radius * points, cells)
-        arcs = None
+        boundary_arc_lengths = None
         if boundary_points is not None:
-            arcs = self.radius * np.mod(check_positions("boundary_points", boundary_points), 2 * np.pi)
-        target = Target.create(num_points, cell_size)
-        mesh = mesh_within([circle(self.radius, centre)], self.area, target, refine, arcs, interior_points)
-        max_deviation = 0 if num_boundary is None else 0.1 * num_boundary + (1 if arcs is None else len(arcs))
+            boundary_arc_lengths = self.radius * np.mod(check_positions("boundary_points", boundary_points), 2 * np.pi)
+        target = MeshTarget.create(num_points, cell_size)
+        mesh = mesh_within(
+            [circle(self.radius, centre)], self.area, target, refine, boundary_arc_lengths, interior_points
+        )
+        max_deviation = (
+            0
+            if num_boundary is None
+            else 0.1 * num_boundary + (1 if boundary_arc_lengths is None else len(boundary_arc_lengths))
+        )
         if num_boundary is not None and abs(mesh.num_facets - num_boundary) > max_deviation:
             raise ValueError(
                 f"num_boundary: cells of the size asked give {mesh.num_facets} nodes on the circle, not "
@@ -141,13 +147,13 @@ class Disk(Domain):
         return (rim_refinement, *(() if refine is None else (refine,) if isinstance(refine, Refine) else tuple(refine)))
 
     def _choose_rings(self, num_points: int | None, cell_size: float | None) -> tuple[int, int]:
-        target = Target.create(num_points, cell_size)
+        target = MeshTarget.create(num_points, cell_size)
         if target.cell_size is None:
-            rings = structured.choose_rings(target.num_points)
+            ring_numbers = structured.choose_rings(target.num_points)
         else:
             # With six nodes more on each ring, cells with legs t and π/3 t have the area of equilateral triangles with
             # edge 1.1 t.
             num_rings = max(1, round(1.1 * self.radius / target.cell_size))
-            rings = (num_rings, 6 * num_rings)
-        check_total(rings[0] * rings[1] // 2, "cell_size")
-        return rings
+            ring_numbers = (num_rings, 6 * num_rings)
+        check_total(ring_numbers[0] * ring_numbers[1] // 2, "cell_size")
+        return ring_numbers

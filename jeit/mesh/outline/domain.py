@@ -146,7 +146,7 @@ class Domain(Body):
         """
 
 
-def numerics(*values: Any) -> Any:
+def array_module(*values: Any) -> Any:
     """The array module to compute with: jax.numpy if any of `values` is being traced, otherwise NumPy."""
     return np if has_values(*values) else jnp
 

@@ -22,10 +22,10 @@ from jeit.mesh.checks import size_checked, warn_large
 from jeit.mesh.generate import structured
 from jeit.mesh.generate.curve import closed_line
 from jeit.mesh.generate.refine import Refinement
-from jeit.mesh.generate.unstructured import Target, check_total, mesh_within
+from jeit.mesh.generate.unstructured import MeshTarget, check_total, mesh_within
 from jeit.mesh.mesh import Mesh
-from jeit.mesh.outline.domain import Domain, Pen, check_length, check_near_origin, check_position, numerics
-from jeit_solvers.engines import as_array, either_engine, has_values, namespace, on_host
+from jeit.mesh.outline.domain import Domain, Pen, array_module, check_length, check_near_origin, check_position
+from jeit_solvers.engines import as_array, has_values, namespace, numpy_or_compiled, on_host
 
 Loop = Float[Array, "k 2"]
 
@@ -130,7 +130,7 @@ class Polygon(Domain):
     ) -> Mesh:
         """Mesh the polygon. The arguments and the errors raised are those of `jeit.mesh.polygon`."""
         curves = [closed_line(np.asarray(loop)) for loop in self.loops()]
-        target = Target.create(num_points, cell_size)
+        target = MeshTarget.create(num_points, cell_size)
         return mesh_within(curves, float(self.area), target, refine, boundary_points, interior_points)
 
 
@@ -193,13 +193,13 @@ class Rectangle(Domain):
         """Vertices of the rectangle."""
         return (self.vertices,)
 
-    @either_engine
+    @numpy_or_compiled
     def contains(self, points: ArrayLike) -> Bool[Array, "..."]:
         """Whether each of `points` (…, 2), in metres, lies in the rectangle or on its edge."""
         xp = namespace(self, points)
         offset = abs(xp.asarray(points) - xp.asarray(self.centre))
-        half_sides = 0.5 * xp.asarray([self.width, self.height])
-        return (offset <= half_sides * (1 + 1e-12)).all(axis=-1)
+        half_side_lengths = 0.5 * xp.asarray([self.width, self.height])
+        return (offset <= half_side_lengths * (1 + 1e-12)).all(axis=-1)
 
     def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
         """Distance (p,) of `points` (p, 2) from the nearest side in metres, negative outside."""
@@ -230,7 +230,7 @@ class Rectangle(Domain):
     ) -> Mesh:
         """Mesh the rectangle and tag its sides. The arguments and the errors raised are those of
         `jeit.mesh.rectangle`."""
-        target = Target.create(num_points, cell_size)
+        target = MeshTarget.create(num_points, cell_size)
         if refine is None and boundary_points is None and interior_points is None:
             mesh = self._mesh_rows(target)
         else:
@@ -242,7 +242,7 @@ class Rectangle(Domain):
         """Add tags for the sides of the rectangle to a mesh of the rectangle."""
         return Mesh(mesh.points, mesh.cells, mesh.facets, self._side_facets(mesh))
 
-    def _mesh_rows(self, target: Target) -> Mesh:
+    def _mesh_rows(self, target: MeshTarget) -> Mesh:
         x_min, _, y_min, _ = self.extent
         rows = structured.choose_rows(self.width, self.height, target.num_points, target.cell_size)
         check_total(rows[0] * rows[1], "cell_size")
@@ -272,18 +272,20 @@ def area_of_loops(loops: Sequence[Loop]) -> Float[Array, ""]:
     return as_array(sum(holes, outer_loop))
 
 
-@either_engine
+@numpy_or_compiled
 def points_on_loop(loop: Loop, arc_length: ArrayLike) -> Float[Array, "... 2"]:
     """Points (…, 2) on a loop at `arc_length` (…) in metres from its first vertex, taken modulo the length of the
     loop."""
     xp = namespace(loop)
     closed_loop = xp.concatenate([loop, loop[:1]])
     cumulative_lengths = xp.concatenate([xp.zeros(1), xp.cumsum(_side_lengths(loop))])
-    wrapped_length = xp.mod(xp.asarray(arc_length, dtype=cumulative_lengths.dtype), cumulative_lengths[-1])
-    return xp.stack([xp.interp(wrapped_length, cumulative_lengths, closed_loop[:, axis]) for axis in range(2)], axis=-1)
+    wrapped_arc_length = xp.mod(xp.asarray(arc_length, dtype=cumulative_lengths.dtype), cumulative_lengths[-1])
+    return xp.stack(
+        [xp.interp(wrapped_arc_length, cumulative_lengths, closed_loop[:, axis]) for axis in range(2)], axis=-1
+    )
 
 
-@either_engine
+@numpy_or_compiled
 def loops_contain(loops: Sequence[Loop], points: ArrayLike) -> Bool[Array, "..."]:
     """Whether each of `points` (…, 2) lies inside the first loop and outside the holes (even-odd rule)."""
     if namespace(loops, points) is np:
@@ -298,7 +300,7 @@ def loops_contain(loops: Sequence[Loop], points: ArrayLike) -> Bool[Array, "..."
 
 def distance_from_loops(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, " p"]:
     """Distance (p,) of `points` (p, 2) from the nearest side in metres, negative outside."""
-    xp = numerics(loops, points)
+    xp = array_module(loops, points)
     point_array, is_inside, nearest_points = _project_onto_loops(xp, loops, points)
     distances = xp.sqrt(((point_array - nearest_points) ** 2).sum(axis=1) + 1e-24)  # differentiable at zero, too
     return as_array(xp.where(is_inside, distances, -distances))
@@ -307,7 +309,7 @@ def distance_from_loops(loops: Sequence[Loop], points: ArrayLike) -> Float[Array
 def nearest_in_loops(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, "p 2"]:
     """Move each of `points` (p, 2) that lies outside to the nearest point on a side; points inside are returned
     unchanged."""
-    xp = numerics(loops, points)
+    xp = array_module(loops, points)
     point_array, is_inside, nearest_points = _project_onto_loops(xp, loops, points)
     return as_array(xp.where(is_inside[:, None], point_array, nearest_points))
 
@@ -315,18 +317,18 @@ def nearest_in_loops(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, "
 def _project_onto_loops(xp: Any, loops: Sequence[Loop], points: ArrayLike) -> tuple[Any, Any, Any]:
     """Convert `points` (p, 2) to an array. Also returns whether each point lies inside (p,), and the point on a side
     that is nearest to it (p, 2)."""
-    chains, point_array = [xp.asarray(loop) for loop in loops], xp.asarray(points, float)
-    start = xp.concatenate(chains)
-    sides = xp.concatenate([xp.roll(loop, -1, axis=0) for loop in chains]) - start
+    loop_arrays, point_array = [xp.asarray(loop) for loop in loops], xp.asarray(points, float)
+    start = xp.concatenate(loop_arrays)
+    sides = xp.concatenate([xp.roll(loop, -1, axis=0) for loop in loop_arrays]) - start
     offset = point_array[:, None] - start
     fraction = xp.clip((offset * sides).sum(axis=-1) / (sides**2).sum(axis=-1), 0, 1)
     points_on_sides = start + fraction[..., None] * sides  # (p, s, 2)
-    closest_side = xp.argmin(((point_array[:, None] - points_on_sides) ** 2).sum(axis=-1), axis=1)
-    nearest_points = xp.take_along_axis(points_on_sides, closest_side[:, None, None], axis=1)[:, 0]
+    nearest_side_index = xp.argmin(((point_array[:, None] - points_on_sides) ** 2).sum(axis=-1), axis=1)
+    nearest_points = xp.take_along_axis(points_on_sides, nearest_side_index[:, None, None], axis=1)[:, 0]
     is_inside = (
-        topology.is_inside_loops(point_array, chains)
+        topology.is_inside_loops(point_array, loop_arrays)
         if xp is np
-        else jax.lax.stop_gradient(loops_contain(chains, point_array))
+        else jax.lax.stop_gradient(loops_contain(loop_arrays, point_array))
     )
     return point_array, is_inside, nearest_points
 

@@ -84,8 +84,8 @@ def node_normals(mesh: Mesh) -> np.ndarray:
     min_cosine = np.ones(len(points))
     np.minimum.at(min_cosine, cells, (mean_normals[cells] * cell_normals[:, None]).sum(axis=2))
     slopes, is_determined = _fit_slopes(points, cells, mean_normals)
-    is_smooth = (min_cosine > _MIN_CREASE_COSINE) & is_determined
-    fitted_normals = mean_normals - np.where(is_smooth[:, None], slopes, 0)
+    is_smooth_node = (min_cosine > _MIN_CREASE_COSINE) & is_determined
+    fitted_normals = mean_normals - np.where(is_smooth_node[:, None], slopes, 0)
     return fitted_normals / np.linalg.norm(fitted_normals, axis=1, keepdims=True)
 
 
@@ -96,8 +96,8 @@ def _fit_slopes(points: np.ndarray, cells: np.ndarray, normal: np.ndarray) -> tu
     num_nodes = len(points)
     pairs = np.concatenate([cells[:, [a, b]] for a in range(3) for b in range(3)])
     adjacency = coo_array((np.ones(len(pairs)), pairs.T), shape=(num_nodes, num_nodes)).tocsr()
-    two_ring = coo_array(adjacency @ adjacency)
-    centre_node, neighbour = two_ring.row, two_ring.col
+    two_ring_neighbours = coo_array(adjacency @ adjacency)
+    centre_node, neighbour = two_ring_neighbours.row, two_ring_neighbours.col
     is_distinct = centre_node != neighbour
     centre_node, neighbour = centre_node[is_distinct], neighbour[is_distinct]
     auxiliary_axis = np.eye(3)[np.abs(normal).argmin(axis=1)]
@@ -109,19 +109,19 @@ def _fit_slopes(points: np.ndarray, cells: np.ndarray, normal: np.ndarray) -> tu
         np.bincount(centre_node, (offset**2).sum(axis=1), num_nodes) / np.bincount(centre_node, minlength=num_nodes)
     )
     u, v, height = (offset / scale[centre_node][:, None]).T
-    terms = np.stack([u, v, u * u / 2, u * v, v * v / 2], axis=1)
-    matrix, right_side = (
+    quadratic_terms = np.stack([u, v, u * u / 2, u * v, v * v / 2], axis=1)
+    matrix, right_hand_side = (
         np.zeros((num_nodes, _NUM_COEFFICIENTS, _NUM_COEFFICIENTS)),
         np.zeros((num_nodes, _NUM_COEFFICIENTS)),
     )
     for k in range(_NUM_COEFFICIENTS):
-        right_side[:, k] = np.bincount(centre_node, terms[:, k] * height, num_nodes)
+        right_hand_side[:, k] = np.bincount(centre_node, quadratic_terms[:, k] * height, num_nodes)
         for j in range(_NUM_COEFFICIENTS):
-            matrix[:, k, j] = np.bincount(centre_node, terms[:, k] * terms[:, j], num_nodes)
+            matrix[:, k, j] = np.bincount(centre_node, quadratic_terms[:, k] * quadratic_terms[:, j], num_nodes)
     eigenvalues = np.linalg.eigvalsh(matrix)
     is_determined = eigenvalues[:, 0] > _MIN_EIGENVALUE_RATIO * eigenvalues[:, -1]
     matrix[~is_determined] = np.eye(_NUM_COEFFICIENTS)
-    slopes = np.linalg.solve(matrix, right_side[..., None])[:, :2, 0]
+    slopes = np.linalg.solve(matrix, right_hand_side[..., None])[:, :2, 0]
     return np.einsum("ni,nij->nj", slopes, axes[:, :2]), is_determined
 
 
@@ -169,12 +169,16 @@ def bend(mesh: Mesh, radius: float, *, axis: str = "y", num_folds: int | None = 
         raise ValueError(f"num_folds: expected a whole number of at least 1, got {describe(num_folds)}.")
     bent_axis = 0 if axis == "y" else 1
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
-    folds = _fold_positions(points[:, bent_axis], points[cells], bent_axis, num_folds)
+    fold_positions = _fold_positions(points[:, bent_axis], points[cells], bent_axis, num_folds)
     edges = {name: np.asarray(mesh.facets)[np.asarray(facet_indices)] for name, facet_indices in mesh.tags.items()}
-    for line in folds[1:-1]:
+    for line in fold_positions[1:-1]:
         points, cells, edges = _cut_cells(points, cells, edges, points[:, bent_axis] - line)
-    horizontal, vertical = _roll_coordinates(points[:, bent_axis], folds, float(radius))
-    columns = [horizontal, points[:, 1], vertical] if bent_axis == 0 else [points[:, 0], horizontal, vertical]
+    horizontal_coordinate, vertical_coordinate = _roll_coordinates(points[:, bent_axis], fold_positions, float(radius))
+    columns = (
+        [horizontal_coordinate, points[:, 1], vertical_coordinate]
+        if bent_axis == 0
+        else [points[:, 0], horizontal_coordinate, vertical_coordinate]
+    )
     return Mesh.create(np.stack(columns, axis=1), cells, tags=edges)
 
 
@@ -222,18 +226,20 @@ def _cut_cells(
         if 0 in signs:
             k = signs.index(0)
             a, b, c = corners[k:] + corners[:k]
-            first_new = midpoint_node(b, c)
-            new_cells += [(a, b, first_new), (a, first_new, c)]
+            first_midpoint = midpoint_node(b, c)
+            new_cells += [(a, b, first_midpoint), (a, first_midpoint, c)]
         else:
             k = signs.index(-sum(signs))
             a, b, c = corners[k:] + corners[:k]
-            first_new, second_new = midpoint_node(a, b), midpoint_node(a, c)
-            new_cells.append((a, first_new, second_new))
-            shorter = np.linalg.norm(points[first_new] - points[c]) < np.linalg.norm(points[b] - points[second_new])
+            first_midpoint, second_midpoint = midpoint_node(a, b), midpoint_node(a, c)
+            new_cells.append((a, first_midpoint, second_midpoint))
+            is_first_diagonal_shorter = np.linalg.norm(points[first_midpoint] - points[c]) < np.linalg.norm(
+                points[b] - points[second_midpoint]
+            )
             new_cells += (
-                [(first_new, b, c), (first_new, c, second_new)]
-                if shorter
-                else [(first_new, b, second_new), (b, c, second_new)]
+                [(first_midpoint, b, c), (first_midpoint, c, second_midpoint)]
+                if is_first_diagonal_shorter
+                else [(first_midpoint, b, second_midpoint), (b, c, second_midpoint)]
             )
     named_edges = {}
     for name, edge_ends in edges.items():
@@ -245,27 +251,29 @@ def _cut_cells(
     return points, np.concatenate([cells[~is_crossed], np.array(new_cells)]), named_edges
 
 
-def _roll_coordinates(positions: np.ndarray, folds: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Horizontal and vertical coordinates of positions (n,) on the sheet after bending. The `folds` lie on a circle;
-    the middle of the sheet stays at 0."""
-    sheet_centre = (folds[0] + folds[-1]) / 2
+def _roll_coordinates(
+    positions: np.ndarray, fold_positions: np.ndarray, radius: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Horizontal and vertical coordinates of positions (n,) on the sheet after bending. The `fold_positions` lie on a
+    circle; the middle of the sheet stays at 0."""
+    sheet_centre = (fold_positions[0] + fold_positions[-1]) / 2
     if np.isinf(radius):
         return positions - sheet_centre, np.zeros_like(positions)
-    strip_widths = np.diff(folds)
+    strip_widths = np.diff(fold_positions)
     size = abs(radius)
     too_wide = strip_widths.max() > 2 * size
     fold_angles = 2 * np.arcsin(np.minimum(strip_widths / (2 * size), 1))
     if too_wide or fold_angles.sum() >= 2 * np.pi:
-        width = folds[-1] - folds[0]
+        width = fold_positions[-1] - fold_positions[0]
         raise ValueError(
             f"radius: a sheet {width:.4g} m wide would overlap itself on a cylinder of radius {size:.4g} m. It needs "
             f"more than {width / (2 * np.pi):.4g} m, and finer cells where these are large; a closed sleeve is a "
             "jeit.mesh.tube."
         )
     angle = np.concatenate([[0.0], np.cumsum(fold_angles)])
-    angle -= np.interp(sheet_centre, folds, angle)
+    angle -= np.interp(sheet_centre, fold_positions, angle)
     horizontal, vertical = size * np.sin(angle), size * (np.cos(angle) - 1) * np.sign(radius)
-    return np.interp(positions, folds, horizontal), np.interp(positions, folds, vertical)
+    return np.interp(positions, fold_positions, horizontal), np.interp(positions, fold_positions, vertical)
 
 
 _SHELL_TAGS = ("inner", "outer", "side")

@@ -17,10 +17,10 @@ from jeit.mesh.outline.domain import check_length
 from jeit.mesh.solids import disk
 
 # Height of a row of equilateral triangles, divided by their edge.
-_ROW_HEIGHT = np.sqrt(3) / 2
-_MIN_AROUND = 6
+_RELATIVE_ROW_HEIGHT = np.sqrt(3) / 2
+_MIN_NODES_AROUND_SLEEVE = 6
 # Number of points on an ellipse for computing its arc length.
-_ELLIPSE_SAMPLES = 4096
+_NUM_ELLIPSE_SAMPLES = 4096
 
 
 def tube(
@@ -86,9 +86,9 @@ def forearm(
     """
     length = check_length("length", length)
     ends = np.stack([_semi_axes("wrist", wrist), _semi_axes("elbow", elbow)])
-    girth = float(np.mean([_arc_lengths(*end)[-1] for end in ends]))
-    slant = float(np.hypot(length, np.abs(ends[1] - ends[0]).mean()))
-    num_per_ring, rows = _node_counts(girth, slant, num_points, cell_size, num_around)
+    mean_girth = float(np.mean([_arc_lengths(*end)[-1] for end in ends]))
+    slant_length = float(np.hypot(length, np.abs(ends[1] - ends[0]).mean()))
+    num_per_ring, rows = _node_counts(mean_girth, slant_length, num_points, cell_size, num_around)
     fractions = np.linspace(0, 1, rows + 1)[:, None]
     return _sleeve_mesh(length, (1 - fractions) * ends[0] + fractions * ends[1], num_per_ring)
 
@@ -110,27 +110,27 @@ def _node_counts(
     if num_around is not None:
         if num_points is not None or cell_size is not None:
             raise ValueError("num_around: give it, num_points or cell_size, not two of them.")
-        num_per_ring = unstructured.check_count("num_around", num_around, _MIN_AROUND)
-        return num_per_ring, max(1, round(height / (_ROW_HEIGHT * girth / num_per_ring)))
-    target = unstructured.Target.create(num_points, cell_size)
+        num_per_ring = unstructured.check_count("num_around", num_around, _MIN_NODES_AROUND_SLEEVE)
+        return num_per_ring, max(1, round(height / (_RELATIVE_ROW_HEIGHT * girth / num_per_ring)))
+    target = unstructured.MeshTarget.create(num_points, cell_size)
     if target.cell_size is None:
         # Number of nodes n = (g / h) (H / (0.87 h) + 1), with the girth g, the height H and the edge length h.
         num_nodes = target.num_points
-        edge = np.sqrt(girth * height / (_ROW_HEIGHT * num_nodes))
+        edge = np.sqrt(girth * height / (_RELATIVE_ROW_HEIGHT * num_nodes))
         for _ in range(30):
-            edge = np.sqrt(girth * (height / _ROW_HEIGHT + edge) / num_nodes)
-        rows = max(1, round(height / (_ROW_HEIGHT * edge)))
-        num_per_ring = max(_MIN_AROUND, round(num_nodes / (rows + 1)))
+            edge = np.sqrt(girth * (height / _RELATIVE_ROW_HEIGHT + edge) / num_nodes)
+        rows = max(1, round(height / (_RELATIVE_ROW_HEIGHT * edge)))
+        num_per_ring = max(_MIN_NODES_AROUND_SLEEVE, round(num_nodes / (rows + 1)))
     else:
-        num_per_ring = max(_MIN_AROUND, round(girth / target.cell_size))
-        rows = max(1, round(height / (_ROW_HEIGHT * girth / num_per_ring)))
+        num_per_ring = max(_MIN_NODES_AROUND_SLEEVE, round(girth / target.cell_size))
+        rows = max(1, round(height / (_RELATIVE_ROW_HEIGHT * girth / num_per_ring)))
     unstructured.check_total(num_per_ring * (rows + 1), "num_points" if target.cell_size is None else "cell_size")
     return num_per_ring, rows
 
 
 def _arc_lengths(a: float, b: float) -> np.ndarray:
     """Arc length along an ellipse with semi-axes a and b, at evenly spaced values of its angular parameter."""
-    angle = np.linspace(0, 2 * np.pi, _ELLIPSE_SAMPLES + 1)
+    angle = np.linspace(0, 2 * np.pi, _NUM_ELLIPSE_SAMPLES + 1)
     corners = np.stack([a * np.cos(angle), b * np.sin(angle)], axis=1)
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
 
@@ -143,7 +143,7 @@ def _sleeve_mesh(height: float, semi_axes: np.ndarray, num_per_ring: int) -> Mes
         angle = 2 * np.pi * relative_angles
         if a != b:
             length = _arc_lengths(a, b)
-            angle = np.interp(relative_angles * length[-1], length, np.linspace(0, 2 * np.pi, _ELLIPSE_SAMPLES + 1))
+            angle = np.interp(relative_angles * length[-1], length, np.linspace(0, 2 * np.pi, _NUM_ELLIPSE_SAMPLES + 1))
         rings.append(np.stack([a * np.cos(angle), b * np.sin(angle), np.full(num_per_ring, height * row)], axis=1))
     points = np.concatenate(rings)
     points[:, 2] /= len(semi_axes) - 1
@@ -192,7 +192,7 @@ def sphere(radius: float, *, num_points: int | None = None, cell_size: float | N
     ```
     """
     radius = check_length("radius", radius)
-    target = unstructured.Target.create(num_points, cell_size)
+    target = unstructured.MeshTarget.create(num_points, cell_size)
     if target.cell_size is None:
         num_divisions = max(1, round(np.sqrt((target.num_points - 2) / 10)))
     else:
@@ -200,7 +200,7 @@ def sphere(radius: float, *, num_points: int | None = None, cell_size: float | N
         num_divisions = max(1, round(np.sqrt(4 * np.pi / 20 / (np.sqrt(3) / 4)) * radius / target.cell_size))
     unstructured.check_total(10 * num_divisions**2 + 2, "cell_size")
     corners = _icosahedron()
-    faces = corners[ConvexHull(corners).simplices]
+    face_nodes = corners[ConvexHull(corners).simplices]
     i, j = np.meshgrid(np.arange(num_divisions + 1), np.arange(num_divisions + 1), indexing="ij")
     is_inside = i + j <= num_divisions
     weights = np.stack([num_divisions - i - j, i, j], axis=-1)[is_inside] / num_divisions
@@ -210,8 +210,8 @@ def sphere(radius: float, *, num_points: int | None = None, cell_size: float | N
     downward_triangles = np.stack([node_index[1:, 1:], node_index[:-1, 1:], node_index[1:, :-1]], axis=-1)
     face_cells = np.concatenate([upward_triangles.reshape(-1, 3), downward_triangles.reshape(-1, 3)])
     face_cells = face_cells[(face_cells >= 0).all(axis=1)]
-    points = np.concatenate([weights @ face for face in faces])
-    cells = np.concatenate([face_cells + k * len(weights) for k in range(len(faces))])
+    points = np.concatenate([weights @ face for face in face_nodes])
+    cells = np.concatenate([face_cells + k * len(weights) for k in range(len(face_nodes))])
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     # Nodes on the edges of the icosahedron were created once for each of the two faces.
     points, cells = merge_points(points, cells, 1e-6 / num_divisions)
@@ -267,6 +267,6 @@ def _orient_outward(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
 
 def _icosahedron() -> np.ndarray:
     """Corners of an icosahedron (12, 3)."""
-    golden = (1 + np.sqrt(5)) / 2
-    plane = np.array([[0, a, b * golden] for a in (1, -1) for b in (1, -1)])
-    return np.concatenate([np.roll(plane, k, axis=1) for k in range(3)]) / np.hypot(1, golden)
+    golden_ratio = (1 + np.sqrt(5)) / 2
+    plane = np.array([[0, a, b * golden_ratio] for a in (1, -1) for b in (1, -1)])
+    return np.concatenate([np.roll(plane, k, axis=1) for k in range(3)]) / np.hypot(1, golden_ratio)

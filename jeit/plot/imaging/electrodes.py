@@ -19,7 +19,7 @@ from jeit.image import Inclusion
 from jeit.image.rasters import CONDUCTIVE, RESISTIVE
 from jeit.inverse.shapes import Star
 from jeit.mesh import Mesh
-from jeit.plot.axes import axes_or_new
+from jeit.plot.axes import get_or_create_axes
 from jeit.plot.colours import DARK_GREY
 
 _STYLES = ((-1, RESISTIVE, "dashed", "resistive"), (1, CONDUCTIVE, "solid", "conductive"))
@@ -34,7 +34,7 @@ def draw_labels(labels: ArrayLike, extent: tuple[float, float, float, float], *,
     pixels = np.asarray(labels)
     if pixels.ndim != 2:
         raise ValueError(f"labels has shape {pixels.shape}; give (rows, columns).")
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     rows, columns = pixels.shape
     x_min, x_max, y_min, y_max = extent
     x = x_min + (np.arange(columns) + 0.5) * (x_max - x_min) / columns
@@ -47,16 +47,16 @@ def draw_labels(labels: ArrayLike, extent: tuple[float, float, float, float], *,
     return ax
 
 
-def draw_outlines(stars: Sequence[Star], *, ax: Axes | None = None) -> Axes:
+def draw_outlines(star_bodies: Sequence[Star], *, ax: Axes | None = None) -> Axes:
     """Draw the outlines of bodies in a sheet, see `jeit.inverse.shapes`, on axes in metres; outlines of resistive
     bodies are dashed. Beside each body the 68 % interval of its change of conductivity is written, if the interval is
     known."""
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     for sign, _, style, name in _STYLES:
-        for index, star in enumerate(star for star in stars if star.sign == sign):
+        for index, star in enumerate(star for star in star_bodies if star.sign == sign):
             closed_outline = np.concatenate([star.outline, star.outline[:1]])
             ax.plot(*closed_outline.T, color=DARK_GREY, linewidth=1.4, linestyle=style, label=None if index else name)
-    _label_intervals(ax, [star for star in stars if star.quantities is not None])
+    _label_intervals(ax, [star for star in star_bodies if star.quantities is not None])
     return ax
 
 
@@ -70,7 +70,8 @@ def _label_intervals(ax: Axes, bodies: Sequence[Star]) -> None:
         positions = [(body.centroid[0], side * (side * body.outline[:, 1]).max()) for side in sides]
         is_free = [
             all(
-                (np.abs(np.subtract(position, used_position)) > min_distances).any() for used_position in used_positions
+                (np.abs(np.subtract(position, number_position)) > min_distances).any()
+                for number_position in used_positions
             )
             for position in positions
         ]
@@ -94,7 +95,7 @@ def _label_intervals(ax: Axes, bodies: Sequence[Star]) -> None:
 def draw_inclusions(inclusions: Sequence[Inclusion], *, ax: Axes | None = None) -> Axes:
     """Mark every inclusion by a plus or minus sign at its centroid and a dashed circle of equal area. In 3-D, the
     circle has the radius of a ball of the inclusion's volume, for every height of the slice."""
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     halo = [withStroke(linewidth=3, foreground="white")]
     for inclusion in inclusions:
         x, y = inclusion.centroid[:2]
@@ -114,7 +115,7 @@ def draw_inclusions(inclusions: Sequence[Inclusion], *, ax: Axes | None = None) 
     return ax
 
 
-METAL = "#b8860b"
+ELECTRODE_COLOUR = "#b8860b"
 
 
 def draw_electrodes(
@@ -126,17 +127,19 @@ def draw_electrodes(
     outline for electrodes on the edge of a 2-D mesh, inside discs, and beside dots. Raises `ValueError` for electrodes
     without known places.
     """
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     pen = _MatplotlibPen()
     electrodes.draw(mesh, pen)
     if pen.boundary_segments:
-        ax.add_collection(LineCollection(pen.boundary_segments, colors=METAL, linewidths=5, capstyle="butt", zorder=3))
+        ax.add_collection(
+            LineCollection(pen.boundary_segments, colors=ELECTRODE_COLOUR, linewidths=5, capstyle="butt", zorder=3)
+        )
     if pen.shapes:
-        shapes = PatchCollection(pen.shapes, facecolor="none", edgecolor=METAL, linewidth=1.6, zorder=3)
+        shapes = PatchCollection(pen.shapes, facecolor="none", edgecolor=ELECTRODE_COLOUR, linewidth=1.6, zorder=3)
         ax.add_collection(shapes)
     if pen.dots:
         x, y = np.array(pen.dots).T
-        ax.scatter(x, y, s=28, color=METAL, zorder=3)
+        ax.scatter(x, y, s=28, color=ELECTRODE_COLOUR, zorder=3)
     if numbers:
         draw_numbers(ax, mesh, np.array(pen.number_positions), np.array(pen.is_beside), first)
     return ax
@@ -147,11 +150,11 @@ def draw_shapes(mesh: Mesh, shapes: ElectrodeShapes, *, ax: Axes) -> None:
     along the edge, and polygons of one corner dots."""
     for corners in shapes.polygons():
         if len(corners) == 2:
-            ax.plot(*corners.T, color=METAL, linewidth=5, solid_capstyle="butt", zorder=3)
+            ax.plot(*corners.T, color=ELECTRODE_COLOUR, linewidth=5, solid_capstyle="butt", zorder=3)
         elif len(corners) == 1:
-            ax.scatter(*corners[0], s=28, color=METAL, zorder=3)
+            ax.scatter(*corners[0], s=28, color=ELECTRODE_COLOUR, zorder=3)
         else:
-            ax.add_patch(Polygon(corners, facecolor="none", edgecolor=METAL, linewidth=1.6, zorder=3))
+            ax.add_patch(Polygon(corners, facecolor="none", edgecolor=ELECTRODE_COLOUR, linewidth=1.6, zorder=3))
     first_indices = np.unique(shapes.electrode, return_index=True)[1]
     draw_numbers(ax, mesh, shapes.middles(), shapes.sizes[first_indices] < 3, 1)
 
@@ -219,13 +222,14 @@ def draw_numbers(
     white_rim = [withStroke(linewidth=2, foreground="white")]
     for group in group_coincident(positions, 0.1 * number_distance):
         k = group[0]
-        effects = white_rim if is_inside[k] or not is_beside[k] else None  # a white rim where the text is on the image
+        # A white rim where the text is on the image.
+        text_effects = white_rim if is_inside[k] or not is_beside[k] else None
         style = {"ha": "center", "va": "center", "fontsize": fontsize, "color": DARK_GREY, "zorder": 4}
         text = ", ".join(str(k + first_number) for k in group)
         if len(group) > 1:
             style["ha"] = _alignment(shifts[k])
         x, y = positions[k] + (1.0 if style["ha"] == "center" else _ALIGNED_FACTOR) * shifts[k]
-        ax.text(x, y, text, path_effects=effects, **style)
+        ax.text(x, y, text, path_effects=text_effects, **style)
 
 
 def _alignment(shift: Float[np.ndarray, " 2"]) -> str:
@@ -261,8 +265,8 @@ def _shifts_from_edge(
         if distance.min() > _EDGE_TOLERANCE / _NUMBER_DISTANCE * number_distance:
             continue
         # At a corner two edges are nearest, and the number is placed along the bisector.
-        is_nearest = distance <= distance.min() + 1e-6 * number_distance
-        outward_normal = _normals(start[is_nearest], end[is_nearest]).sum(axis=0)
+        is_nearest_side = distance <= distance.min() + 1e-6 * number_distance
+        outward_normal = _normals(start[is_nearest_side], end[is_nearest_side]).sum(axis=0)
         outward_normal /= max(np.linalg.norm(outward_normal), 1e-12)
         is_inside[k] = (
             _free_distance(position, outward_normal, start, end, 0.01 * number_distance)
@@ -276,8 +280,8 @@ def _shifts_from_centre(corners, positions, number_distance: float) -> Float[np.
     """Shifts (L, 2) of numbers away from the middle of a body; zero for electrodes near the middle."""
     offset = positions - (corners.min(axis=0) + corners.max(axis=0)) / 2
     distance = np.linalg.norm(offset, axis=1, keepdims=True)
-    is_outer = distance > 0.3 * np.ptp(corners, axis=0).max()
-    return np.where(is_outer, number_distance * offset / np.maximum(distance, 1e-12), 0)
+    is_far_from_centre = distance > 0.3 * np.ptp(corners, axis=0).max()
+    return np.where(is_far_from_centre, number_distance * offset / np.maximum(distance, 1e-12), 0)
 
 
 def _normals(start, end) -> Float[np.ndarray, "b 2"]:

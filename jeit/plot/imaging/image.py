@@ -19,7 +19,7 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import Inclusion, Raster
 from jeit.mesh import Mesh, check_flat, measures
-from jeit.plot.axes import axes_or_new, draw_scale_bar, extent_of, hide_axes
+from jeit.plot.axes import draw_scale_bar, extent_of, get_or_create_axes, hide_axes
 from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, LIGHT_GREY, ColourScale, check_scale
 from jeit.plot.imaging.electrodes import draw_electrodes, draw_inclusions
 
@@ -45,7 +45,7 @@ def plot_mesh(
     ```
     """
     check_body(mesh, electrodes)
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     points = np.asarray(mesh.points)
     triangles = np.asarray(mesh.cells if mesh.dimension == 2 else mesh.facets)
     ax.triplot(points[:, 0], points[:, 1], triangles, color=LIGHT_GREY, linewidth=0.7)
@@ -87,13 +87,13 @@ def draw_slice_outline(
     ax.contour(is_inside, [0.5], extent=padded_extent, origin="upper", colors=DARK_GREY, linewidths=0.9, zorder=2)
 
 
-def slice_text(mesh: Mesh, height: float | None = None, subject_text: str = "slice") -> str:
+def slice_text(mesh: Mesh, height: float | None = None, beginning: str = "slice") -> str:
     """Text for a slice at z = `height` metres (default: half the height), such as "slice at z = 20.0 mm"; empty for a
     plane mesh."""
     if mesh.dimension == 2:
         return ""
     z = np.asarray(mesh.points)[:, 2]
-    return f"{subject_text} at z = {1e3 * ((z.min() + z.max()) / 2 if height is None else height):.1f} mm"
+    return f"{beginning} at z = {1e3 * ((z.min() + z.max()) / 2 if height is None else height):.1f} mm"
 
 
 def plot_image(
@@ -140,7 +140,7 @@ def plot_image(
         )
     if np.iscomplexobj(image):
         raise ValueError("values are complex; draw their real or imaginary part.")
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     if mesh.dimension == 3:
         cell_image = image if image.shape == (mesh.num_cells,) else image[np.asarray(mesh.cells)].mean(axis=1)
         raster = Raster.create(mesh, height=height)
@@ -193,7 +193,7 @@ def plot_raster(
     if electrodes is not None and mesh is None:
         raise ValueError("electrodes are drawn along the boundary of a mesh: give mesh, the one the raster is of.")
     fitted_scale = scale.of(finite_values, "S")
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     mappable = ax.imshow(fitted_scale.factor * pixels, extent=extent, interpolation="nearest", **fitted_scale.keywords)
     _finish_axes(ax, mesh, electrodes, inclusions, extent, title)
     fitted_scale.draw_bar(ax, mappable)
@@ -283,11 +283,11 @@ def plot_sensitivity(
     density = np.linalg.norm(jacobian, axis=0) / np.asarray(measures(model.mesh))
     decibels = 20 * np.log10(np.maximum(density / density.max(), 1e-12))
     # The field is singular at the ends of electrodes, so 0 dB is set to the value exceeded in 1 % of the cells.
-    ceiling = np.quantile(decibels, 0.99)
+    upper_limit = np.quantile(decibels, 0.99)
     quantity = "Sensitivity per area (dB)" if model.mesh.dimension == 2 else "Sensitivity per volume (dB)"
     return plot_image(
         model.mesh,
-        np.minimum(decibels, ceiling) - ceiling,
+        np.minimum(decibels, upper_limit) - upper_limit,
         model.electrodes,
         scale=ColourScale(difference=False, quantity=quantity, unit="", limit=0.0, colour_map="magma"),
         title=title,

@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind
 from jeit.image.rasters import FiguresOfMerit
 from jeit.inverse.hyperparameter.choice import Choice
-from jeit.plot.axes import axes_or_new, draw_horizontal_grid, soften_axes
+from jeit.plot.axes import draw_horizontal_grid, get_or_create_axes, style_graph_axes
 from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SERIES_COLOURS, SERIES_MARKERS, choose_si_prefix
 from jeit.protocol import Protocol
 
 # Colour of each rule for λ; other rules, and values of λ specified as numbers, are drawn in the colour `DARK_GREY`.
-COLOURS = {
+RULE_COLOURS = {
     "gcv": "#d1495b",
     "l-curve": "#1f6fb4",
     "discrepancy": "#c9820a",
@@ -65,13 +65,13 @@ def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = N
     plot_choice(compare_rules(model, 1.0, difference=change, noise=1e-6))
     ```
     """
-    all_choices = list(choices.values()) if isinstance(choices, Mapping) else [choices]
-    for item in all_choices:
-        check_kind("choices", item, Choice, "a Choice, or several, {name: choice}, as of compare_rules")
+    choices_of_all_rules = list(choices.values()) if isinstance(choices, Mapping) else [choices]
+    for choice_of_rule in choices_of_all_rules:
+        check_kind("choices", choice_of_rule, Choice, "a Choice, or several, {name: choice}, as of compare_rules")
     if isinstance(choices, Choice):
         if choices.criterion.size == 0:
             raise ValueError("choices: a hyperparameter that was given has no curve; draw one that a rule chose.")
-        ax = axes_or_new(ax, (5.6, 4.2))
+        ax = get_or_create_axes(ax, (5.6, 4.2))
         if choices.rule == "l-curve":
             _draw_l_curve(ax, choices, [choices])
             ax.set_title(title or "", loc="left")
@@ -80,10 +80,10 @@ def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = N
             ax.set_title(title or _choice_title(choices), color=_rule_colour(choices), fontsize=11, loc="left")
             ax.set_xlabel("Hyperparameter λ")
         return ax
-    rules = [choice for choice in all_choices if choice.criterion.size]
+    rules = [choice for choice in choices_of_all_rules if choice.criterion.size]
     if not rules:
         raise ValueError("choices: there is no choice of a rule among them, so there is no curve to draw.")
-    ax = axes_or_new(ax, (9.6, 5.4))
+    ax = get_or_create_axes(ax, (9.6, 5.4))
     ax.set_axis_off()
     ax.set_title(title or "", loc="left")
     rules_with_data = [choice for choice in rules if choice.residual.size]
@@ -91,14 +91,14 @@ def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = N
     if rules_with_data:
         left_edge = 0.54
         # Every choice contains the whole L-curve; the choice with the most candidates has the finest L-curve.
-        most_detailed = max(rules_with_data, key=lambda choice: choice.candidates.size)
-        _draw_l_curve(ax.inset_axes((0, 0, 0.46, 1)), most_detailed, all_choices)
+        most_detailed_choice = max(rules_with_data, key=lambda choice: choice.candidates.size)
+        _draw_l_curve(ax.inset_axes((0, 0, 0.46, 1)), most_detailed_choice, choices_of_all_rules)
     height = 1 / len(rules)
     panel = None
     for row, choice in enumerate(rules):
         panel_bounds = (left_edge, 1 - (row + 1) * height, 1 - left_edge, (0.62 if len(rules) > 1 else 0.95) * height)
         panel = ax.inset_axes(panel_bounds, sharex=panel)
-        for other_choice in all_choices:
+        for other_choice in choices_of_all_rules:
             panel.axvline(
                 float(other_choice.hyperparameter),
                 color=_rule_colour(other_choice),
@@ -106,7 +106,7 @@ def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = N
                 alpha=0.45,
                 zorder=0,
             )
-        _draw_criterion(panel, choice, is_small=len(rules) > 1)
+        _draw_criterion(panel, choice, is_small_panel=len(rules) > 1)
         panel.tick_params(labelbottom=row == len(rules) - 1)
     if panel is not None:
         panel.set_xlabel("Hyperparameter λ")
@@ -150,7 +150,7 @@ def _draw_l_curve(ax: Axes, curve: Choice, choices: list[Choice]) -> None:
     _style_axes(ax)
 
 
-def _draw_criterion(ax: Axes, choice: Choice, *, is_small: bool = False) -> None:
+def _draw_criterion(ax: Axes, choice: Choice, *, is_small_panel: bool = False) -> None:
     label, scale, aim_text = _CRITERIA.get(choice.rule, ("criterion", "linear", ""))
     value = float(choice.hyperparameter)
     ax.set_xscale("log")
@@ -159,16 +159,20 @@ def _draw_criterion(ax: Axes, choice: Choice, *, is_small: bool = False) -> None
     if choice.target is not None:
         ax.axhline(choice.target, color=DARK_GREY, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
     ax.plot(
-        value, choice.read(choice.criterion), clip_on=False, zorder=3, **_marker_style(choice, 6 if is_small else 8)
+        value,
+        choice.read(choice.criterion),
+        clip_on=False,
+        zorder=3,
+        **_marker_style(choice, 6 if is_small_panel else 8),
     )
     text = f"{label}, {aim_text}" if aim_text else label
-    if is_small:
+    if is_small_panel:
         ax.set_title(f"{choice.rule}: {text}", fontsize=8.5, loc="left", pad=3, color=_rule_colour(choice))
         ax.tick_params(labelsize=7.5)
     else:
         ax.axvline(value, color=_rule_colour(choice), linewidth=0.6, alpha=0.45, zorder=0)
         ax.set_ylabel(text[0].upper() + text[1:])
-    _style_axes(ax, ticks=3 if is_small else 6)
+    _style_axes(ax, ticks=3 if is_small_panel else 6)
 
 
 def _marker_style(choice: Choice, size: float) -> dict:
@@ -184,11 +188,11 @@ def _choice_title(choice: Choice) -> str:
 
 
 def _rule_colour(choice: Choice) -> str:
-    return COLOURS.get(choice.rule, DARK_GREY)
+    return RULE_COLOURS.get(choice.rule, DARK_GREY)
 
 
 def _style_axes(ax: Axes, ticks: int = 6) -> None:
-    soften_axes(ax)
+    style_graph_axes(ax)
     for axis, max_ticks in ((ax.xaxis, 8), (ax.yaxis, ticks)):
         if axis.get_scale() == "log":
             axis.set_major_locator(LogLocator(numticks=max_ticks))
@@ -245,7 +249,7 @@ def plot_figures_of_merit(
     for name, merit in figures.items():
         if not isinstance(merit, FiguresOfMerit) or np.ndim(merit.distance) != 1:
             raise ValueError(f"figures['{name}'] must be what figures_of_merit gives for many targets (T,).")
-    ax = axes_or_new(ax, (10.6, 5.6))
+    ax = get_or_create_axes(ax, (10.6, 5.6))
     ax.set_axis_off()
     ax.set_title(title or "")
     max_radius = max(1e3 * float(np.max(merit.body_radius)) for merit in figures.values())
@@ -282,7 +286,7 @@ def _style_panel(panel: Axes, heading: str, unit: str, max_distance: float) -> N
     panel.set_xlim(0, max_distance)
     lower_limit, upper_limit = panel.get_ylim()
     panel.set_ylim(min(lower_limit, 0), upper_limit)  # from zero, so that small variations look small
-    soften_axes(panel)
+    style_graph_axes(panel)
     panel.tick_params(length=3, labelsize=9)
     draw_horizontal_grid(panel)
 
@@ -318,7 +322,7 @@ def plot_voltages(
     rms_voltage = np.sqrt(np.mean(measured[is_drawn] ** 2))
     factor, unit = choose_si_prefix(float(np.abs(measured[is_drawn]).max()), "V")
     misfit = np.linalg.norm((modelled - measured)[is_drawn]) / np.linalg.norm(measured[is_drawn])
-    ax = axes_or_new(ax, (8.4, 5.0))
+    ax = get_or_create_axes(ax, (8.4, 5.0))
     ax.set_axis_off()
     voltage_axes = ax.inset_axes((0, 0.42, 1, 0.58))
     difference_axes = ax.inset_axes((0, 0, 1, 0.36), sharex=voltage_axes)

@@ -34,12 +34,12 @@ from jeit_solvers.engines import as_array
 
 # Number of pixels along a side of an image, and colour of a body without an image.
 _NUM_PIXELS, _BODY_COLOUR = 160, "#dfe2e6"
-SHEET_FRAMES = 12
+NUM_CONTACT_SHEET_FRAMES = 12
 """Default maximum number of frames on a contact sheet."""
 SERIES_FRAMES, _FRAMES_PER_ROW = 12, 6
 """Number of frames at the beginning of the picture of a series."""
 # Maximum number of refused frames named below a contact sheet.
-_MAX_NAMED = 6
+_MAX_NAMED_FRAMES = 6
 
 
 class FrameCount(NamedTuple):
@@ -125,7 +125,7 @@ def plot_frames(
     *,
     titles: Sequence[str] | None = None,
     scale: ColourScale = CHANGE_SCALE,
-    most: int = SHEET_FRAMES,
+    most: int = NUM_CONTACT_SHEET_FRAMES,
     count: FrameCount | None = None,
 ) -> Figure:
     """Draw a contact sheet of a stream: evenly spaced frames with titles and one colour scale.
@@ -184,14 +184,14 @@ def _count_text(count: FrameCount, num_drawn: int, mesh: Mesh) -> str:
     """Text about the number of frames drawn and about the refused frames of a stream."""
     sentences = [] if num_drawn == count.number else [f"{num_drawn} of {count.number} frames"]
     if count.refused:
-        names = ", ".join(count.names[:_MAX_NAMED]) + (" …" if count.refused > _MAX_NAMED else "")
+        names = ", ".join(count.names[:_MAX_NAMED_FRAMES]) + (" …" if count.refused > _MAX_NAMED_FRAMES else "")
         sentences.append(f"{count.refused} of {count.number} refused: {names}")
-    return "; ".join([*sentences, *filter(None, [slice_text(mesh, subject_text="slices")])])
+    return "; ".join([*sentences, *filter(None, [slice_text(mesh, beginning="slices")])])
 
 
 # Minimum amplitude at which the phase is drawn: as a share of the maximum amplitude, and as a multiple of the noise of
 # the amplitude.
-_MIN_PHASE_SHARE, _MIN_PHASE_SNR = 0.15, 3.0
+_MIN_RELATIVE_AMPLITUDE_OF_PHASE, _MIN_SIGNAL_TO_NOISE_OF_PHASE = 0.15, 3.0
 # Minimum number of frames for a spectrum, as for `jeit.image.oscillation`.
 _MIN_FRAMES = 5
 
@@ -229,8 +229,8 @@ def plot_series(
         amplitude_scale = ColourScale(difference=False, quantity=f"Amplitude at {oscillation.frequency:.3g} Hz")
         title = f"{oscillation.frequency:.4g} Hz (resolution {oscillation.resolution:.2g} Hz)"
         maps.draw_map(maps_figure.add_subplot(grid[row, 1]), oscillation.amplitude, amplitude_scale, title)
-        has_phase = (oscillation.amplitude > _MIN_PHASE_SHARE * oscillation.amplitude.max()) & (
-            oscillation.amplitude > _MIN_PHASE_SNR * oscillation.noise
+        has_phase = (oscillation.amplitude > _MIN_RELATIVE_AMPLITUDE_OF_PHASE * oscillation.amplitude.max()) & (
+            oscillation.amplitude > _MIN_SIGNAL_TO_NOISE_OF_PHASE * oscillation.noise
         )
         maps.draw_phase(
             maps_figure.add_subplot(grid[row, 2]), np.where(has_phase, np.degrees(oscillation.phase), np.nan)

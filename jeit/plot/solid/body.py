@@ -12,12 +12,12 @@ from matplotlib.colors import to_rgba
 from jeit.electrodes.electrode_shapes import ElectrodeShapes, ProjectionSurface, surface_triangles
 from jeit.mesh import Mesh
 from jeit.plot.colours import LIGHT_GREY
-from jeit.plot.imaging.electrodes import METAL, group_coincident
-from jeit.plot.solid.scene import BODY, Scene, draw_number
+from jeit.plot.imaging.electrodes import ELECTRODE_COLOUR, group_coincident
+from jeit.plot.solid.scene import BODY_COLOUR, Scene, draw_number
 
 _HULL_OPACITY = 0.1
 # Cosine of the angle between the normals of two facets, below which their common edge is drawn as an edge of the body.
-_EDGE_COSINE = 0.85
+_MAX_EDGE_COSINE = 0.85
 # Distance by which electrodes are drawn nearer to the viewer than the surface under them, and distance of numbers from
 # electrodes, both divided by the size of the body.
 _ELECTRODE_OFFSET, _NUMBER_DISTANCE = 0.06, 0.045
@@ -36,7 +36,7 @@ def longest_side(mesh: Mesh) -> float:
 def add_hull(scene: Scene, mesh: Mesh) -> None:
     """Add the translucent boundary of a solid to a scene, with its edges and its outline."""
     points, triangles = np.asarray(mesh.points), surface_triangles(mesh)
-    scene.add_triangles(points, triangles, np.array(to_rgba(BODY, _HULL_OPACITY)), smooth=True, is_lit=False)
+    scene.add_triangles(points, triangles, np.array(to_rgba(BODY_COLOUR, _HULL_OPACITY)), smooth=True, is_lit=False)
     scene.add_lines(points[visible_edges(points, triangles, scene.camera.toward)], LIGHT_GREY, 0.9)
 
 
@@ -56,7 +56,7 @@ def visible_edges(points, triangles, view_direction: Float[np.ndarray, "3"]) -> 
     # Facets parallel to the line of sight, within rounding errors, face neither to the viewer nor away.
     facing_cosines = np.stack([first_normals @ view_direction, second_normals @ view_direction])
     facing_cosines = np.where(np.abs(facing_cosines) < 1e-9, 0, facing_cosines)
-    is_drawn = (np.sum(first_normals * second_normals, axis=1) < _EDGE_COSINE) | (
+    is_drawn = (np.sum(first_normals * second_normals, axis=1) < _MAX_EDGE_COSINE) | (
         (facing_cosines > 0).any(axis=0) & (facing_cosines <= 0).any(axis=0)
     )
     is_boundary = np.ones(len(edges), bool)
@@ -75,16 +75,16 @@ def add_electrodes(
     surface, size = ProjectionSurface(points, triangles), float(np.ptp(points, axis=0).max())
     polygons = shapes.polygons()
     normals = surface.normals(np.array([corners.mean(axis=0) for corners in polygons]))
-    rims = _rims(polygons, shapes.electrode, 1e-6 * size)
+    electrode_rims = _rims(polygons, shapes.electrode, 1e-6 * size)
     front_polygons = [
         polygon for polygon, normal in zip(polygons, normals, strict=True) if normal @ scene.camera.toward > 0
     ]
-    hides_body = (
+    is_in_front_of_body = (
         translucent_in_front
         and sum(_visible_area(scene, polygon) for polygon in front_polygons)
         > _MAX_COVERED_SHARE * _visible_area(scene, points[triangles]) / 2
     )
-    for corners, normal, rim in zip(polygons, normals, rims, strict=True):
+    for corners, normal, rim in zip(polygons, normals, electrode_rims, strict=True):
         if len(corners) == 1:
             angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
             _, first_axis, second_axis = surface.frames(corners)[0]
@@ -93,7 +93,7 @@ def add_electrodes(
             )
             rim = np.ones(12, bool)
         facing_sign = float(np.sign(normal @ scene.camera.toward))
-        colour = to_rgba(METAL, _TRANSLUCENT_OPACITY if hides_body and facing_sign > 0 else 1.0)
+        colour = to_rgba(ELECTRODE_COLOUR, _TRANSLUCENT_OPACITY if is_in_front_of_body and facing_sign > 0 else 1.0)
         scene.add_polygon(corners, colour, depth_offset=_ELECTRODE_OFFSET * size * facing_sign, rim=rim)
 
 
@@ -128,12 +128,15 @@ def number_electrodes(
     normals = ProjectionSurface(points, triangles).normals(centres)
     positions = scene.camera.on_page(centres + _NUMBER_DISTANCE * float(np.ptp(points, axis=0).max()) * normals)
     fontsize = 8 if len(positions) <= 20 else 6.5
-    is_faint = normals @ scene.camera.toward < -0.05
-    front_positions, min_distance = positions[~is_faint], _MIN_NUMBER_DISTANCE * float(np.ptp(points, axis=0).max())
-    horizontal = scene.camera.on_page(points)[:, 0]
-    left_limit, right_limit = horizontal.min() + min_distance, horizontal.max() - min_distance
+    is_on_far_side = normals @ scene.camera.toward < -0.05
+    front_positions, min_distance = (
+        positions[~is_on_far_side],
+        _MIN_NUMBER_DISTANCE * float(np.ptp(points, axis=0).max()),
+    )
+    horizontal_position = scene.camera.on_page(points)[:, 0]
+    left_limit, right_limit = horizontal_position.min() + min_distance, horizontal_position.max() - min_distance
     for draws_faint in (False, True) if number_hidden else (False,):
-        electrode_indices = np.flatnonzero(is_faint == draws_faint)
+        electrode_indices = np.flatnonzero(is_on_far_side == draws_faint)
         for group in group_coincident(positions[electrode_indices], min_distance):
             position = positions[electrode_indices[group]].mean(axis=0)
             # Numbers of electrodes behind the body are left out where they would overlap a number in front.

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jeit.arguments.extras import how_to_install, optional
+from jeit.arguments.extras import import_optional, installation_command
 from jeit.electrodes import AbstractElectrodes, ElectrodeShapes, shapes_of
 from jeit.image import Inclusion
 from jeit.mesh import Mesh
 from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, ColourScale
-from jeit.plot.imaging.electrodes import METAL
+from jeit.plot.imaging.electrodes import ELECTRODE_COLOUR
 from jeit.plot.solid.isosurfaces import DEFAULT_LEVELS, OUTER_OPACITY, check_drawn, level_surfaces
-from jeit.plot.solid.scene import BODY
+from jeit.plot.solid.scene import BODY_COLOUR
 from jeit.plot.solid.slices import cell_values
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def view_solid(
     """
     check_drawn(mesh, electrodes, scale)
     surfaces = level_surfaces(mesh, values, levels, is_signed=scale.difference)
-    pv: Any = optional("pyvista", "the interactive view", "Pictures without it: jeit.plot.plot_solid.")
+    pv: Any = import_optional("pyvista", "the interactive view", "Pictures without it: jeit.plot.plot_solid.")
     fitted_scale = scale.of(np.asarray(values), "S/m")
     colour_options: dict[str, Any] = {
         "cmap": fitted_scale.keywords["cmap"],
@@ -72,22 +72,22 @@ def view_solid(
         # disappear.
         plotter.enable_depth_peeling()
     surface_mesh = pv.PolyData.from_regular_faces(points, np.asarray(mesh.facets))
-    plotter.add_mesh(surface_mesh, color=BODY, opacity=0.12, name="hull")
+    plotter.add_mesh(surface_mesh, color=BODY_COLOUR, opacity=0.12, name="hull")
     plotter.add_mesh(surface_mesh.extract_feature_edges(30), color=DARK_GREY, line_width=1.5, name="edges")
     for k, (value, level, surface) in enumerate(surfaces):
         if not len(surface.triangles):
             continue
-        shell = pv.PolyData.from_regular_faces(1e3 * surface.points, surface.triangles)
-        shell["value"] = np.full(shell.n_points, fitted_scale.factor * value)
+        body_shell = pv.PolyData.from_regular_faces(1e3 * surface.points, surface.triangles)
+        body_shell["value"] = np.full(body_shell.n_points, fitted_scale.factor * value)
         opacity = 1.0 if level == max(levels) else OUTER_OPACITY
         options = {"smooth_shading": True, "show_scalar_bar": False, "name": f"isosurface {k}"}
-        plotter.add_mesh(shell, scalars="value", opacity=opacity, **options, **colour_options)
+        plotter.add_mesh(body_shell, scalars="value", opacity=opacity, **options, **colour_options)
     grid = pv.UnstructuredGrid({pv.CellType.TETRA: np.asarray(mesh.cells)}, points)
     grid.cell_data["value"] = fitted_scale.factor * cell_values(mesh, values)
     # The label has two lines, since VTK cuts off text that is wider than the bar.
-    quantity, bracket, unit = fitted_scale.label.rpartition(" (")
+    quantity, unit_text, unit = fitted_scale.label.rpartition(" (")
     bar = {
-        "title": f"{quantity}\n{bracket.strip()}{unit}",
+        "title": f"{quantity}\n{unit_text.strip()}{unit}",
         "color": DARK_GREY,
         "vertical": True,
         "n_labels": 5,
@@ -114,7 +114,7 @@ def view_solid(
 def can_view() -> str:
     """Reason why an interactive view cannot be opened on this machine; empty if it can."""
     if find_spec("pyvista") is None:
-        return f"PyVista is not installed: {how_to_install('view')}"
+        return f"PyVista is not installed: {installation_command('view')}"
     if sys.platform in ("darwin", "win32") or os.environ.get("WAYLAND_DISPLAY"):
         return ""
     if not (display := os.environ.get("DISPLAY", "")):
@@ -152,12 +152,14 @@ def _add_electrodes(plotter: pyvista.Plotter, pv: Any, shapes: ElectrodeShapes) 
             electrode_surfaces.append(pv.Sphere(radius=0.012 * size, center=1e3 * corners[0]))
         else:
             # Triangles around the centre, since a patch on a curved wall is not a plane polygon.
-            ring = np.arange(len(corners))
-            fan = np.stack([ring, np.roll(ring, -1), np.full(len(ring), len(ring))], axis=1)
-            electrode_surfaces.append(
-                pv.PolyData.from_regular_faces(1e3 * np.vstack([corners, corners.mean(axis=0)]), fan)
+            ring_indices = np.arange(len(corners))
+            fan_triangles = np.stack(
+                [ring_indices, np.roll(ring_indices, -1), np.full(len(ring_indices), len(ring_indices))], axis=1
             )
-    plotter.add_mesh(pv.merge(electrode_surfaces), color=METAL, name="electrodes", ambient=0.35)
+            electrode_surfaces.append(
+                pv.PolyData.from_regular_faces(1e3 * np.vstack([corners, corners.mean(axis=0)]), fan_triangles)
+            )
+    plotter.add_mesh(pv.merge(electrode_surfaces), color=ELECTRODE_COLOUR, name="electrodes", ambient=0.35)
     numbers = [str(k + 1) for k in range(shapes.number)]
     style: dict[str, Any] = {"font_size": 14, "text_color": DARK_GREY, "shape_opacity": 0.6, "show_points": False}
     plotter.add_point_labels(1e3 * shapes.middles(), numbers, always_visible=True, shape_color="white", **style)

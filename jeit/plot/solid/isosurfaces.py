@@ -17,7 +17,7 @@ from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane, TriangleSurface, cut_by_plane, isosurface_of, node_values
 from jeit.image.plane import check_solid, crossed_edges
 from jeit.mesh import Mesh
-from jeit.plot.axes import axes_or_new
+from jeit.plot.axes import get_or_create_axes
 from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, ColourScale, FittedScale, check_scale
 from jeit.plot.solid.body import add_electrodes, add_hull, number_electrodes
 from jeit.plot.solid.scene import CORNER_VIEW, Camera, Scene, hide_axes_in_space, mark_sign
@@ -32,7 +32,7 @@ def draw_visible_body(ax: Axes, camera: Camera, inclusion: Inclusion) -> None:
     if inclusion.form is None:  # a ball, whose outline is a circle from every side
         ax.add_patch(Circle((x, y), inclusion.radius, **_DASH_PATTERN))
     else:
-        _draw_round(ax, camera.on_page(inclusion.form.surface().points))
+        _draw_dashed_hull(ax, camera.on_page(inclusion.form.surface().points))
     mark_sign(ax, x, y, inclusion.sign)
 
 
@@ -42,7 +42,7 @@ def draw_body_in_plane(ax: Axes, plane: Plane, inclusion: Inclusion) -> None:
         surface = inclusion.form.surface()
         segments = crossed_edges(surface.triangles, plane.distance(surface.points)).at_corners(surface.points)
         if len(segments):
-            corners = _draw_round(ax, plane.on_page(segments.reshape(-1, 3)))
+            corners = _draw_dashed_hull(ax, plane.on_page(segments.reshape(-1, 3)))
             x, y = (corners.min(axis=0) + corners.max(axis=0)) / 2
             mark_sign(ax, x, y, inclusion.sign)
         return
@@ -54,7 +54,7 @@ def draw_body_in_plane(ax: Axes, plane: Plane, inclusion: Inclusion) -> None:
         mark_sign(ax, x, y, inclusion.sign)
 
 
-def _draw_round(ax: Axes, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "k 2"]:
+def _draw_dashed_hull(ax: Axes, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "k 2"]:
     """Draw the convex hull of points as a dashed line, and return its corners."""
     corners = points[ConvexHull(points, qhull_options="QJ").vertices]
     ax.add_patch(Polygon(corners, **_DASH_PATTERN))
@@ -107,7 +107,7 @@ def plot_isosurfaces(
     check_drawn(mesh, electrodes, scale)
     fitted_scale = scale.of(np.asarray(values), "S/m")
     ax = draw_in_space(
-        axes_or_new(ax),
+        get_or_create_axes(ax),
         mesh,
         values,
         electrodes,

@@ -99,7 +99,7 @@ _RIM = [withStroke(linewidth=2.2, foreground="white")]
 _HALO = [withStroke(linewidth=3, foreground="white")]
 _AXIS_NAMES = ("x", "y", "z")
 # Colour of surfaces without values.
-BODY = "#b9bec6"
+BODY_COLOUR = "#b9bec6"
 
 
 class Scene:
@@ -137,13 +137,13 @@ class Scene:
         face_colours = np.array(np.broadcast_to(colours, (len(triangles), 4)), dtype=float)
         if is_lit:
             face_colours[:, :3] *= self.camera.light(normals)[:, None]
-        nearness = self.camera.nearness(corners.mean(axis=1)) + depth_offset
+        distances_towards_viewer = self.camera.nearness(corners.mean(axis=1)) + depth_offset
         # Edges in the colour of their face close gaps. Translucent triangles have no edges, as these would be visible
         # as a net.
         is_opaque = face_colours[:, 3] > 0.99
         self._add(
             corners[:, [0, 1, 2, 2]],
-            nearness,
+            distances_towards_viewer,
             face_colours,
             np.where(is_opaque[:, None], face_colours, 0),
             0.7 * is_opaque,
@@ -157,7 +157,7 @@ class Scene:
         centre = corners.mean(axis=0)
         corner_index = np.arange(len(corners))
         points = np.concatenate([corners, (corners + centre) / 2, centre[None]])
-        inner_nodes, next_corner, num_corners = (
+        inner_vertices, next_corner, num_corners = (
             corner_index + len(corners),
             (corner_index + 1) % len(corners),
             len(corners),
@@ -165,8 +165,8 @@ class Scene:
         triangles = np.concatenate(
             [
                 np.stack([corner_index, next_corner, next_corner + num_corners], axis=1),
-                np.stack([corner_index, next_corner + num_corners, inner_nodes], axis=1),
-                np.stack([inner_nodes, next_corner + num_corners, np.full(num_corners, 2 * num_corners)], axis=1),
+                np.stack([corner_index, next_corner + num_corners, inner_vertices], axis=1),
+                np.stack([inner_vertices, next_corner + num_corners, np.full(num_corners, 2 * num_corners)], axis=1),
             ]
         )
         self.add_triangles(points, triangles, np.array(to_rgba(colour)), depth_offset=depth_offset)
@@ -178,14 +178,18 @@ class Scene:
     ) -> None:
         """Add lines between pairs of `end_points`, `width` in points; `depth_offset` as in `add_triangles`."""
         edge = np.broadcast_to(to_rgba(colour), (len(end_points), 4))
-        nearness = self.camera.nearness(end_points.mean(axis=1)) + depth_offset
+        distances_towards_viewer = self.camera.nearness(end_points.mean(axis=1)) + depth_offset
         self._add(
-            end_points[:, [0, 1, 1, 0]], nearness, np.zeros((len(end_points), 4)), edge, np.full(len(end_points), width)
+            end_points[:, [0, 1, 1, 0]],
+            distances_towards_viewer,
+            np.zeros((len(end_points), 4)),
+            edge,
+            np.full(len(end_points), width),
         )
 
-    def _add(self, corners, nearness, face, edge, width) -> None:
+    def _add(self, corners, distances_towards_viewer, face, edge, width) -> None:
         self._corners.append(self.camera.on_page(corners))
-        self._nearness.append(nearness)
+        self._nearness.append(distances_towards_viewer)
         self._face.append(face)
         self._edge.append(edge)
         self._width.append(width)
@@ -234,7 +238,7 @@ def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], origin: tupl
 
     `directions`: (3, 2), projected unit vectors; `length`: length of an arrow that is not shortened by projection.
     """
-    for letter, direction in zip(_AXIS_NAMES, directions, strict=True):
+    for axis_name, direction in zip(_AXIS_NAMES, directions, strict=True):
         if np.hypot(*direction) < 0.15:
             continue
         tip = np.array(origin) + length * direction
@@ -248,7 +252,7 @@ def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], origin: tupl
         ax.annotate("", xy=tuple(tip), xytext=origin, arrowprops=style, annotation_clip=False)
         # The distance of the letter from the tip does not depend on the length of the arrow.
         x, y = tip + 0.3 * length * direction / np.hypot(*direction)
-        ax.text(x, y, letter, ha="center", va="center", fontsize=8, color=DARK_GREY)
+        ax.text(x, y, axis_name, ha="center", va="center", fontsize=8, color=DARK_GREY)
 
 
 def draw_number(

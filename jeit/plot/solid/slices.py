@@ -18,9 +18,9 @@ from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane, cut_by_plane
 from jeit.image.plane import AXES, crossed_edges
 from jeit.mesh import Mesh, centroids
-from jeit.plot.axes import axes_or_new, draw_scale_bar
+from jeit.plot.axes import draw_scale_bar, get_or_create_axes
 from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, ColourScale, FittedScale
-from jeit.plot.imaging.electrodes import METAL
+from jeit.plot.imaging.electrodes import ELECTRODE_COLOUR
 from jeit.plot.solid.body import longest_side
 from jeit.plot.solid.isosurfaces import DEFAULT_LEVELS, check_drawn, draw_body_in_plane, draw_in_space
 from jeit.plot.solid.scene import CORNER_VIEW, Camera, draw_axes_cross, draw_number
@@ -28,7 +28,7 @@ from jeit.plot.solid.surfaces import mappable
 
 MAX_SLICES = 64
 # Maximum number of inclusions listed in the caption of the overview.
-_MAX_LISTED = 5
+_MAX_LISTED_INCLUSIONS = 5
 
 
 def plot_slice(
@@ -66,7 +66,7 @@ def plot_slice(
     check_drawn(mesh, electrodes, scale)
     image = cell_values(mesh, values)
     fitted_scale = scale.of(image, "S/m")
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     mappable = draw_slice(ax, mesh, image, plane, electrodes, inclusions=inclusions, fitted=fitted_scale)
     finish_slice(ax, plane, data_extent(ax), draw_cross=True)
     fitted_scale.draw_bar(ax, mappable)
@@ -232,13 +232,13 @@ def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, distan
         distances = plane.distance(corners)
         if len(corners) < 3 or distances.min() > 0 or distances.max() < 0:
             continue
-        ring = np.arange(1, len(corners) - 1)
-        fan = np.stack([np.zeros_like(ring), ring, ring + 1], axis=1)
-        lines = plane.on_page(crossed_edges(fan, distances).at_corners(corners))
+        ring_indices = np.arange(1, len(corners) - 1)
+        fan_triangles = np.stack([np.zeros_like(ring_indices), ring_indices, ring_indices + 1], axis=1)
+        lines = plane.on_page(crossed_edges(fan_triangles, distances).at_corners(corners))
         if len(lines):
             lines_by_electrode.setdefault(int(electrode_index), []).extend(lines)
     for electrode_index, lines in lines_by_electrode.items():
-        ax.add_collection(LineCollection(lines, colors=METAL, linewidths=4, capstyle="butt", zorder=3))
+        ax.add_collection(LineCollection(lines, colors=ELECTRODE_COLOUR, linewidths=4, capstyle="butt", zorder=3))
         segment_ends = np.concatenate(lines)
         position = segment_ends.mean(axis=0)
         if np.ptp(segment_ends, axis=0).max() < 0.1 * distance:
@@ -252,11 +252,11 @@ def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, distan
 def _num_columns(num_panels: int, aspect_ratio: float) -> int:
     """Number of columns of a grid of `num_panels` panels on a landscape page; `aspect_ratio`: ratio of height to width
     of a panel."""
-    preferred_number = max(1, round(float(np.sqrt(1.6 * num_panels * aspect_ratio))))
+    preferred_num_columns = max(1, round(float(np.sqrt(1.6 * num_panels * aspect_ratio))))
     # Of several similar numbers of columns, the number that leaves the fewest panels empty is chosen.
-    candidates = range(max(1, preferred_number - 1), preferred_number + 2)
+    candidates = range(max(1, preferred_num_columns - 1), preferred_num_columns + 2)
     return min(
-        num_panels, min(candidates, key=lambda columns: (-num_panels % columns, abs(columns - preferred_number)))
+        num_panels, min(candidates, key=lambda columns: (-num_panels % columns, abs(columns - preferred_num_columns)))
     )
 
 
@@ -292,7 +292,7 @@ def plot_solid(
     image = cell_values(mesh, values)
     fitted_scale = scale.of(image, "S/m")
     shapes = _electrode_shapes(mesh, electrodes)
-    common_point = strongest_place(mesh, image, inclusions)
+    common_point = common_point_of_slices(mesh, image, inclusions)
     planes = [Plane.at(axis, float(common_point[AXES.index(axis)])) for axis in ("z", "x", "y")]
     figure = Figure(figsize=(12.6, 6.4), layout="constrained") if figure is None else figure
     grid = figure.add_gridspec(2, 4, width_ratios=(1.75, 1, 1, 0.045))
@@ -323,7 +323,7 @@ def plot_solid(
     return figure
 
 
-def strongest_place(mesh: Mesh, image: np.ndarray, inclusions: Sequence[Inclusion] = ()) -> np.ndarray:
+def common_point_of_slices(mesh: Mesh, image: np.ndarray, inclusions: Sequence[Inclusion] = ()) -> np.ndarray:
     """Common point (3,) of the slices: the centroid of the first inclusion, or else the centroid of the cell whose
     value differs most from the median."""
     if inclusions:
@@ -340,7 +340,7 @@ def _caption(ax: Axes, common_point, levels, inclusions: Sequence[Inclusion], *,
     if inclusions:
         ball_text = "" if all(inclusion.form for inclusion in inclusions) else ", drawn as balls of their volume"
         lines += ["", f"found, dashed{ball_text}:"]
-    for inclusion in inclusions[:_MAX_LISTED]:
+    for inclusion in inclusions[:_MAX_LISTED_INCLUSIONS]:
         sign = "+" if inclusion.sign > 0 else "−"
         column = "column of " if inclusion.is_column else ""
         radius = "" if inclusion.centroid_radius is None else f" ±{1e3 * inclusion.centroid_radius:.2g}"
@@ -348,8 +348,8 @@ def _caption(ax: Axes, common_point, levels, inclusions: Sequence[Inclusion], *,
         lines.append(f"{sign}  {column}{1e6 * inclusion.area:.3g} cm³ at {place_text}")
         if inclusion.contrast_interval is not None:
             lines.append(f"    {interval_text(inclusion.contrast_interval, signed_percent)}")
-    if len(inclusions) > _MAX_LISTED:
-        lines.append(f"and {len(inclusions) - _MAX_LISTED} more")
+    if len(inclusions) > _MAX_LISTED_INCLUSIONS:
+        lines.append(f"and {len(inclusions) - _MAX_LISTED_INCLUSIONS} more")
     ax.text(0, 0.9, "\n".join(lines), transform=ax.transAxes, va="top", fontsize=8.5, color=DARK_GREY, linespacing=1.6)
 
 

@@ -18,11 +18,11 @@ from jeit.electrodes.electrode_shapes import ElectrodeShapes, ProjectionSurface,
 from jeit.layout import SurfaceLayout
 from jeit.mesh import measures
 from jeit.mesh.geodesic import Triangles
-from jeit.plot.axes import axes_or_new
+from jeit.plot.axes import get_or_create_axes
 from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, SERIES_COLOURS, ColourScale, FittedScale, check_scale
-from jeit.plot.imaging.electrodes import METAL
+from jeit.plot.imaging.electrodes import ELECTRODE_COLOUR
 from jeit.plot.solid.body import add_electrodes, longest_side, number_electrodes
-from jeit.plot.solid.scene import BODY, CORNER_VIEW, Camera, Scene, hide_axes_in_space
+from jeit.plot.solid.scene import BODY_COLOUR, CORNER_VIEW, Camera, Scene, hide_axes_in_space
 
 # Distance, divided by the size of the skin, by which a surface must be in front of a mark to hide it.
 _MARK_OFFSET = 0.02
@@ -67,10 +67,10 @@ def plot_surface(
     check_scale(scale)
     if electrodes is not None:
         check_kind("electrodes", electrodes, ElectrodeShapes, "ElectrodeShapes, of shapes_of(mesh, electrodes)")
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     scene, fitted_scale = Scene(camera), None
     if values is None:
-        colours = np.array(to_rgba(BODY))
+        colours = np.array(to_rgba(BODY_COLOUR))
     else:
         image = checked_values(values, len(point_array), len(triangle_array))
         fitted_scale = scale.of(image, "S")
@@ -181,8 +181,8 @@ def plot_curved_skin(
     check_scale(scale)
     mesh = layout.surface
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
-    ax = axes_or_new(ax)
-    scene, fitted_scale, colours = Scene(camera), None, np.array(to_rgba(BODY))
+    ax = get_or_create_axes(ax)
+    scene, fitted_scale, colours = Scene(camera), None, np.array(to_rgba(BODY_COLOUR))
     if values is not None:
         image = checked_values(values, len(points), len(cells))
         fitted_scale = scale.of(image, "S")
@@ -195,7 +195,7 @@ def plot_curved_skin(
         (normal,) = surface.normals(corners.mean(axis=0)[None])
         cosine = abs(float(normal @ camera.toward))
         rim = np.ones(len(corners), bool)
-        scene.add_polygon(corners, METAL, depth_offset=depth_offset / max(cosine, 0.1), rim=rim)
+        scene.add_polygon(corners, ELECTRODE_COLOUR, depth_offset=depth_offset / max(cosine, 0.1), rim=rim)
     scene.draw(ax)
     triangles = Triangles.of(mesh)
     for (name, mark_points), colour in zip((marks or {}).items(), SERIES_COLOURS, strict=False):
@@ -241,8 +241,8 @@ def _visible_points(mesh, points, camera: Camera):
                           a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]], axis=1)  # fmt: skip
         doubled_area = areas.sum(axis=1)
         weights = areas / np.where(doubled_area == 0, 1.0, doubled_area)[:, None]
-        is_covering = (weights >= 0).all(axis=1) & (doubled_area != 0)
-        covering_depths = (weights * depths).sum(axis=1)[is_covering]
+        covers_point = (weights >= 0).all(axis=1) & (doubled_area != 0)
+        covering_depths = (weights * depths).sum(axis=1)[covers_point]
         if not (covering_depths > depth + _MARK_OFFSET * longest_side(mesh)).any():
             visible_masks.append(point)
     return np.array(visible_masks).reshape(-1, 3)

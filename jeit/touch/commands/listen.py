@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from jeit.cli.options import Quiet, check_at_least, make_folder, naming_options
+from jeit.cli.options import QuietOption, check_at_least, make_folder, naming_options_in_errors
 
 if TYPE_CHECKING:
     from jeit.touch.listening import SoundLabels
@@ -81,14 +81,14 @@ def classify_recording(
             show_default=False,
         ),
     ] = None,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Classify the sounds in a recording, every 0.1 s; writes events.csv, report.json and timeline.png.
 
     MODEL is a classifier trained on labelled clips: see 'jeit listen fit --help'.
     """
     from jeit.acoustic import Calibration, Recording, read_recording
-    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.cli.console import Steps, plain_console, print_written_files
     from jeit.touch.listening import Listener
     from jeit.touch.reports.listener import SOUND_LABEL_FILES, write_sound_labels
 
@@ -107,7 +107,7 @@ def classify_recording(
         write_sound_labels(labels, output, model=str(model))
     if not quiet:
         _print_summary(console, labels)
-        say_written(console, output / "events.csv", "report.json", "timeline.png")
+        print_written_files(console, output / "events.csv", "report.json", "timeline.png")
 
 
 @listen.command()
@@ -147,7 +147,7 @@ def fit(
     seed: Annotated[
         int, typer.Option(help="Seed of the random numbers for the initial weights and the training of networks.")
     ] = 0,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Train a classifier of sounds on labelled clips; prints its accuracy on held-out clips.
 
@@ -159,13 +159,13 @@ def fit(
     import jax
 
     from jeit.arguments import counted
-    from jeit.arguments.extras import need_extra
-    from jeit.cli.console import Steps, name_value_table, plain_console, say_written
+    from jeit.arguments.extras import require_extra
+    from jeit.cli.console import Steps, name_value_table, plain_console, print_written_files
     from jeit.touch.listening import Listener, read_clips
-    from jeit.touch.listening.learners import BATCHES
+    from jeit.touch.listening.learners import MAX_TRAINING_BATCHES
     from jeit.touch.reports.listener import LISTENER_FILES, summary, write_listener
 
-    need_extra("learn", "training a classifier of sounds")
+    require_extra("learn", "training a classifier of sounds")
     if loudness not in _LOUDNESS_CHOICES:
         raise ValueError(f"--loudness must be one of {', '.join(_LOUDNESS_CHOICES)}; it is '{loudness}'.")
     check_at_least({"--batches": (batches, 1), "--seed": (seed, 0)})
@@ -181,13 +181,13 @@ def fit(
         step("read")
         labelled_clips = read_clips(clips, progress=step.report)
         step("learn")
-        with naming_options({"method": "--method", "labels": "FOLDER-BY-CLASS"}):
+        with naming_options_in_errors({"method": "--method", "labels": "FOLDER-BY-CLASS"}):
             listener = Listener.fit(
                 labelled_clips,
                 method=method,
                 loudness=_LOUDNESS_CHOICES[loudness],
                 key=jax.random.key(seed),
-                batches=batches or BATCHES,
+                batches=batches or MAX_TRAINING_BATCHES,
                 folder=training_folder,
                 progress=step.report,
             )
@@ -207,7 +207,7 @@ def fit(
     rows += [("note", note) for note in listener.notes]
     console.print()
     console.print(name_value_table(f"Learnt from {listener.name}", rows))
-    say_written(console, output / "listener.jeit", "report.json", "learning.png")
+    print_written_files(console, output / "listener.jeit", "report.json", "learning.png")
 
 
 def _print_summary(console, result: "SoundLabels") -> None:

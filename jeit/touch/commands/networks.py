@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from jeit.cli.options import NETWORK, Quiet, make_folder, naming_options
+from jeit.cli.options import NETWORK_METHOD, QuietOption, make_folder, naming_options_in_errors
 
 if TYPE_CHECKING:
     import numpy as np
@@ -52,16 +52,16 @@ def image_by_network(
     import numpy as np
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.cli.console import Steps, plain_console, print_written_files
     from jeit.cli.options import make_folder
-    from jeit.cli.streams import FrameCounter, Stopping
+    from jeit.cli.streams import FrameCounter, StreamStopper
     from jeit.design import describes_skin, read_described_skin
     from jeit.imaging.stream_preparation import parse_frames
     from jeit.report.stream import PICTURES
     from jeit.touch.networks import read_network, resting_frame, stream_depths
     from jeit.touch.reports.image_network import DEPTH_FILES, write_depths
 
-    if method != NETWORK:
+    if method != NETWORK_METHOD:
         raise ValueError(f"--model is for --method network, not {method or 'the default'}; leave one out.")
     if model is None:
         raise ValueError("--method network needs --model, the folder of 'jeit learn image'.")
@@ -69,18 +69,18 @@ def image_by_network(
         raise ValueError(f"--{ineffective_options[0]} has no use with --method network; leave it out.")
     data, reference, kind, description = inputs
     console = plain_console()
-    with Stopping() as stopping, Steps(console, quiet=quiet) as step:
+    with StreamStopper() as stopping, Steps(console, quiet=quiet) as step:
         make_folder(output, DEPTH_FILES)
         step("read")
         skin = None
         if description is not None and describes_skin(description):
             skin, description = read_described_skin(description), None
         network = read_network(model, skin=skin)
-        is_table = skin is not None
+        is_read_as_table = skin is not None
         base_frames = (
             None
             if reference is None
-            else _read_frame_file("--reference", reference, kind, description, network, None, is_table=is_table)
+            else _read_frame_file("--reference", reference, kind, description, network, None, is_table=is_read_as_table)
         )
         untouched_frames = None if base_frames is None else base_frames.frames
         if data == "-":
@@ -88,7 +88,14 @@ def image_by_network(
         else:
             frame_index = None if streamed else 0 if frame is None else frame
             frame_file = _read_frame_file(
-                "DATA", data, kind, description, network, frame_index, is_table=is_table, format_example=reference
+                "DATA",
+                data,
+                kind,
+                description,
+                network,
+                frame_index,
+                is_table=is_read_as_table,
+                format_example=reference,
             )
             frames, numbers, untouched_frames = (
                 frame_file.frames,
@@ -99,20 +106,20 @@ def image_by_network(
             raise ValueError("--reference: give a file of frames of the untouched skin.")
         reference_frame = resting_frame(untouched_frames, str(reference or data))
         step("image")
-        counter = FrameCounter(step, None if numbers is None else len(numbers))
+        frame_counter = FrameCounter(step, None if numbers is None else len(numbers))
 
-        def print_refused(frame_depth: "FrameDepth") -> None:
-            counter.count_frame()
+        def print_refused_frame(frame_depth: "FrameDepth") -> None:
+            frame_counter.count_frame()
             if frame_depth.depth is None and not quiet:
                 console.print(f"  frame {frame_depth.number}: refused. {frame_depth.reason}", soft_wrap=True)
 
-        frame_depths = stream_depths(network, stopping.until(frames), reference_frame)
+        frame_depths = stream_depths(network, stopping.frames_until_signal(frames), reference_frame)
         if numbers is not None:
             frame_depths = (item._replace(number=int(numbers[item.number])) for item in frame_depths)
         drawing = stopping.drawing_reporter(PICTURES, step)
-        with stopping.exit_after_signal(counter, "frames.csv", "depth.npz"):
+        with stopping.exit_after_signal(frame_counter, "frames.csv", "depth.npz"):
             summary = write_depths(
-                frame_depths, network, output, name=str(data), progress=print_refused, drawing=drawing
+                frame_depths, network, output, name=str(data), progress=print_refused_frame, drawing=drawing
             )
     if quiet:
         return
@@ -125,7 +132,7 @@ def image_by_network(
         )
     else:
         console.print(f"untouched: nothing is deeper than noise makes it, {1e3 * network.floor:.2g} mm")
-    say_written(console, output / "frames.csv", "depth.npz", "depth.png", "report.json")
+    print_written_files(console, output / "frames.csv", "depth.npz", "depth.png", "report.json")
 
 
 def _read_frame_file(
@@ -216,7 +223,7 @@ def image(
         str | None,
         typer.Option(help="Address of a dask scheduler whose workers simulate the touches (default: this process)."),
     ] = None,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Train a network that images indentation depth: simulates touches, trains on them, and prints the accuracy.
 
@@ -225,21 +232,21 @@ def image(
     """
     from contextlib import ExitStack
 
-    from jeit.arguments.extras import need_extra
-    from jeit.cli.console import Steps, name_value_table, plain_console, say_written
+    from jeit.arguments.extras import require_extra
+    from jeit.cli.console import Steps, name_value_table, plain_console, print_written_files
     from jeit.design import read_described_skin
     from jeit.design.commands.study import connect_to_scheduler
     from jeit.touch.networks import learn_images
     from jeit.touch.reports.image_network import LEARNT_FILES, write_learnt_images
 
-    need_extra("learn", "a network that images touches")
-    need_extra("cluster", "a store of simulated touches")
+    require_extra("learn", "a network that images touches")
+    require_extra("cluster", "a store of simulated touches")
     make_folder(output, LEARNT_FILES)
     console = plain_console()
     with ExitStack() as stack:
         step = stack.enter_context(Steps(console, quiet=quiet))
         step("read")
-        with naming_options({"path": "skin"}):
+        with naming_options_in_errors({"path": "skin"}):
             described_skin = read_described_skin(skin)
         client = None if scheduler is None else stack.enter_context(connect_to_scheduler(scheduler))
         step("learn")
@@ -271,4 +278,4 @@ def image(
     ]
     console.print()
     console.print(name_value_table(f"Learnt of {skin.name}", rows))
-    say_written(console, output / "network.jeit", "report.json", "learning.png")
+    print_written_files(console, output / "network.jeit", "report.json", "learning.png")

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from jeit.cli.options import Quiet, check_positive, make_folder, naming_options
+from jeit.cli.options import QuietOption, check_positive, make_folder, naming_options_in_errors
 from jeit.touch.commands.touch_health import health
 from jeit.touch.commands.touch_watch import gestures, watch
 
@@ -68,7 +68,7 @@ def contacts(
         float,
         typer.Option(help="Least change of a contact, relative to the strongest of its frame; below are side lobes."),
     ] = 0.4,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Find all contacts in the frames of a recording, without learning: when, where, and which belong to one touch.
 
@@ -77,7 +77,7 @@ def contacts(
     import numpy as np
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.cli.console import Steps, plain_console, print_written_files
     from jeit.data import load_description, read_frame_recording
     from jeit.touch import TouchImages, find_recorded_contacts, untouched_frames
     from jeit.touch.reports.touch_watch import CONTACT_FILES, write_contacts
@@ -89,15 +89,15 @@ def contacts(
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        with naming_options({"description": "--skin"}):
+        with naming_options_in_errors({"description": "--skin"}):
             description = load_description(skin)
-        recorded = read_frame_recording(recording, description)
-        seconds = recorded.seconds
+        recording_of_frames = read_frame_recording(recording, description)
+        seconds = recording_of_frames.seconds
         if seconds is None:
-            seconds = np.arange(len(recorded.frames)) / (rate or _DEFAULT_RATE)
-        with naming_options({"untouched": "--untouched"}):
+            seconds = np.arange(len(recording_of_frames.frames)) / (rate or _DEFAULT_RATE)
+        with naming_options_in_errors({"untouched": "--untouched"}):
             untouched_voltages = (
-                untouched_frames(recorded, seconds, untouched)
+                untouched_frames(recording_of_frames, seconds, untouched)
                 if reference is None
                 else read_frame_recording(reference, description).frames
             )
@@ -105,19 +105,19 @@ def contacts(
         images = TouchImages.prepare(description, untouched_voltages, progress=step.report)
         step("find")
         recorded_contacts = find_recorded_contacts(
-            images, recorded.frames, seconds, untouched_voltages, sign=-1 if lowers else 1, weakest=weakest
+            images, recording_of_frames.frames, seconds, untouched_voltages, sign=-1 if lowers else 1, weakest=weakest
         )
         step("write")
         write_contacts(recorded_contacts, images, output, name=recording.name)
     if quiet:
         return
     console.print(f"\n{counted(len(seconds), 'frame')}: {counted(len(recorded_contacts.touches), 'touch')}")
-    if recorded.seconds is None and rate is None:
+    if recording_of_frames.seconds is None and rate is None:
         console.print(f"  note: no times are known: {_DEFAULT_RATE:g} frames a second are assumed; see --rate")
     for note in recorded_contacts.notes:
         console.print(f"  note: {note}", soft_wrap=True)
     _print_touches(console, recorded_contacts.touches, images.background)
-    say_written(console, output / "contacts.csv", "report.json", "contacts.png")
+    print_written_files(console, output / "contacts.csv", "report.json", "contacts.png")
 
 
 @touch.command()
@@ -159,20 +159,20 @@ def fit(
             help="Standardise the changes of each group separately, which removes drift between groups.",
         ),
     ] = False,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Train models of a skin on recorded presses; prints their errors on presses held out in intervals of time.
 
     Writes skin.skops, report.json and learning.png, a picture of the errors, to the folder SKIN.
     """
-    from jeit.arguments.extras import need_extra
-    from jeit.cli.console import Steps, name_value_table, plain_console, say_written
+    from jeit.arguments.extras import require_extra
+    from jeit.cli.console import Steps, name_value_table, plain_console, print_written_files
     from jeit.data import load_description
     from jeit.mesh import OwnMesh
     from jeit.touch import LearntSkin, read_presses
     from jeit.touch.reports.learnt_skin import SKIN_FILES, summary, write_learnt_skin
 
-    need_extra("learn", "learning a skin")
+    require_extra("learn", "learning a skin")
     make_folder(output, SKIN_FILES)
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
@@ -185,7 +185,9 @@ def fit(
                 presses, num_points=None if isinstance(skin_description.domain, OwnMesh) else _NUM_NODES
             )
         step("learn")
-        with naming_options({"num_channels": "--channels", "per_session": "--per-session", "model": "--description"}):
+        with naming_options_in_errors(
+            {"num_channels": "--channels", "per_session": "--per-session", "model": "--description"}
+        ):
             skin = LearntSkin.fit(
                 recorded_presses,
                 method=method or "auto",
@@ -205,7 +207,7 @@ def fit(
     console.print()
     console.print(name_value_table(f"Learnt from {recorded_presses.name}", rows))
     _print_notes(console, skin.notes)
-    say_written(console, output / "skin.skops", "report.json", "learning.png")
+    print_written_files(console, output / "skin.skops", "report.json", "learning.png")
 
 
 @touch.command()
@@ -228,13 +230,13 @@ def predict(
         Path,
         typer.Option("--output", "-o", help="Folder for touches.csv, report.json, touches.png.", show_default=False),
     ],
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Predict for each frame where, how hard and by what the skin is touched, and how certain that is."""
     import numpy as np
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.cli.console import Steps, plain_console, print_written_files
     from jeit.touch import read_frames, read_skin
     from jeit.touch.reports.learnt_skin import TOUCH_FILES, write_touches
 
@@ -259,7 +261,7 @@ def predict(
             )
     console.print("\n" + "; ".join(descriptions))
     _print_notes(console, touches.notes)
-    say_written(console, output / "touches.csv", "report.json", "touches.png")
+    print_written_files(console, output / "touches.csv", "report.json", "touches.png")
 
 
 def _print_touches(console, touches, background: float) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from jeit.cli.options import Quiet, check_positive, make_folder, naming_options
+from jeit.cli.options import QuietOption, check_positive, make_folder, naming_options_in_errors
 
 # Number of frames processed between two progress messages.
 _FRAMES_PER_MESSAGE = 500
@@ -54,7 +54,7 @@ def health(
             "windows)."
         ),
     ] = None,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Detect cuts, failing electrodes and repairs by comparing a recording with a recording of the healthy skin.
 
@@ -63,7 +63,7 @@ def health(
     import numpy as np
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.cli.console import Steps, plain_console, print_written_files
     from jeit.data import load_description, read_frame_recording
     from jeit.touch import doubts_of, learn_health, watch
     from jeit.touch.health.health_learning import seconds_of
@@ -76,7 +76,7 @@ def health(
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        with naming_options({"description": "--skin"}):
+        with naming_options_in_errors({"description": "--skin"}):
             description = None if skin is None else load_description(skin)
         healthy_recording, checked_recording = (
             read_frame_recording(path, description) for path in (healthy, recording)
@@ -95,8 +95,8 @@ def health(
         step("watch")
         seconds = seconds_of(checked_recording, rate)
         times = np.arange(len(checked_recording.frames), dtype=float) if seconds is None else seconds
-        with naming_options({"frames": f"'{recording}'"}):
-            warnings = doubts_of(healthy_state, healthy_recording, checked_recording.frames)
+        with naming_options_in_errors({"frames": f"'{recording}'"}):
+            doubt_texts = doubts_of(healthy_state, healthy_recording, checked_recording.frames)
         state = healthy_state
         for first_frame in range(0, len(times), _FRAMES_PER_MESSAGE):
             step.report(f"{first_frame:,} of {counted(len(times), 'frame')}")
@@ -113,13 +113,13 @@ def health(
             output,
             name=recording.name,
             timed=seconds is not None,
-            notes=warnings,
+            notes=doubt_texts,
         )
     if quiet:
         return
     unit = "frame" if seconds is None else "s"
     console.print(f"\n{counted(state.frames, 'frame')}: {counted(len(state.events), 'event')}")
-    for note in warnings:
+    for note in doubt_texts:
         console.print(f"  note: {note}", soft_wrap=True)
     for event in state.events:
         electrode_text = "" if event.electrode is None else f" {event.electrode + 1}"
@@ -130,4 +130,4 @@ def health(
         )
     if (held_event := state.held) is not None:
         console.print(f"  held at the end: {held_event.reason}", soft_wrap=True)
-    say_written(console, output / "events.csv", "report.json", "health.png")
+    print_written_files(console, output / "events.csv", "report.json", "health.png")

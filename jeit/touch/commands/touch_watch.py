@@ -9,9 +9,9 @@ from typing import Annotated
 
 import typer
 
-from jeit.cli.options import AsIs, Quiet, check_positive, make_folder, naming_options
+from jeit.cli.options import AsIsOption, QuietOption, check_positive, make_folder, naming_options_in_errors
 
-Skin = Annotated[
+SkinOption = Annotated[
     Path,
     typer.Option(metavar="SKIN.toml", help="Geometry, electrodes and protocol of the skin.", show_default=False),
 ]
@@ -28,7 +28,7 @@ def gestures(
             show_default=False,
         ),
     ],
-    skin: Skin,
+    skin: SkinOption,
     output: Annotated[
         Path,
         typer.Option("--output", "-o", metavar="MODEL", help="Folder for the learnt gestures.", show_default=False),
@@ -40,24 +40,24 @@ def gestures(
             "classifier that is most accurate for held-out people."
         ),
     ] = None,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Train a gesture classifier on recordings; prints its accuracy for people who were held out of the training.
 
     Writes gestures.skops, report.json and gestures.png, the confusion matrix, to the folder MODEL.
     """
-    from jeit.arguments.extras import need_extra
-    from jeit.cli.console import Steps, name_value_table, plain_console, say_written
+    from jeit.arguments.extras import require_extra
+    from jeit.cli.console import Steps, name_value_table, plain_console, print_written_files
     from jeit.data import GestureSet, load_description
     from jeit.touch import learn_gestures
     from jeit.touch.reports.touch_watch import GESTURE_FILES, write_gestures
 
-    need_extra("learn", "learning gestures")
+    require_extra("learn", "learning gestures")
     make_folder(output, GESTURE_FILES)
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        with naming_options({"which": "--skin", "description": "--skin"}):
+        with naming_options_in_errors({"which": "--skin", "description": "--skin"}):
             description = load_description(skin)
         gesture_set = GestureSet.read(recordings)
         step("learn")
@@ -71,13 +71,13 @@ def gestures(
     rows = [("recordings", f"{len(gesture_set)}, of {num_people} {'people' if num_people > 1 else 'person'}")]
     rows += [("gestures", ", ".join(model.names)), ("classifier", f"{model.method} on {model.form}")]
     if standing is not None:
-        is_right = standing.held_out == standing.right
-        accuracies = ", ".join(f"{name} {100 * is_right[standing.right == name].mean():.0f}" for name in model.names)
-        rows.append(("right, held out", f"{100 * is_right.mean():.1f} % ({accuracies})"))
+        is_correct = standing.held_out == standing.right
+        accuracies = ", ".join(f"{name} {100 * is_correct[standing.right == name].mean():.0f}" for name in model.names)
+        rows.append(("right, held out", f"{100 * is_correct.mean():.1f} % ({accuracies})"))
     rows += [("note", note) for note in model.notes]
     console.print()
     console.print(name_value_table(f"Learnt from {recordings.name}", rows))
-    say_written(console, output / "gestures.skops", "report.json", "gestures.png")
+    print_written_files(console, output / "gestures.skops", "report.json", "gestures.png")
 
 
 def watch(
@@ -89,7 +89,7 @@ def watch(
             show_default=False,
         ),
     ],
-    skin: Skin,
+    skin: SkinOption,
     gestures: Annotated[
         Path,
         typer.Option(
@@ -119,8 +119,8 @@ def watch(
     patience: Annotated[
         float, typer.Option(help="Seconds after which a lasting touch becomes part of the reference.")
     ] = 30.0,
-    quiet: Quiet = False,
-    as_is: AsIs = False,
+    quiet: QuietOption = False,
+    as_is: AsIsOption = False,
 ) -> None:
     """Name the gestures of touches as they end: when, where, which gesture, and how probable it is.
 
@@ -130,23 +130,23 @@ def watch(
     """
     from dataclasses import replace
 
-    from jeit.arguments.extras import need_extra
+    from jeit.arguments.extras import require_extra
     from jeit.cli.console import Steps, plain_console
-    from jeit.cli.streams import LiveFrames, Stopping
+    from jeit.cli.streams import LiveFrames, StreamStopper
     from jeit.data import load_description, read_frame_recording
     from jeit.imaging.stream_preparation import parse_frames
     from jeit.touch import GestureModel, TouchImages, TouchWatch
     from jeit.touch.gestures.touch_images import TOUCH_IMAGES
     from jeit.touch.reports.touch_watch import WATCH_FILES, write_watch
 
-    need_extra("learn", "naming gestures")
+    require_extra("learn", "naming gestures")
     check_positive({"--untouched": untouched, "--patience": patience} | ({} if rate is None else {"--rate": rate}))
     console = plain_console()
-    with Stopping() as stopping:
+    with StreamStopper() as stopping:
         make_folder(output, WATCH_FILES)
         with Steps(console, quiet=quiet) as step:
             step("read")
-            with naming_options({"description": "--skin"}):
+            with naming_options_in_errors({"description": "--skin"}):
                 description = load_description(skin)
             model = GestureModel.read(gestures)
             untouched_frames = None if reference is None else read_frame_recording(reference, description).frames
@@ -166,8 +166,8 @@ def watch(
             images = TouchImages.prepare(
                 description, untouched_frames, replace(TOUCH_IMAGES, as_is=as_is), progress=step.report
             )
-            watch = TouchWatch.create(images, model, untouched_frames, rate=frame_rate, patience=patience)
-        for note in () if quiet else watch.notes:
+            touch_watch = TouchWatch.create(images, model, untouched_frames, rate=frame_rate, patience=patience)
+        for note in () if quiet else touch_watch.notes:
             console.print(f"  note: {note}", soft_wrap=True)
 
         if live_frames is not None and not quiet:
@@ -183,7 +183,11 @@ def watch(
                 console.print(_describe_touch(touch))
 
         written_watch = write_watch(
-            watch.follow(stopping.until(frames)), watch, output, name=stream, progress=show_frame
+            touch_watch.follow(stopping.frames_until_signal(frames)),
+            touch_watch,
+            output,
+            name=stream,
+            progress=show_frame,
         )
     if not quiet:
         _print_summary(console, written_watch, live_frames, output)
@@ -196,12 +200,14 @@ def _print_summary(console, written_watch, live_frames, output: Path) -> None:
     import numpy as np
 
     from jeit.arguments import counted
-    from jeit.cli.console import say_written
+    from jeit.cli.console import print_written_files
 
     frame_counts = ", ".join(f"{number} {status}" for status, number in sorted(written_watch.counts.items()))
-    num_unlike = sum(touch.unlike for touch in written_watch.touches)
+    num_unlike_touches = sum(touch.unlike for touch in written_watch.touches)
     console.print(f"\n{counted(len(written_watch.seconds), 'frame')}: {frame_counts}")
-    console.print(f"{counted(len(written_watch.touches), 'touch')}, {num_unlike} of them unlike any learnt from")
+    console.print(
+        f"{counted(len(written_watch.touches), 'touch')}, {num_unlike_touches} of them unlike any learnt from"
+    )
     if written_watch.latency.size:
         median_latency, high_latency = 1e3 * np.quantile(written_watch.latency, (0.5, 0.99))
         console.print(
@@ -211,7 +217,7 @@ def _print_summary(console, written_watch, live_frames, output: Path) -> None:
         console.print(f"{counted(live_frames.left_out, 'frame')} left out that had come before they could be read")
     if written_watch.first_reason:
         console.print(f"first refusal: {written_watch.first_reason}", soft_wrap=True)
-    say_written(console, output / "events.csv", "paths.csv", "report.json", "timeline.png")
+    print_written_files(console, output / "events.csv", "paths.csv", "report.json", "timeline.png")
 
 
 def _read_recording(path: Path, description, untouched, untouched_duration: float, rate: float):
@@ -228,14 +234,14 @@ def _read_recording(path: Path, description, untouched, untouched_duration: floa
     elif len(seconds) > 1 and np.median(np.diff(seconds)) > 0:
         rate = 1 / float(np.median(np.diff(seconds)))
     if untouched is None:
-        with naming_options({"untouched": "--untouched"}):
+        with naming_options_in_errors({"untouched": "--untouched"}):
             untouched = untouched_frames(recording, seconds, untouched_duration)
     return zip(seconds.tolist(), recording.frames, strict=True), untouched, rate
 
 
 def _describe_touch(touch) -> str:
-    course = touch.touch.course
-    x, y = 1e3 * course.centroid[int(course.peak.argmax())]
+    time_course = touch.touch.course
+    x, y = 1e3 * time_course.centroid[int(time_course.peak.argmax())]
     name = "unlike any" if touch.unlike else f"{touch.gesture:<12}{100 * touch.probability:3.0f} %"
     name += ", held" if touch.held else ", cut off" if touch.touch.cut_off else ""
     duration = touch.touch.offset - touch.touch.onset

@@ -1,6 +1,6 @@
 from .cell_finder import CellFinder
 from .finder import Contact, ImageNoise, find_contacts
-from .load_calibration import Load, LoadCalibration
+from .load_calibration import LoadCalibration, LoadEstimate
 from .raster_finder import RasterFinder, RasterStages
 from .tracker import ContactTracker, TouchPath, track_contacts
 
@@ -9,8 +9,8 @@ __all__ = [
     "Contact",
     "ContactTracker",
     "ImageNoise",
-    "Load",
     "LoadCalibration",
+    "LoadEstimate",
     "RasterFinder",
     "RasterStages",
     "TouchPath",

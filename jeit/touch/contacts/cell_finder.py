@@ -8,7 +8,7 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from jeit.arguments import describe, is_number
-from jeit.image.segmentation import basins, shared_facets
+from jeit.image.segmentation import shared_facets, watershed_basins
 from jeit.mesh import Mesh, centroids, measures
 from jeit.mesh.geodesic import Triangles
 from jeit.touch.contacts.finder import AbstractFinder, Contact, ImageNoise, check_finder, check_share
@@ -146,7 +146,7 @@ class CellFinder(AbstractFinder):
     def find(self, change, noise):
         """Find the contacts in an image; see `find_contacts`."""
         change, clear_change = self.above_noise(change, noise)
-        basin_peaks = basins(clear_change, self.shared, floor=0.0, least_prominence=self.least_prominence)
+        basin_peaks = watershed_basins(clear_change, self.shared, min_value=0.0, least_prominence=self.least_prominence)
         peaks = np.unique(basin_peaks[basin_peaks >= 0])
         strong_peaks = peaks[change[peaks] >= self.least_peak * change[peaks].max(initial=0.0)]
         return [self._describe_contact(change, noise, peak, basin_peaks == peak) for peak in strong_peaks.tolist()]

@@ -24,7 +24,7 @@ _CLIPPING_DEVIATIONS = 3.0
 # Ratio of the standard deviation of all cells to that of the cells that remain, for normal noise.
 _CLIPPED_DEVIATION = 1.0136
 # Maximum number of rounds of clipping.
-_MAX_ROUNDS = 20
+_MAX_CLIPPING_ROUNDS = 20
 
 
 class ImageNoise(Module):
@@ -155,13 +155,13 @@ def _clipped_deviation(values: Float[np.ndarray, " m"]) -> float:
     To identify outliers, the standard deviation is estimated from the median absolute deviation.
     """
     remaining_values = values
-    for _ in range(_MAX_ROUNDS):
+    for _ in range(_MAX_CLIPPING_ROUNDS):
         median = np.median(remaining_values)
         robust_deviation = _DEVIATION_PER_MEDIAN * np.median(np.abs(remaining_values - median))
-        kept_values = values[np.abs(values - median) <= _CLIPPING_DEVIATIONS * robust_deviation]
-        if len(kept_values) == len(remaining_values):
+        unclipped_values = values[np.abs(values - median) <= _CLIPPING_DEVIATIONS * robust_deviation]
+        if len(unclipped_values) == len(remaining_values):
             break
-        remaining_values = kept_values
+        remaining_values = unclipped_values
     return float(_CLIPPED_DEVIATION * remaining_values.std())
 
 

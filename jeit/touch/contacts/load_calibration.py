@@ -33,7 +33,7 @@ _MAX_SATURATION = 0.98
 _MAX_RELATIVE_DISTANCE, _MIN_RELATIVE_WIDTH = 10.0, 1e-3
 
 
-class Load(Module):
+class LoadEstimate(Module):
     """Estimated load of a contact.
 
     **Fields**: `force`: the load, newtons; `deviation`: its standard deviation, newtons.
@@ -115,24 +115,34 @@ class LoadCalibration(Module):
         # Weak priors, each with the weight of a thousandth of a reading, for parameters that the places or loads of the
         # contacts do not determine.
         prior_weights = np.sqrt(1e-3) * np.array([0.0, 0.3, 0.3, 0.3])
-        optimum = least_squares(
+        least_squares_result = least_squares(
             lambda parameters: np.concatenate(
                 [residuals(parameters), prior_weights * (parameters - initial_parameters)]
             ),
             initial_parameters,
         )
-        if not optimum.success:
-            raise ValueError(f"contacts and loads: no curve fits them ({optimum.message}).")
-        scatter = float(np.sqrt((residuals(optimum.x) ** 2).sum() / (len(loads) - len(initial_parameters))))
-        covariance = scatter**2 * np.linalg.inv(optimum.jac.T @ optimum.jac)
-        highest = float((loads / (loads + np.exp(optimum.x[3]))).max())
+        if not least_squares_result.success:
+            raise ValueError(f"contacts and loads: no curve fits them ({least_squares_result.message}).")
+        scatter = float(
+            np.sqrt((residuals(least_squares_result.x) ** 2).sum() / (len(loads) - len(initial_parameters)))
+        )
+        covariance = scatter**2 * np.linalg.inv(least_squares_result.jac.T @ least_squares_result.jac)
+        highest = float((loads / (loads + np.exp(least_squares_result.x[3]))).max())
         load_range = float(loads.min()), float(loads.max())
         sign = int(np.sign(peaks[0]))
         return cls(
-            centre, float(radius), optimum.x, covariance, sign, scatter, load_range, float(distances.max()), highest
+            centre,
+            float(radius),
+            least_squares_result.x,
+            covariance,
+            sign,
+            scatter,
+            load_range,
+            float(distances.max()),
+            highest,
         )
 
-    def load(self, contact: Contact) -> Load:
+    def load(self, contact: Contact) -> LoadEstimate:
         """Estimate the load of a contact, newtons, and its standard deviation.
 
         The standard deviation includes the uncertainty of the parameters and the scatter of peaks about the curve, but
@@ -152,7 +162,7 @@ class LoadCalibration(Module):
                 f"contact is {1e3 * distance * self.radius:.1f} mm from the middle, and calibrated contacts reach "
                 f"{1e3 * self.farthest * self.radius:.1f} mm; calibrate with loads farther out."
             )
-        log_scale, quadratic, quartic, log_half_load = self.parameters
+        log_scale, quadratic, quartic, log_half_saturation_load = self.parameters
         saturation = abs(contact.peak) / np.exp(log_scale + quadratic * distance**2 + quartic * distance**4)
         # A peak less than two standard deviations above the calibrated peaks is no evidence of a larger load.
         if saturation > min(self.highest * np.exp(2 * self.scatter), max(self.highest, _MAX_SATURATION)):
@@ -160,17 +170,22 @@ class LoadCalibration(Module):
                 f"contact: its peak {describe(contact.peak)} is {saturation / self.highest:.2f} times the highest "
                 f"that was calibrated there, by {self.loads[1]:g} N; calibrate with greater loads."
             )
-        force = float(np.exp(log_half_load) * saturation / (1 - saturation))
+        force = float(np.exp(log_half_saturation_load) * saturation / (1 - saturation))
         # Derivatives of log F with respect to log peak: 1 / (1 − saturation); with respect to log s, b and c: −1 / (1 −
         # saturation), times the derivative of log peak; with respect to log F½: 1.
         sensitivity = 1 / (1 - saturation)
         derivatives = np.array([-sensitivity, -sensitivity * distance**2, -sensitivity * distance**4, 1.0])
         variance = derivatives @ self.covariance @ derivatives + (sensitivity * self.scatter) ** 2
-        return Load(force, force * float(np.sqrt(variance)))
+        return LoadEstimate(force, force * float(np.sqrt(variance)))
 
 
 def _log_peak(parameters, distance, loads):
     """Compute the logarithms of the peaks of contacts at the relative distances ρ = `distance` under `loads`,
     newtons."""
-    log_scale, quadratic, quartic, log_half_load = parameters
-    return log_scale + quadratic * distance**2 + quartic * distance**4 + np.log(loads / (loads + np.exp(log_half_load)))
+    log_scale, quadratic, quartic, log_half_saturation_load = parameters
+    return (
+        log_scale
+        + quadratic * distance**2
+        + quartic * distance**4
+        + np.log(loads / (loads + np.exp(log_half_saturation_load)))
+    )

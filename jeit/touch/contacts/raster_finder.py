@@ -17,7 +17,7 @@ from scipy import sparse
 from scipy.special import ndtr
 
 from jeit.arguments import describe, is_number
-from jeit.arguments.extras import optional
+from jeit.arguments.extras import import_optional
 from jeit.image import Raster
 from jeit.mesh import Mesh
 from jeit.touch.contacts.cell_finder import gaussian_means
@@ -138,8 +138,8 @@ class RasterFinder(AbstractFinder):
         `find_contacts`."""
         change = signed_image(self, image)
         stages = self._stages(change, noise_or_estimate(change, noise))
-        signed_results = self.sign * stages.region, restore_sign(self, stages.contacts)
-        return eqx.tree_at(lambda results: (results.region, results.contacts), stages, signed_results)
+        region_and_contacts = self.sign * stages.region, restore_sign(self, stages.contacts)
+        return eqx.tree_at(lambda results: (results.region, results.contacts), stages, region_and_contacts)
 
     def _stages(self, change: Float[np.ndarray, " m"], noise: ImageNoise) -> RasterStages:
         """Compute the results of all steps for a `change` (m,) whose sign makes contacts positive."""
@@ -152,15 +152,15 @@ class RasterFinder(AbstractFinder):
             np.where(is_on_skin, clear_change[cell_indices], 0.0),
         )
         max_change = clear_change.max()
-        grey = np.rint(255 * clear_change / (max_change or 1.0)).astype(np.uint8)
+        grey_levels = np.rint(255 * clear_change / (max_change or 1.0)).astype(np.uint8)
         # OpenCV selects pixels above the local mean minus its constant, so that a negative constant is passed. Pixels
         # outside the skin are set to the local mean of the skin's pixels: if they were black, the whole rim of the skin
         # would exceed the local mean.
         block_size = (self.block, self.block)
         skin_weights = np.maximum(opencv.GaussianBlur(is_on_skin * 1.0, block_size, 0), 1e-12)
-        local_means = opencv.GaussianBlur(grey * 1.0, block_size, 0) / skin_weights
+        local_means = opencv.GaussianBlur(grey_levels * 1.0, block_size, 0) / skin_weights
         threshold = opencv.adaptiveThreshold(
-            np.where(is_on_skin, grey, local_means).astype(np.uint8),
+            np.where(is_on_skin, grey_levels, local_means).astype(np.uint8),
             255,
             opencv.ADAPTIVE_THRESH_GAUSSIAN_C,
             opencv.THRESH_BINARY,
@@ -168,10 +168,10 @@ class RasterFinder(AbstractFinder):
             -self.constant,
         ) * is_on_skin.astype(np.uint8)
         ellipse = opencv.getStructuringElement(opencv.MORPH_ELLIPSE, (self.opening, self.opening))
-        opened = opencv.morphologyEx(threshold, opencv.MORPH_OPEN, ellipse)
-        contours, _ = opencv.findContours(opened, opencv.RETR_EXTERNAL, opencv.CHAIN_APPROX_NONE)
+        opened_mask = opencv.morphologyEx(threshold, opencv.MORPH_OPEN, ellipse)
+        contours, _ = opencv.findContours(opened_mask, opencv.RETR_EXTERNAL, opencv.CHAIN_APPROX_NONE)
         membership_noise = self._membership_noise(
-            cell_indices[is_on_skin], (grey - local_means - self.constant)[is_on_skin] * max_change / 255, noise
+            cell_indices[is_on_skin], (grey_levels - local_means - self.constant)[is_on_skin] * max_change / 255, noise
         )
         contacts = [
             self._contact(opencv, region, contour[:, 0], membership_noise, skin_weights, clear_change > 0, noise)
@@ -180,7 +180,7 @@ class RasterFinder(AbstractFinder):
         sorted_contacts = sorted(
             (contact for contact in contacts if contact is not None), key=lambda contact: -contact.peak
         )
-        return RasterStages(region, grey, threshold > 0, opened > 0, sorted_contacts, self.raster.extent)
+        return RasterStages(region, grey_levels, threshold > 0, opened_mask > 0, sorted_contacts, self.raster.extent)
 
     def _contact(
         self, opencv, region, contour: np.ndarray, membership_noise: tuple, skin_weights, is_clear, noise: ImageNoise
@@ -252,4 +252,4 @@ class RasterFinder(AbstractFinder):
 
 
 def _import_opencv() -> Any:
-    return optional("cv2", "RasterFinder", "CellFinder needs nothing more.")
+    return import_optional("cv2", "RasterFinder", "CellFinder needs nothing more.")

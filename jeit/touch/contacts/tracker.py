@@ -16,7 +16,7 @@ from jeit_solvers.module import Module
 # frames.
 _VELOCITY_GAIN = 0.5
 # Maximum time for which a touch may be hidden by the contact of another touch, as a multiple of `gap`.
-_HIDDEN_GAPS = 4
+_MAX_HIDDEN_GAPS = 4
 
 
 class TouchPath(Module):
@@ -136,11 +136,11 @@ class ContactTracker(Module):
         # bridged too.
         tolerance = min(interval, self.gap)
         has_ended = [
-            time - touch.observations[-1][0] > self.gap * (_HIDDEN_GAPS if touch.is_hidden else 1) + tolerance
+            time - touch.observations[-1][0] > self.gap * (_MAX_HIDDEN_GAPS if touch.is_hidden else 1) + tolerance
             for touch in self.open
         ]
-        ended_touches = [touch for touch, ended in zip(self.open, has_ended, strict=True) if ended]
-        current_touches = [touch for touch, ended in zip(self.open, has_ended, strict=True) if not ended]
+        ended_touches = [touch for touch, is_ended in zip(self.open, has_ended, strict=True) if is_ended]
+        current_touches = [touch for touch, is_ended in zip(self.open, has_ended, strict=True) if not is_ended]
         predicted_positions = np.array([touch.predicted_position(time) for touch in current_touches])
         contact_positions = np.array([contact.centroid for contact in contacts])
         distances = np.linalg.norm(predicted_positions.reshape(-1, 1, 2) - contact_positions.reshape(1, -1, 2), axis=-1)
@@ -154,13 +154,13 @@ class ContactTracker(Module):
             for row, column in zip(rows, columns, strict=True)
             if distances[row, column] <= max_distance
         }
-        hiding_distances = self.reach + np.sqrt(np.array([contact.area for contact in contacts]) / np.pi)
+        max_hiding_distances = self.reach + np.sqrt(np.array([contact.area for contact in contacts]) / np.pi)
         unassigned_touches = [row for row in range(len(current_touches)) if row not in assigned_contacts]
         hidden_touches = {
             row
             for row in unassigned_touches
             for column in assigned_contacts.values()
-            if distances[row, column] <= hiding_distances[column]
+            if distances[row, column] <= max_hiding_distances[column]
         }
         updated_touches = [
             _update_touch(touch, time, contacts[assigned_contacts[row]])
@@ -180,8 +180,8 @@ class ContactTracker(Module):
             _TrackedTouch(self.number + contact_index, time, contact.centroid, np.zeros(2), ((time, contact),))
             for contact_index, contact in enumerate(new_contacts)
         ]
-        closed = self.closed + self._finished_paths(ended_touches)
-        values = (time, (*updated_touches, *new_touches), closed, self.number + len(new_contacts))
+        closed_touches = self.closed + self._finished_paths(ended_touches)
+        values = (time, (*updated_touches, *new_touches), closed_touches, self.number + len(new_contacts))
         return ContactTracker(self.gap, self.reach, self.fastest, self.least, *values)
 
     @property

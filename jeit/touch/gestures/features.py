@@ -201,7 +201,7 @@ def _sample_time_course(time_course: ChangeCourse) -> Float[np.ndarray, "T c"]:
     positions_on_axis = centred_path @ np.linalg.svd(centred_path, full_matrices=False)[2][0]
     positions_on_axis = positions_on_axis - positions_on_axis[0]
     largest_displacement = positions_on_axis[np.abs(positions_on_axis).argmax()]
-    change, mean, area, half_share = (
+    change, mean, area, half_peak_share = (
         np.interp(sample_times, seconds, values)
         for values in (time_course.peak, time_course.mean, time_course.area, time_course.half_share)
     )
@@ -212,7 +212,7 @@ def _sample_time_course(time_course: ChangeCourse) -> Float[np.ndarray, "T c"]:
             change / time_course.peak.max(),
             mean,
             area,
-            half_share,
+            half_peak_share,
             speed,
             distance,
             np.sign(largest_displacement) * positions_on_axis,

@@ -74,9 +74,9 @@ class Scale:
         """Estimate the transform from features (n, k); `size` is the median of |x|. Constant features become zero."""
         size = np.median(np.abs(values), axis=0)
         size = np.where(size > 0, size, np.maximum(np.abs(values).max(axis=0), 1e-300))
-        logs = np.sign(values) * np.log1p(np.abs(values) / size)
-        deviation = logs.std(axis=0)
-        return cls(size, logs.mean(axis=0), np.where(deviation > 1e-12, deviation, 1.0))
+        log_values = np.sign(values) * np.log1p(np.abs(values) / size)
+        deviation = log_values.std(axis=0)
+        return cls(size, log_values.mean(axis=0), np.where(deviation > 1e-12, deviation, 1.0))
 
     def __call__(self, values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
         """Transform features (n, k) to the common scale."""
@@ -116,11 +116,11 @@ def random_folds(true_classes: np.ndarray, num_folds: int, seed: int = 0) -> Int
     fold.
     """
     rng = np.random.default_rng(seed)
-    folds, num_assigned = np.empty(len(true_classes), int), 0
+    folds, num_assigned_rows = np.empty(len(true_classes), int), 0
     for class_index in np.unique(true_classes):
-        class_rows = rng.permutation(np.flatnonzero(true_classes == class_index))
-        folds[class_rows] = (num_assigned + np.arange(len(class_rows))) % num_folds
-        num_assigned += len(class_rows)
+        rows_of_class = rng.permutation(np.flatnonzero(true_classes == class_index))
+        folds[rows_of_class] = (num_assigned_rows + np.arange(len(rows_of_class))) % num_folds
+        num_assigned_rows += len(rows_of_class)
     return np.unique(folds, return_inverse=True)[1]
 
 

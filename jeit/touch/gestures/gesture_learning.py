@@ -118,10 +118,10 @@ def _touch_level_and_sign(images: TouchImages, untouched: np.ndarray, recordings
     candidates = []
     for sign in (1, -1):
         level = TouchLevel.of_untouched(images.mesh, sign * untouched)
-        ratios = [
+        signed_ratios = [
             np.nanmax(sign * changes) / level.level for changes in changes_of_recordings if np.isfinite(changes).any()
         ]
-        candidates.append((float(np.median(ratios)) if ratios else 0.0, level, sign))
+        candidates.append((float(np.median(signed_ratios)) if signed_ratios else 0.0, level, sign))
     return max(candidates, key=lambda candidate: candidate[0])[1:]
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind, check_name, describe, is_number
-from jeit.arguments.extras import need_extra
+from jeit.arguments.extras import require_extra
 from jeit.touch.gestures.features import course_features
 from jeit.touch.gestures.gesture_classifiers import (
     FEATURE_FORMS,
@@ -177,7 +177,7 @@ class GestureModel:
         labels, people and touches differ, for empty labels, fewer than two gestures, gestures with fewer than two
         touches, and unknown names of methods and forms; `ImportError` without the extra `learn`.
         """
-        need_extra("learn", "learning gestures")
+        require_extra("learn", "learning gestures")
         check_name("method", method, METHODS)
         check_name("form", form, ("auto", *FEATURE_FORMS))
         label_array, people_array = _check_labels_and_people(touches, labels, people)
@@ -233,13 +233,13 @@ class GestureModel:
         """
         values = FEATURE_FORMS[self.form](touches).values
         if not len(values):
-            empty_array = np.empty(0)
+            no_values = np.empty(0)
             return Gestures(
-                empty_array.astype(str),
-                empty_array,
+                no_values.astype(str),
+                no_values,
                 np.empty((0, len(self.names))),
                 self.names,
-                empty_array.astype(bool),
+                no_values.astype(bool),
             )
         odds = np.full((len(values), len(self.names)), -1e3)
         odds[:, self.model.classes_] = log_odds(self.model, self.scale(values))

@@ -261,10 +261,10 @@ class TouchStream(Module):
         """
         if not (is_number(second) and second >= self.second):
             raise ValueError(f"second must not be before the last frame, {self.second:g} s; it is {describe(second)}.")
-        frame = check_images(np.asarray(image)[None], len(self.level.areas))
-        if second == self.second or not np.isfinite(frame).all():
+        current_frame = check_images(np.asarray(image)[None], len(self.level.areas))
+        if second == self.second or not np.isfinite(current_frame).all():
             return replace(self, lost=(self.lost[0], self.lost[1] + 1)) if self.open else self
-        time_course = self.level.course(np.array([float(second)]), frame)
+        time_course = self.level.course(np.array([float(second)]), current_frame)
         new_state, is_after_gap = self, second - self.second >= self.gap - _TIME_TOLERANCE
         if self.open and second - self.open[self.held - 1].seconds[0] >= self.gap - _TIME_TOLERANCE:
             new_state = replace(self, ended=(*self.ended, *self._current_touch()), open=(), held=0, lost=(0, 0))
@@ -333,12 +333,12 @@ def find_touches(
     time_course = level.course(seconds[used_frames], images[used_frames])
     is_after_gap = np.concatenate([[True], intervals >= gap - _TIME_TOLERANCE, [True]])
     frames_above_level = np.flatnonzero(time_course.peak > level.level)
-    frame_groups = np.split(
+    frames_of_touches = np.split(
         frames_above_level,
         1 + np.flatnonzero(np.diff(time_course.seconds[frames_above_level]) >= gap - _TIME_TOLERANCE),
     )
     touches = []
-    for frames in frame_groups:
+    for frames in frames_of_touches:
         if not frames.size or frames[-1] - frames[0] + 1 < least:
             continue
         first_frame, last_frame = frames[0], frames[-1]

@@ -94,11 +94,13 @@ class TouchImages:
         Yields the status of each frame, and its image of the change of conductivity (m,), S, which is NaN if the frame
         was refused.
         """
-        refused_change = np.full(self.mesh.num_cells, np.nan)
+        change_of_refused_frame = np.full(self.mesh.num_cells, np.nan)
         for frame_image in stream(self.imager, frames):
             yield (
                 frame_image,
-                refused_change if frame_image.conductivity is None else frame_image.conductivity - self.background,
+                change_of_refused_frame
+                if frame_image.conductivity is None
+                else frame_image.conductivity - self.background,
             )
 
     def changes(self, frames: Float[np.ndarray, "F M"]) -> Float[np.ndarray, "F m"]:

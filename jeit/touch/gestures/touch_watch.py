@@ -144,16 +144,16 @@ class TouchWatch:
         peaks = np.nanmax(model.reading.sign * images.changes(untouched), axis=1)
         peaks = peaks[np.isfinite(peaks)]
         if len(peaks) and np.mean(peaks > level.level) > _MAX_FRACTION_ABOVE_LEVEL:
-            raised_level = TouchLevel.of_untouched(images.mesh, model.reading.sign * images.changes(untouched))
+            untouched_level = TouchLevel.of_untouched(images.mesh, model.reading.sign * images.changes(untouched))
             notes.append(
                 f"the untouched skin's images reach {peaks.max() / level.level:.2g} times the level that a touch "
                 "exceeded when gestures were learnt: a higher one is used, and weak touches are missed. Was the "
                 "skin touched meanwhile?"
             )
-            level = raised_level
-        training_rate = model.reading.rate
-        if not 0.5 < rate / training_rate < 2:
-            notes.append(f"gestures were learnt at {training_rate:.3g} frames/s, and frames come at {rate:.3g}.")
+            level = untouched_level
+        training_frame_rate = model.reading.rate
+        if not 0.5 < rate / training_frame_rate < 2:
+            notes.append(f"gestures were learnt at {training_frame_rate:.3g} frames/s, and frames come at {rate:.3g}.")
         return cls(images, level, model, max(_MIN_GAP, _MIN_GAP_FRAMES / rate), patience, tuple(notes))
 
     def follow(self, frames: Iterable[tuple[float, Any]]) -> Iterator[WatchedFrame]:
@@ -190,7 +190,7 @@ class _WatchState:
             yield self._frame_result(image, self.sign * change)
         if self.touches.touches:
             self.arrival_time = time.perf_counter()
-            ended_touches = tuple(self._ended_touch(touch) for touch in self.touches.touches)
+            ended_touches = tuple(self._ended_touch(ended_touch) for ended_touch in self.touches.touches)
             yield WatchedFrame(
                 self.frame_time, None, np.nan, False, None, ended_touches, time.perf_counter() - self.arrival_time
             )

@@ -51,13 +51,13 @@ _MAX_PARTIAL_RATIO = 0.4
 # Misfit below which a cut through the whole depth is certain.
 _CERTAIN_MISFIT = 0.01
 # Ratio of misfits above which the worse of the fits of a complete and a partial cut is excluded.
-_DISTINCT_RATIO = 4.0
+_DISTINCT_MISFIT_RATIO = 4.0
 # Maximum standard deviation of an end of the path, in mesh edges.
 _MAX_END_DEVIATION = 10.0
 # Model error, relative to a channel's change and to the root mean square of all changes.
 _MODEL_ERROR = 0.05
 # Standard deviation of a relative change common to all voltages.
-_FACTOR_DEVIATION = 0.1
+_COMMON_FACTOR_DEVIATION = 0.1
 # Step of numerical derivatives with respect to places, divided by the skin's side.
 _DERIVATIVE_STEP = 1e-5
 
@@ -111,10 +111,10 @@ class LossFit:
         cell_centres = np.asarray(centroids(model.mesh))[:, :2]
         self.lower_corner, self.upper_corner = cell_centres.min(axis=0), cell_centres.max(axis=0)
         self.skin_size = float((self.upper_corner - self.lower_corner).max())
-        refined_model, parent, edge_length = finer_model(
+        refined_model, parent_cells, edge_length = finer_model(
             model, centre, _REFINED_RADIUS * self.skin_size, _EDGE_LENGTH * self.skin_size
         )
-        self.region = LocalChange(refined_model, conductivity[parent], centre, _REFINED_RADIUS * self.skin_size)
+        self.region = LocalChange(refined_model, conductivity[parent_cells], centre, _REFINED_RADIUS * self.skin_size)
         self.lower_corner = np.maximum(self.lower_corner, centre - self.region.radius)
         self.upper_corner = np.minimum(self.upper_corner, centre + self.region.radius)
         self.edge_length, self.band_half_width, self.model_conductivity = (
@@ -123,8 +123,8 @@ class LossFit:
             conductivity,
         )
         self.parents, self.cells_per_parent = (
-            parent[self.region.cells],
-            np.bincount(parent, minlength=len(conductivity)),
+            parent_cells[self.region.cells],
+            np.bincount(parent_cells, minlength=len(conductivity)),
         )
         self.conductivity, self.centres = conductivity[self.parents], self.region.centres
         self.dimension = model.mesh.dimension
@@ -162,15 +162,17 @@ class LossFit:
         complete_cut = min(complete_cuts, key=lambda fit: fit.misfit)
         partial_cut = min(partial_cuts, key=lambda fit: fit.misfit)
         complete_cut, partial_cut = self._fit_bend(complete_cut, is_length_fixed=True), self._fit_bend(partial_cut)
-        is_through = not partial_cut.misfit < _MAX_PARTIAL_RATIO * complete_cut.misfit
-        best_fit, rejected_fit = (complete_cut, partial_cut) if is_through else (partial_cut, complete_cut)
+        is_complete_cut = not partial_cut.misfit < _MAX_PARTIAL_RATIO * complete_cut.misfit
+        best_fit, rejected_fit = (complete_cut, partial_cut) if is_complete_cut else (partial_cut, complete_cut)
         path = best_fit.unknowns[:-2].reshape(-1, 2)
         # A long partial cut and a short cut through the whole depth may fit about equally well.
-        is_certain = is_through and best_fit.misfit < _CERTAIN_MISFIT
-        are_similar = not is_certain and rejected_fit.misfit < _DISTINCT_RATIO * best_fit.misfit
+        is_certainly_complete = is_complete_cut and best_fit.misfit < _CERTAIN_MISFIT
+        are_similar = not is_certainly_complete and rejected_fit.misfit < _DISTINCT_MISFIT_RATIO * best_fit.misfit
         length_difference = abs(_length(best_fit) - _length(rejected_fit)) if are_similar else 0.0
         deviation = float(np.hypot(self._deviation(best_fit), length_difference))
-        return FittedLoss(path, best_fit.misfit, self._conductivity_on_mesh(best_fit.unknowns), is_through, deviation)
+        return FittedLoss(
+            path, best_fit.misfit, self._conductivity_on_mesh(best_fit.unknowns), is_complete_cut, deviation
+        )
 
     def fit_spot(self, start: np.ndarray) -> FittedLoss:
         """Fit a round spot of lost or gained conductivity near a place (x, y), metres."""
@@ -179,18 +181,18 @@ class LossFit:
         return FittedLoss(best_fit.unknowns[None, :2], best_fit.misfit, self._conductivity_on_mesh(best_fit.unknowns))
 
     def _fit_bend(self, straight_fit: _FittedUnknowns, *, is_length_fixed: bool = False) -> _FittedUnknowns:
-        cut_ends = straight_fit.unknowns[:-2].reshape(-1, 2)
-        centre, (x, y) = cut_ends.mean(axis=0), cut_ends[-1] - cut_ends[0]
+        end_points_of_cut = straight_fit.unknowns[:-2].reshape(-1, 2)
+        centre, (x, y) = end_points_of_cut.mean(axis=0), end_points_of_cut[-1] - end_points_of_cut[0]
         bend_offset = _BEND_OFFSET * np.array([-y, x])
         candidate_starts = [
-            np.array([*cut_ends[0], *bend_place, *cut_ends[-1], *straight_fit.unknowns[-2:]])
-            for bend_place in (centre + bend_offset, centre - bend_offset)
+            np.array([*end_points_of_cut[0], *bend_position, *end_points_of_cut[-1], *straight_fit.unknowns[-2:]])
+            for bend_position in (centre + bend_offset, centre - bend_offset)
         ]
         bent_fits = [
             self._minimise_misfit(candidate, is_length_fixed=is_length_fixed) for candidate in candidate_starts
         ]
-        bent_fit = min(bent_fits, key=lambda fit: fit.misfit)
-        return bent_fit if bent_fit.misfit < _MAX_BEND_RATIO * straight_fit.misfit else straight_fit
+        best_bent_fit = min(bent_fits, key=lambda fit: fit.misfit)
+        return best_bent_fit if best_bent_fit.misfit < _MAX_BEND_RATIO * straight_fit.misfit else straight_fit
 
     def _minimise_misfit(self, start: np.ndarray, *, is_length_fixed: bool = False) -> _FittedUnknowns:
         """Minimise the misfit over the unknowns of a cut or a spot, from `start`; if `is_length_fixed`, the added
@@ -207,7 +209,7 @@ class LossFit:
             return unknowns
 
         clipped_start = np.clip(start, lower_bounds + 1e-9, upper_bounds - 1e-9)
-        optimum = least_squares(
+        least_squares_result = least_squares(
             lambda free_unknowns: self._residual(all_unknowns(free_unknowns)),
             clipped_start[is_free],
             lambda free_unknowns: self._jacobian(all_unknowns(free_unknowns))[:, is_free],  # pyright: ignore[reportArgumentType]
@@ -217,7 +219,7 @@ class LossFit:
             ftol=1e-3,
             xtol=1e-3,
         )
-        return _FittedUnknowns(all_unknowns(optimum.x), 2 * optimum.cost / self.energy)
+        return _FittedUnknowns(all_unknowns(least_squares_result.x), 2 * least_squares_result.cost / self.energy)
 
     def _bounds(self, num_unknowns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return lower bounds, upper bounds and scales of the unknowns of a cut or a spot, each an array
@@ -233,7 +235,11 @@ class LossFit:
             lower_bounds = [*np.tile(self.lower_corner, num_points), np.log(_MIN_ADDED_LENGTH)]
             upper_bounds = [*np.tile(self.upper_corner, num_points), np.log(_MAX_ADDED_LENGTH) + 1e-6]
             scales = [*np.full(2 * num_points, 0.05 * self.skin_size), 1.0]
-        return np.array([*lower_bounds, -0.5]), np.array([*upper_bounds, 0.5]), np.array([*scales, _FACTOR_DEVIATION])
+        return (
+            np.array([*lower_bounds, -0.5]),
+            np.array([*upper_bounds, 0.5]),
+            np.array([*scales, _COMMON_FACTOR_DEVIATION]),
+        )
 
     def _deviation(self, fitted: _FittedUnknowns) -> float:
         """Estimate the standard deviation of the length of a cut, metres, from those of both ends and half an edge of
@@ -247,10 +253,10 @@ class LossFit:
             step = self.edge_length * step / max(float(np.linalg.norm(step)), 1e-12)
             energy_increases = []
             for sign in (1.0, -1.0):
-                moved_path = path.copy()
-                moved_path[end] += sign * step
+                shifted_path = path.copy()
+                shifted_path[end] += sign * step
                 energy_increases.append(
-                    self._misfit(np.array([*moved_path.ravel(), *fitted.unknowns[-2:]])) - min_energy
+                    self._misfit(np.array([*shifted_path.ravel(), *fitted.unknowns[-2:]])) - min_energy
                 )
             variance += self.edge_length**2 * min(
                 residual_variance / max(max(energy_increases), 1e-12 * self.energy), _MAX_END_DEVIATION**2
@@ -273,7 +279,7 @@ class LossFit:
 
     def _residual(self, unknowns: np.ndarray) -> np.ndarray:
         unexplained_change = (1 + unknowns[-1]) * self._predicted_change(unknowns) - self.change
-        return np.append(self._weight_residual(unexplained_change), unknowns[-1] / _FACTOR_DEVIATION)
+        return np.append(self._weight_residual(unexplained_change), unknowns[-1] / _COMMON_FACTOR_DEVIATION)
 
     def _jacobian(self, unknowns: np.ndarray) -> np.ndarray:
         """Compute the derivatives (residuals, unknowns) of the weighted residuals of the fit with respect to the
@@ -283,9 +289,9 @@ class LossFit:
         steps[: 2 if len(unknowns) == 5 else -1] *= self.skin_size
         change_derivatives = []
         for unknown_index, step in enumerate(steps):
-            moved_unknowns = unknowns.copy()
-            moved_unknowns[unknown_index] += step
-            change_derivatives.append((self._conductivity_change(moved_unknowns) - change) / step)
+            shifted_unknowns = unknowns.copy()
+            shifted_unknowns[unknown_index] += step
+            change_derivatives.append((self._conductivity_change(shifted_unknowns) - change) / step)
         impedance, impedance_derivatives = self.region.derivatives(change, change_derivatives)
         columns = np.column_stack(
             [
@@ -295,7 +301,7 @@ class LossFit:
         )
         columns[:, :-1] *= 1 + unknowns[-1]
         last_row = np.zeros(len(unknowns))
-        last_row[-1] = 1 / _FACTOR_DEVIATION
+        last_row[-1] = 1 / _COMMON_FACTOR_DEVIATION
         return np.concatenate([self._weight_residual(columns), last_row[None]])
 
     def _conductivity_change(self, unknowns: np.ndarray) -> np.ndarray:
@@ -335,10 +341,10 @@ class LossFit:
         positions_on_path = x_offsets * directions[:, 0] + y_offsets * directions[:, 1]
         positions_across = x_offsets * normals[:, 0] + y_offsets * normals[:, 1]
         # The band reaches beyond the ends of its centre line, which is shortened so that the band ends with the path.
-        shortening = np.minimum(self.band_half_width / _END_NARROWING, 0.45 * lengths)
+        end_shortening = np.minimum(self.band_half_width / _END_NARROWING, 0.45 * lengths)
         first_positions, last_positions = np.zeros(len(lengths)), lengths.copy()
-        first_positions[0] += shortening[0]
-        last_positions[-1] -= shortening[-1]
+        first_positions[0] += end_shortening[0]
+        last_positions[-1] -= end_shortening[-1]
         distances_beyond_ends = _END_NARROWING * (
             positions_on_path - np.clip(positions_on_path, first_positions, last_positions)
         )
@@ -348,8 +354,10 @@ class LossFit:
             squared_distances[np.arange(len(squared_distances)), nearest_segments] / self.band_half_width**2
         )
         # Profile of the loss across the band, with integral 1.
-        profile = np.where(squared_distances < 1, (1 - squared_distances) ** 2, 0.0) * 15 / (16 * self.band_half_width)
-        return 1 / (1 + np.exp(unknowns[-2]) * self.skin_size * profile), normals[nearest_segments]
+        profile_across_path = (
+            np.where(squared_distances < 1, (1 - squared_distances) ** 2, 0.0) * 15 / (16 * self.band_half_width)
+        )
+        return 1 / (1 + np.exp(unknowns[-2]) * self.skin_size * profile_across_path), normals[nearest_segments]
 
     def _conductivity_on_mesh(self, unknowns: np.ndarray) -> np.ndarray:
         """Compute the conductivity with the fitted loss on the mesh of the model before refinement, one value for each

@@ -117,7 +117,7 @@ _MIN_FRACTION_AFTER = 0.5
 # Fraction of a step that the median of no third of the frames before the step may exceed.
 _MAX_FRACTION_BEFORE = 0.5
 # Fraction of a step below which the level of a frame counts as the level before the step.
-_BEFORE_LEVEL = 0.3
+_MAX_FRACTION_OF_LEVEL_BEFORE = 0.3
 # Maximum fraction of frames on one side of the step with the level of the other side, which touches of the opposite
 # sign may cause.
 _MAX_OUTLIER_FRACTION = 0.1
@@ -208,9 +208,16 @@ def is_distinct(projections: Float[np.ndarray, " n"], first_frame: int) -> bool:
     A lasting step is distinct from two touches, between which the level returns to 0.
     """
     noise = 1.4826 * np.median(np.abs(np.diff(projections))) / np.sqrt(2)
-    max_fraction = max(_MAX_OUTLIER_FRACTION, 1.5 * float(ndtr((_BEFORE_LEVEL - 1) / max(noise, 1e-12))))
-    early_fraction = np.mean(projections[:first_frame] > 1 - _BEFORE_LEVEL) if first_frame else 0.0
-    return bool(np.mean(projections[first_frame:] < _BEFORE_LEVEL) <= max_fraction and early_fraction <= max_fraction)
+    max_fraction = max(
+        _MAX_OUTLIER_FRACTION, 1.5 * float(ndtr((_MAX_FRACTION_OF_LEVEL_BEFORE - 1) / max(noise, 1e-12)))
+    )
+    outlier_fraction_before = (
+        np.mean(projections[:first_frame] > 1 - _MAX_FRACTION_OF_LEVEL_BEFORE) if first_frame else 0.0
+    )
+    return bool(
+        np.mean(projections[first_frame:] < _MAX_FRACTION_OF_LEVEL_BEFORE) <= max_fraction
+        and outlier_fraction_before <= max_fraction
+    )
 
 
 def _best_split_index(projections: np.ndarray, half_length: int) -> int:

@@ -40,9 +40,9 @@ _MIN_RELATIVE_CHANGE = 0.12
 # Maximum fraction of electrodes that may fail at once.
 _MAX_FAULTY_FRACTION = 0.25
 # Maximum ratio of readings to reference readings for a torn wire.
-_TORN_RATIO = 0.2
+_MAX_TORN_READING_RATIO = 0.2
 # Minimum ratio of noise to healthy noise for a loose contact.
-_LOOSE_NOISE_RATIO = 5.0
+_MIN_LOOSE_NOISE_RATIO = 5.0
 # Ratio of the standard deviation of a normal variable to the median magnitude of the difference of two independent
 # values.
 _DEVIATION_PER_MEDIAN_DIFFERENCE = 1.0484
@@ -121,8 +121,10 @@ class ImagedSkin:
         patterns, pattern_indices = np.unique(has_reading, axis=0, return_inverse=True)
         for pattern_index, pattern in enumerate(patterns):
             if pattern.any():
-                is_pattern = pattern_indices.ravel() == pattern_index
-                images[is_pattern] = np.asarray(self.linear_reconstruction(pattern).image(as_array(volts[is_pattern])))
+                has_pattern = pattern_indices.ravel() == pattern_index
+                images[has_pattern] = np.asarray(
+                    self.linear_reconstruction(pattern).image(as_array(volts[has_pattern]))
+                )
         return images
 
     def fit_cut(
@@ -136,11 +138,13 @@ class ImagedSkin:
         is_used = usable & np.isfinite(change)
         volts = np.where(is_used, change / self.gain, 0.0)
         image = np.asarray(self.linear_reconstruction(is_used).image(as_array(volts)))
-        losses = np.maximum(-image, 0.0)
-        if not losses.max() > 0:
+        conductivity_losses = np.maximum(-image, 0.0)
+        if not conductivity_losses.max() > 0:
             return None
         centres = np.asarray(centroids(self.model.mesh))[:, :2]
-        weights = np.asarray(measures(self.model.mesh)) * np.where(losses > _PEAK_FRACTION * losses.max(), losses, 0.0)
+        weights = np.asarray(measures(self.model.mesh)) * np.where(
+            conductivity_losses > _PEAK_FRACTION * conductivity_losses.max(), conductivity_losses, 0.0
+        )
         start = weights @ centres / weights.sum()
         channels = np.flatnonzero(is_used)
         channel_noise = noise[channels] / np.abs(self.gain[channels])
@@ -218,20 +222,22 @@ def kind_of_fault(
         and np.ptp(medians) <= 0.02 * np.abs(medians).max()
         and np.ptp(reference[electrode_channels]) > 0.1 * rms_reading
     )
-    if is_constant or np.median(np.abs(medians)) < _TORN_RATIO * np.median(np.abs(reference[electrode_channels])):
+    if is_constant or np.median(np.abs(medians)) < _MAX_TORN_READING_RATIO * np.median(
+        np.abs(reference[electrode_channels])
+    ):
         return EventKind.TORN
     # Touches hardly affect the median difference from frame to frame.
     differences = np.diff(electrode_frames, axis=0)
-    has_steps = np.isfinite(differences).any(axis=0)
+    has_differences = np.isfinite(differences).any(axis=0)
     noise_ratios = np.zeros(len(medians))
-    if has_steps.any():
-        noise_ratios[has_steps] = _DEVIATION_PER_MEDIAN_DIFFERENCE * np.nanmedian(
-            np.abs(differences[:, has_steps]), axis=0
+    if has_differences.any():
+        noise_ratios[has_differences] = _DEVIATION_PER_MEDIAN_DIFFERENCE * np.nanmedian(
+            np.abs(differences[:, has_differences]), axis=0
         )
     noise_ratios /= np.minimum(noise[electrode_channels], rms_reading)
-    if np.median(noise_ratios) > _LOOSE_NOISE_RATIO and np.median(np.abs(medians)) < _MAX_RELATIVE_CHANGE * np.median(
-        np.abs(reference[electrode_channels])
-    ):
+    if np.median(noise_ratios) > _MIN_LOOSE_NOISE_RATIO and np.median(
+        np.abs(medians)
+    ) < _MAX_RELATIVE_CHANGE * np.median(np.abs(reference[electrode_channels])):
         return EventKind.LOOSE
     return EventKind.DEAD
 

@@ -55,15 +55,17 @@ def learn_health(
     check_kind("healthy", healthy, FrameRecording, "a FrameRecording, as of read_frame_recording(path)")
     frames, seconds = healthy.frames, seconds_of(healthy, rate)
     if seconds is not None:
-        is_later = np.diff(seconds, prepend=-np.inf) > 0  # duplicate frames are left out
-        frames, seconds = frames[is_later], seconds[is_later]
+        is_later_than_previous = np.diff(seconds, prepend=-np.inf) > 0  # duplicate frames are left out
+        frames, seconds = frames[is_later_than_previous], seconds[is_later_than_previous]
     options = {"patience": patience, "sign": sign}
     if description is None:
         return SkinHealth.fit(frames, seconds, **options)
     if description.domain is None or description.electrodes is None:
         return SkinHealth.fit(frames, seconds, protocol=description.protocol(healthy.name), **options)
-    rest_frames = np.nanmedian(frames, axis=0, keepdims=True) if healthy.reference is None else healthy.reference
-    images = TouchImages.prepare(description, rest_frames, progress=progress)
+    median_untouched_frame = (
+        np.nanmedian(frames, axis=0, keepdims=True) if healthy.reference is None else healthy.reference
+    )
+    images = TouchImages.prepare(description, median_untouched_frame, progress=progress)
     background = np.full(images.mesh.num_cells, images.background)
     return SkinHealth.fit(frames, seconds, model=images.calibration.model, conductivity=background, **options)
 

@@ -24,11 +24,11 @@ _WINDOW_PER_TOUCH = 3.0
 # Minimum of the default length of a window, as a fraction of the recording.
 _MIN_WINDOW_FRACTION = 1 / 40
 # Limit of a change between windows, as a multiple of the maximum among healthy windows.
-_CHANGE_FACTOR = 2.0
+_CHANGE_LIMIT_FACTOR = 2.0
 # Minimum limit of a change between windows, in standard deviations of healthy changes.
 _MIN_CHANGE_SIZE = 4.0
-# Increase of `_CHANGE_FACTOR`, to be divided by the number of windows.
-_CHANGE_INCREASE = 20.0
+# Increase of `_CHANGE_LIMIT_FACTOR`, to be divided by the number of windows.
+_CHANGE_LIMIT_FACTOR_INCREASE = 20.0
 # Factor by which windows may be shorter than touches require.
 _SHORT_WINDOW_FACTOR = 1.5
 # Factor on the limits of changes if windows are even shorter, because touches then appear to last.
@@ -37,7 +37,7 @@ _BRIEF_LIMIT_FACTOR = 2.0
 _MIN_REMAINING_FRACTION = 0.4
 # Limit of the change of voltages from the healthy recording to another recording, as a multiple of the maximum between
 # healthy windows.
-_LEVEL_FACTOR = 3.0
+_LEVEL_LIMIT_FACTOR = 3.0
 # Minimum ratio of the change in a touched frame to the change in quiet frames.
 _MIN_TOUCH_RATIO = 3.0
 # Quantile of the changes of all frames that estimates the change in quiet frames.
@@ -182,10 +182,10 @@ def _estimate_noise(frames: np.ndarray) -> np.ndarray:
     total_deviations[has_steps] = np.nanstd(steps[:, has_steps], axis=0) / np.sqrt(2)
     # With a coarse analogue-to-digital converter, the median change is zero or one step of the converter; the mean
     # change is more informative.
-    num_small = np.maximum((_UNTOUCHED_FRACTION * num_readings).astype(int), 1)
+    num_smallest_changes = np.maximum((_UNTOUCHED_FRACTION * num_readings).astype(int), 1)
     trimmed_deviations[has_steps] = (
-        np.cumsum(np.nan_to_num(magnitudes), axis=0)[num_small - 1, np.arange(len(num_small))]
-        / num_small
+        np.cumsum(np.nan_to_num(magnitudes), axis=0)[num_smallest_changes - 1, np.arange(len(num_smallest_changes))]
+        / num_smallest_changes
         / _NORMAL_MEAN_MAGNITUDE
         / np.sqrt(2)
     )
@@ -234,7 +234,7 @@ def _window_levels(steps: np.ndarray, window: int) -> np.ndarray:
     return np.array([channel_medians(steps[start : start + window]) for start in starts]) - channel_medians(steps)
 
 
-def _step_limits(triples: np.ndarray, window: int, floor: np.ndarray) -> tuple[np.ndarray, float, float]:
+def _step_limits(window_triples: np.ndarray, window: int, floor: np.ndarray) -> tuple[np.ndarray, float, float]:
     """Estimate the scale of each channel's change between windows, and two limits of voltage steps relative to this
     scale.
 
@@ -242,16 +242,18 @@ def _step_limits(triples: np.ndarray, window: int, floor: np.ndarray) -> tuple[n
     including touches. The steps in each half of the recording are relative to the scale of the other half, which is
     independent of them.
     """
-    pairs = triples[:, : 2 * window]
+    pairs = window_triples[:, : 2 * window]
     changes = np.nan_to_num(np.array([window_change(pair) for pair in pairs]))
-    half_index, lasting_sizes, sizes = len(changes) // 2, [0.0], [0.0]
-    rest_medians = channel_medians(np.concatenate(list(triples[:: max(1, len(triples) // _MIN_NUM_WINDOWS)])))
-    for training, test in (
-        (slice(None, half_index), slice(half_index, None)),
-        (slice(half_index, None), slice(None, half_index)),
+    middle_index, lasting_sizes, sizes = len(changes) // 2, [0.0], [0.0]
+    untouched_medians = channel_medians(
+        np.concatenate(list(window_triples[:: max(1, len(window_triples) // _MIN_NUM_WINDOWS)]))
+    )
+    for is_training_part, test in (
+        (slice(None, middle_index), slice(middle_index, None)),
+        (slice(middle_index, None), slice(None, middle_index)),
     ):
-        scale = _deviation_of_changes(changes[training], floor)
-        for triple, pair in zip(triples[test], pairs[test], strict=True):
+        scale = _deviation_of_changes(changes[is_training_part], floor)
+        for triple, pair in zip(window_triples[test], pairs[test], strict=True):
             step = lasting_step(pair, scale, 0.0)
             if step is None:
                 continue
@@ -259,13 +261,13 @@ def _step_limits(triples: np.ndarray, window: int, floor: np.ndarray) -> tuple[n
             direction = np.nan_to_num(step.change / scale**2)
             medians_after = channel_medians(triple[2 * window :])
             # A step back to the voltages of the untouched skin is the end of a touch.
-            if change_size((medians_after - rest_medians) / scale) < _MIN_REMAINING_FRACTION * step.size:
+            if change_size((medians_after - untouched_medians) / scale) < _MIN_REMAINING_FRACTION * step.size:
                 continue
-            remaining_change = np.nan_to_num(medians_after - channel_medians(pair[:window]))
-            if remaining_change @ direction > _MIN_REMAINING_FRACTION * (np.nan_to_num(step.change) @ direction):
+            lasting_change = np.nan_to_num(medians_after - channel_medians(pair[:window]))
+            if lasting_change @ direction > _MIN_REMAINING_FRACTION * (np.nan_to_num(step.change) @ direction):
                 lasting_sizes.append(step.size)
         lasting_sizes.append(float(np.median(change_size(changes[test] / scale))) if len(changes[test]) else 0.0)
-    factor = _CHANGE_FACTOR + _CHANGE_INCREASE / max(len(changes), 1)
+    factor = _CHANGE_LIMIT_FACTOR + _CHANGE_LIMIT_FACTOR_INCREASE / max(len(changes), 1)
     lasting_limit = max(_MIN_CHANGE_SIZE, factor * max(lasting_sizes))
     return _deviation_of_changes(changes, floor), lasting_limit, max(lasting_limit, factor * max(sizes))
 
@@ -274,14 +276,14 @@ def _level_limit(changes: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, fl
     """Estimate the scale of each channel's differences between windows and the whole recording, and the limit of these
     differences. Differences in each half of the recording are divided by the scale of the other half."""
     changes = np.nan_to_num(changes)
-    half_index = len(changes) // 2
+    middle_index = len(changes) // 2
     sizes = [
-        change_size(changes[half_index:] / _deviation_of_changes(changes[:half_index], floor)),
-        change_size(changes[:half_index] / _deviation_of_changes(changes[half_index:], floor)),
+        change_size(changes[middle_index:] / _deviation_of_changes(changes[:middle_index], floor)),
+        change_size(changes[:middle_index] / _deviation_of_changes(changes[middle_index:], floor)),
     ]
     max_size = float(np.concatenate(sizes).max(initial=0.0))
     return _deviation_of_changes(changes, floor), max(
-        _MIN_CHANGE_SIZE, (_LEVEL_FACTOR + _CHANGE_INCREASE / max(len(changes), 1)) * max_size
+        _MIN_CHANGE_SIZE, (_LEVEL_LIMIT_FACTOR + _CHANGE_LIMIT_FACTOR_INCREASE / max(len(changes), 1)) * max_size
     )
 
 
@@ -291,8 +293,8 @@ def _deviation_of_changes(changes: np.ndarray, floor: np.ndarray) -> np.ndarray:
         _DEVIATION_PER_MEAN_MAGNITUDE * np.mean(np.abs(changes), axis=0) if len(changes) else np.zeros(changes.shape[1])
     )
     # A channel may have hardly changed by chance while others did change.
-    typical_ratio = np.median(deviations[np.isfinite(floor)] / floor[np.isfinite(floor)])
-    return np.maximum(deviations, np.maximum(1.0, 0.5 * typical_ratio) * floor)
+    median_deviation_ratio = np.median(deviations[np.isfinite(floor)] / floor[np.isfinite(floor)])
+    return np.maximum(deviations, np.maximum(1.0, 0.5 * median_deviation_ratio) * floor)
 
 
 def _touch_directions(frames: np.ndarray, noise: np.ndarray, window: int) -> tuple[np.ndarray, float]:
@@ -312,10 +314,10 @@ def _touch_directions(frames: np.ndarray, noise: np.ndarray, window: int) -> tup
     ]
     frames_of_touches = frames_of_touches if len(frames_of_touches) >= _MIN_WINDOW_STEPS else scaled_frames
     frames_of_touches = frames_of_touches[:: max(1, len(frames_of_touches) // 2000)]
-    half_index, fractions = len(frames_of_touches) // 2, []
+    middle_index, fractions = len(frames_of_touches) // 2, []
     for training, test in (
-        (frames_of_touches[:half_index], frames_of_touches[half_index:]),
-        (frames_of_touches[half_index:], frames_of_touches[:half_index]),
+        (frames_of_touches[:middle_index], frames_of_touches[middle_index:]),
+        (frames_of_touches[middle_index:], frames_of_touches[:middle_index]),
     ):
         if len(training) and len(test):
             fractions.append(_fraction_outside(test, _principal_directions(training)))

@@ -30,7 +30,7 @@ from jeit.mesh.checks import size_checked
 from jeit_solvers.engines import on_host
 
 # Maximum number of times that a cell of the mesh is halved.
-_MAX_ROUNDS = 12
+_MAX_HALVINGS_OF_CELL = 12
 # Classes of electrodes that remain valid if the mesh of the skin is refined.
 _MESH_INDEPENDENT = (BoundaryElectrodes, SheetDiscs, PointElectrodes, NodeElectrodes)
 
@@ -47,8 +47,8 @@ def finer_model(
     mesh = model.mesh
     check_flat(mesh, "cuts")
     if mesh.dimension == 2 and isinstance(model.electrodes, _MESH_INDEPENDENT):
-        refined_mesh, parent = finer_mesh(mesh, centre, radius, 0.5 * edge**2)
-        return ForwardModel(refined_mesh, model.electrodes, model.protocol), parent, edge
+        refined_mesh, parent_cells = finer_mesh(mesh, centre, radius, 0.5 * edge**2)
+        return ForwardModel(refined_mesh, model.electrodes, model.protocol), parent_cells, edge
     bounding_box_sides = np.ptp(np.asarray(mesh.points), axis=0)
     if mesh.dimension == 2:
         edge = float(np.sqrt(2 * np.mean(np.asarray(measures(mesh)))))
@@ -64,18 +64,18 @@ def finer_mesh(mesh: Mesh, centre: np.ndarray, radius: float, area: float) -> tu
     Returns the refined mesh, and the index of the original cell that contains each refined cell.
     """
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
-    parent = np.arange(len(cells))
-    for _ in range(_MAX_ROUNDS):
+    parent_cells = np.arange(len(cells))
+    for _ in range(_MAX_HALVINGS_OF_CELL):
         refined_mesh = Mesh.create(points, cells)
         is_near = np.linalg.norm(np.asarray(centroids(refined_mesh)) - centre, axis=1) < radius
         is_large = is_near & (np.asarray(measures(refined_mesh)) > area)
         if not is_large.any():
             break
-        points, cells, parent = _halve_cells(points, cells, parent, is_large)
-    return Mesh.create(points, cells), parent
+        points, cells, parent_cells = _halve_cells(points, cells, parent_cells, is_large)
+    return Mesh.create(points, cells), parent_cells
 
 
-def _halve_cells(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, is_large: Bool[np.ndarray, " m"]):
+def _halve_cells(points: np.ndarray, cells: np.ndarray, parent_cells: np.ndarray, is_large: Bool[np.ndarray, " m"]):
     """Halve the cells that `is_large` marks, and further cells as needed to avoid hanging nodes. Returns the points,
     the cells, and the index of each cell's original cell."""
     node_pairs = np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).astype(np.int64)
@@ -89,10 +89,10 @@ def _halve_cells(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, is_l
     is_split = np.zeros(len(edges), bool)
     is_split[longest_edges[is_large]] = True
     while True:
-        is_hanging = is_split[edge_numbers].any(axis=1) & ~is_split[longest_edges]
-        if not is_hanging.any():
+        has_hanging_node = is_split[edge_numbers].any(axis=1) & ~is_split[longest_edges]
+        if not has_hanging_node.any():
             break
-        is_split[longest_edges[is_hanging]] = True
+        is_split[longest_edges[has_hanging_node]] = True
     midpoint_nodes = np.full(len(edges), -1)
     midpoint_nodes[is_split] = len(points) + np.arange(is_split.sum())
     points = np.concatenate([points, points[edges[is_split]].mean(axis=1)])
@@ -105,20 +105,24 @@ def _halve_cells(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, is_l
     )
     is_unchanged = ~is_split[longest_edges]
     first_node, second_node, third_node = rotated_cells[~is_unchanged].T
-    new_nodes, parents_of_halved = midpoint_nodes[rotated_edges[~is_unchanged]], parent[~is_unchanged]
-    new_cells, new_parents = [rotated_cells[is_unchanged]], [parent[is_unchanged]]
+    new_nodes, parents_of_halved = midpoint_nodes[rotated_edges[~is_unchanged]], parent_cells[~is_unchanged]
+    new_cells, new_parents = [rotated_cells[is_unchanged]], [parent_cells[is_unchanged]]
     half_triangles = ((second_node, third_node, new_nodes[:, 1]), (third_node, first_node, new_nodes[:, 2]))
     for corner, opposite_corner, edge_midpoint in half_triangles:
         # Half of a cell is the triangle (corner, opposite, midpoint of the longest edge); its edge from corner to
         # opposite may be halved too.
-        is_halved = edge_midpoint >= 0
+        is_halved_cell = edge_midpoint >= 0
         longest_midpoint = new_nodes[:, 0]
         new_cells += [
-            np.column_stack([corner, opposite_corner, longest_midpoint])[~is_halved],
-            np.column_stack([corner, edge_midpoint, longest_midpoint])[is_halved],
-            np.column_stack([edge_midpoint, opposite_corner, longest_midpoint])[is_halved],
+            np.column_stack([corner, opposite_corner, longest_midpoint])[~is_halved_cell],
+            np.column_stack([corner, edge_midpoint, longest_midpoint])[is_halved_cell],
+            np.column_stack([edge_midpoint, opposite_corner, longest_midpoint])[is_halved_cell],
         ]
-        new_parents += [parents_of_halved[~is_halved], parents_of_halved[is_halved], parents_of_halved[is_halved]]
+        new_parents += [
+            parents_of_halved[~is_halved_cell],
+            parents_of_halved[is_halved_cell],
+            parents_of_halved[is_halved_cell],
+        ]
     return points, np.concatenate(new_cells), np.concatenate(new_parents)
 
 
@@ -171,11 +175,11 @@ class LocalChange:
         region, and its derivatives along the changes in `directions`."""
         cells, product, solution = self._solve_change(change)
         fields: Any = unit_fields(solution, product, self.resistance)[0]  # pyright: ignore[reportArgumentType]
-        node_fields = np.zeros((self.solution.shape[0], fields.shape[1]))
+        nodal_fields = np.zeros((self.solution.shape[0], fields.shape[1]))
         nodes = np.unique(self.corners[cells])
-        node_fields[nodes] = fields
+        nodal_fields[nodes] = fields
         field_gradients = np.einsum(
-            "ckd,ckl->dcl", self.gradients[cells], node_fields[self.corners[cells]], optimize=True
+            "ckd,ckl->dcl", self.gradients[cells], nodal_fields[self.corners[cells]], optimize=True
         )
         impedance_derivatives = []
         for direction in directions:

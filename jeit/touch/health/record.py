@@ -93,10 +93,10 @@ class HealthRecord:
         fault = "is several times as noisy as it was, or jumps" if kind == EventKind.NOISY else "does not move"
         record = self
         for channel in np.flatnonzero(channels):
-            is_channel = np.arange(self.reference.size) == channel
-            finding = Finding(kind, f"Channel {channel} {fault}.", True, channels=is_channel)
+            is_faulty_channel = np.arange(self.reference.size) == channel
+            finding = Finding(kind, f"Channel {channel} {fault}.", True, channels=is_faulty_channel)
             event = record.create_event(event_time, finding, EventStatus.LASTING)
-            event = eqx.tree_at(lambda event: event.channels, event, is_channel)
+            event = eqx.tree_at(lambda event: event.channels, event, is_faulty_channel)
             record = replace(record, events=(*record.events, event))
         return record if record is self else record._update_trusted_channels()
 

@@ -28,7 +28,7 @@ from jeit.touch.health.healthy import HealthyState, average_frames, check_frames
 from jeit.touch.health.record import CHANNEL_KINDS, MIN_DISAPPEARED_FRACTION, HealthRecord
 
 # Patience, a time longer than any touch is held, in seconds.
-PATIENCE = 30.0
+DEFAULT_PATIENCE = 30.0
 # Patience as a number of windows, for frames without times.
 _PATIENCE_WINDOWS = 3
 # Ratio of the patience to the length of a window of frames.
@@ -38,7 +38,7 @@ _REFERENCE_WEIGHT = 0.1
 # Minimum fraction of channels with a reading, below which a frame is refused.
 _MIN_READ_FRACTION = 0.5
 # Multiple of the span of healthy changes beyond which a channel is faulty.
-_SPAN_FACTOR = 3.0
+_FAULTY_SPAN_RATIO = 3.0
 # Maximum fraction of channels that may be beyond this multiple of the span at once.
 _MAX_OUTLIER_FRACTION = 0.34
 
@@ -126,7 +126,7 @@ class SkinHealth:
             period = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
         if patience is not None and not (is_number(patience) and patience > 0):
             raise ValueError(f"patience must be positive, in seconds; it is {describe(patience)}.")
-        wanted_patience = PATIENCE if times is not None and patience is None else patience
+        wanted_patience = DEFAULT_PATIENCE if times is not None and patience is None else patience
         state = HealthyState.learn(
             frames, period, None if wanted_patience is None else float(wanted_patience) / _PATIENCE_PER_WINDOW
         )
@@ -273,7 +273,7 @@ class SkinHealth:
     def _process(self, time: float, values: np.ndarray, has_reading: np.ndarray) -> "SkinHealth":
         healthy = self.healthy
         lower_limits, upper_limits = healthy.span + self.reference
-        margins = _SPAN_FACTOR * (upper_limits - lower_limits) + healthy.limit * np.where(
+        margins = _FAULTY_SPAN_RATIO * (upper_limits - lower_limits) + healthy.limit * np.where(
             healthy.used, healthy.noise, 0.0
         )
         is_outlier = has_reading & ((values < lower_limits - margins) | (values > upper_limits + margins))
@@ -383,9 +383,9 @@ class SkinHealth:
         scale = np.where(self.trusted, self.healthy.scale, np.inf)
         if change_size(deviations / scale) <= self.healthy.limit:  # the skin is as before a touch
             return next_state
-        reversed_record = self.record.mend_reversed_event(change)
-        if reversed_record is not None:
-            return replace(next_state, record=reversed_record)
+        record_without_reversed_event = self.record.mend_reversed_event(change)
+        if record_without_reversed_event is not None:
+            return replace(next_state, record=record_without_reversed_event)
         findings = classify_change(
             step.change, frames_after, self.reference, self.healthy, self.record.touching, self.skin
         )

@@ -15,15 +15,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 # Fraction of a window's changes, those of smallest magnitude, from which noise is estimated.
-_SMALL_FRACTION = 0.5
+_SMALLEST_CHANGES_FRACTION = 0.5
 # Minimum fraction of changes that have readings.
 _MIN_READ_FRACTION = 0.5
 # Minimum limit of a variation measure, as a multiple of the usual value.
 _MIN_LIMIT_RATIO = 3.0
 # Limit of a variation measure, as a multiple of the maximum among healthy windows.
-_UNSTEADY_FACTOR = 2.0
-# Increase of `_UNSTEADY_FACTOR`, to be divided by the number of windows.
-_UNSTEADY_INCREASE = 12.0
+_UNSTEADY_LIMIT_FACTOR = 2.0
+# Increase of `_UNSTEADY_LIMIT_FACTOR`, to be divided by the number of windows.
+_UNSTEADY_LIMIT_FACTOR_INCREASE = 12.0
 # Minimum fraction of steps in which a healthy channel changes; a channel that changes less often never counts as stuck.
 _MIN_MOVING_FRACTION = 0.6
 # Maximum fraction of channels that may be noisy or stuck at once.
@@ -51,16 +51,17 @@ class Steadiness:
         """
         starts = range(0, max(1, len(steps) - window + 1), max(1, window // 2))
         measures = np.array([_variation_measures(steps[start : start + window]) for start in starts])  # (windows, 2, M)
-        half_index, ratios = len(measures) // 2, [np.zeros((1, *measures.shape[1:]))]
+        middle_index, ratios = len(measures) // 2, [np.zeros((1, *measures.shape[1:]))]
         for training, test in (
-            (measures[:half_index], measures[half_index:]),
-            (measures[half_index:], measures[:half_index]),
+            (measures[:middle_index], measures[middle_index:]),
+            (measures[middle_index:], measures[:middle_index]),
         ):
             if len(training) and len(test):
                 ratios.append(_relative_to_others(np.nan_to_num(test / _usual_variation(training, noise))))
         max_ratios = np.concatenate(ratios).max(axis=(0, 2))
         limits = np.maximum(
-            _MIN_LIMIT_RATIO, (_UNSTEADY_FACTOR + _UNSTEADY_INCREASE / max(len(measures), 1)) * max_ratios
+            _MIN_LIMIT_RATIO,
+            (_UNSTEADY_LIMIT_FACTOR + _UNSTEADY_LIMIT_FACTOR_INCREASE / max(len(measures), 1)) * max_ratios,
         )
         # With a coarse analogue-to-digital converter, a channel may read the same value throughout a window.
         differences = np.diff(steps, axis=0)
@@ -77,8 +78,8 @@ class Steadiness:
 
         `steps` (steps, channels): averaged frames of both windows, volts; `trusted`: whether each channel may be used.
         """
-        half_index, exceeds_by_window = len(steps) // 2, []
-        for window_steps in (steps[:half_index], steps[half_index:]):
+        middle_index, exceeds_by_window = len(steps) // 2, []
+        for window_steps in (steps[:middle_index], steps[middle_index:]):
             ratios = np.where(trusted, np.nan_to_num(_variation_measures(window_steps) / self.usual_values), 0.0)
             exceeds_by_window.append((_relative_to_others(ratios) > self.limits[:, None]).any(axis=0))
         return self._exclude_common_changes(exceeds_by_window, trusted)
@@ -88,11 +89,11 @@ class Steadiness:
     ) -> Bool[np.ndarray, " M"]:
         """Return whether each channel is constant in both of two windows while other channels change; arguments: see
         `noisy_channels`."""
-        half_index = len(steps) // 2
+        middle_index = len(steps) // 2
         return self._exclude_common_changes(
             [
                 (_variation_measures(window_steps)[1] == 0) & self.can_be_stuck
-                for window_steps in (steps[:half_index], steps[half_index:])
+                for window_steps in (steps[:middle_index], steps[middle_index:])
             ],
             trusted,
         )
@@ -130,7 +131,7 @@ def _variation_measures(window_steps: Float[np.ndarray, "w M"]) -> Float[np.ndar
     magnitudes = np.sort(np.abs(np.diff(window_steps, axis=0)), axis=0)  # NaN last
     num_readings = np.isfinite(magnitudes).sum(axis=0)
     magnitudes, cumulative_sums = np.nan_to_num(magnitudes), np.cumsum(np.nan_to_num(magnitudes), axis=0)
-    num_small_changes = np.maximum((_SMALL_FRACTION * num_readings).astype(int), 1)
+    num_small_changes = np.maximum((_SMALLEST_CHANGES_FRACTION * num_readings).astype(int), 1)
     channels = np.arange(magnitudes.shape[1])
     measures = np.stack(
         [

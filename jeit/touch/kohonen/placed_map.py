@@ -16,8 +16,8 @@ from scipy.sparse.linalg import lsqr
 from scipy.spatial import KDTree
 
 from jeit.arguments import check_key, check_kind, real_array
-from jeit.arguments.extras import optional
-from jeit.files import npz_arrays, require_arrays, written_whole
+from jeit.arguments.extras import import_optional
+from jeit.files import atomically_written_file, npz_arrays, require_arrays
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 
 # Number of neurons from which the place of a frame is estimated, and regularisation of the neurons' shares. The
@@ -26,7 +26,7 @@ from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 _NUM_NEAREST, _REGULARISATION = 9, 0.05
 _NUM_ON_GRID, _REGULARISATION_ON_GRID = 25, 0.005
 # Weight of the mean place of a neuron's presses in the least-squares fit of the neuron's place, relative to one press.
-_MEAN_WEIGHT = 0.3
+_MEAN_PLACE_WEIGHT = 0.3
 _MIN_PRESSES = 10
 # Fields of a `PlacedMap` that its file contains in addition to the map.
 _PLACE_FIELDS = "places", "widening", "missed", "fitted"
@@ -86,11 +86,11 @@ class PlacedMap:
         if len(frames) < _MIN_PRESSES or (positions == positions[0]).all():
             raise ValueError(f"positions: give those of {_MIN_PRESSES} presses or more, at different places.")
         nearest_neurons = learnt.nearest(frames, 1)[0][:, 0]
-        is_odd = np.arange(len(frames)) % 2 == 1
+        is_odd_frame = np.arange(len(frames)) % 2 == 1
         candidates = []
         for is_fitted in (False, True):
             squared_error = squared_spread = squared_residual = 0.0
-            for is_held_out in (is_odd, ~is_odd):
+            for is_held_out in (is_odd_frame, ~is_odd_frame):
                 training_map = cls._from_presses(
                     learnt, frames[~is_held_out], positions[~is_held_out], nearest_neurons[~is_held_out], is_fitted
                 )
@@ -127,14 +127,15 @@ class PlacedMap:
         placed_map = cls(learnt, mean_positions, 1.0, 0.0, mean_positions if is_fitted else None)
         if not is_fitted:
             return placed_map
-        neurons, neuron_weights, _ = placed_map._find_neurons_and_weights(frames)
-        rows = np.repeat(np.arange(len(frames)), neurons.shape[1])
+        combined_neurons, neuron_weights, _ = placed_map._find_neurons_and_weights(frames)
+        rows = np.repeat(np.arange(len(frames)), combined_neurons.shape[1])
         combination_matrix = csr_array(
-            (neuron_weights.ravel(), (rows, neurons.ravel())), shape=(len(frames), np.count_nonzero(win_counts))
+            (neuron_weights.ravel(), (rows, combined_neurons.ravel())),
+            shape=(len(frames), np.count_nonzero(win_counts)),
         )
         place_errors = positions - combination_matrix @ mean_positions[placed_map.placed]
         place_corrections = [
-            lsqr(combination_matrix, column, damp=np.sqrt(_MEAN_WEIGHT), atol=1e-9, btol=1e-9)[0]
+            lsqr(combination_matrix, column, damp=np.sqrt(_MEAN_PLACE_WEIGHT), atol=1e-9, btol=1e-9)[0]
             for column in place_errors.T
         ]
         fitted_positions = mean_positions.copy()
@@ -161,8 +162,8 @@ class PlacedMap:
         return estimate.places, self.widening * estimate.deviation
 
     def _estimate_places(self, frames: Float[np.ndarray, "n M"]) -> "_Estimate":
-        neurons, neuron_weights, residuals = self._find_neurons_and_weights(frames)
-        neuron_places = self._placed_neurons.places[neurons]
+        combined_neurons, neuron_weights, residuals = self._find_neurons_and_weights(frames)
+        neuron_places = self._placed_neurons.places[combined_neurons]
         initial_places = neuron_places.mean(axis=1) if self.fitted is None else neuron_places[:, 0]
         offset = np.einsum("nq,nqd->nd", neuron_weights, neuron_places) - initial_places
         max_lengths = np.linalg.norm(neuron_places - initial_places[:, None], axis=2).max(axis=1)
@@ -178,22 +179,22 @@ class PlacedMap:
         """
         placed_neurons = self._placed_neurons
         if self.fitted is None:
-            neurons, regularisation = (
+            combined_neurons, regularisation = (
                 placed_neurons.neurons.nearest(frames, min(_NUM_NEAREST, len(placed_neurons.places)))[0],
                 _REGULARISATION,
             )
         else:
-            neurons, regularisation = (
+            combined_neurons, regularisation = (
                 placed_neurons.grid_neighbours[placed_neurons.neurons.winners(frames)[:, 1]],
                 _REGULARISATION_ON_GRID,
             )
-        neuron_weights, residuals = np.empty(neurons.shape), np.empty(frames.shape)
+        neuron_weights, residuals = np.empty(combined_neurons.shape), np.empty(frames.shape)
         for start in range(0, len(frames), _CHUNK_SIZE):
             rows = slice(start, start + _CHUNK_SIZE)
             neuron_weights[rows], residuals[rows] = _fit_combination_weights(
-                placed_neurons.neurons.weights[0][neurons[rows]], frames[rows], regularisation
+                placed_neurons.neurons.weights[0][combined_neurons[rows]], frames[rows], regularisation
             )
-        return neurons, neuron_weights, residuals
+        return combined_neurons, neuron_weights, residuals
 
     def predict(self, features: ArrayLike) -> Float[np.ndarray, "n d"]:
         """Estimate the places of touches as `locate` does, without standard deviations, in the interface of
@@ -244,11 +245,11 @@ def _fit_combination_weights(
     num_neurons = neuron_frames.shape[1]
     mean_frames = neuron_frames.mean(axis=1, keepdims=True)
     deviations = neuron_frames - mean_frames
-    gram = deviations @ np.swapaxes(deviations, 1, 2)
-    diagonal = np.einsum("nqq->nq", gram)  # a view of the diagonal of `gram`
+    gram_matrix = deviations @ np.swapaxes(deviations, 1, 2)
+    diagonal = np.einsum("nqq->nq", gram_matrix)  # a view of the diagonal of `gram_matrix`
     diagonal += regularisation * diagonal.mean(axis=1, keepdims=True) + 1e-300
     change = frames - mean_frames[:, 0]
-    weights = np.linalg.solve(gram, deviations @ change[..., None])
+    weights = np.linalg.solve(gram_matrix, deviations @ change[..., None])
     residuals = change - (np.swapaxes(weights, 1, 2) @ deviations)[:, 0]
     return weights[..., 0] + (1 - weights.sum(axis=1)) / num_neurons, residuals
 
@@ -267,20 +268,20 @@ def drawn_map(learnt: SelfOrganisingMap, key: Array) -> Float[np.ndarray, "R C 2
     places are those on the grid, shifted slightly at random by `key`; the orientation of the drawing has no meaning.
     Raises `ValueError` if `learnt` is no map, and for an invalid key.
     """
-    networkx = optional("networkx", "a map drawn as a graph")
+    networkx = import_optional("networkx", "a map drawn as a graph")
     import jax
 
     check_kind("learnt", learnt, SelfOrganisingMap, "a map, as of SelfOrganisingMap.fit")
     check_key(key)
     rows, columns = learnt.shape
-    first_ends, second_ends = neighbours(learnt.shape)
+    first_neurons, second_neurons = neighbours(learnt.shape)
     weight_rows = learnt.weights.reshape(rows * columns, -1)
-    distances = np.linalg.norm(weight_rows[first_ends] - weight_rows[second_ends], axis=1)
+    distances = np.linalg.norm(weight_rows[first_neurons] - weight_rows[second_neurons], axis=1)
     median_distance = float(np.median(distances)) or 1.0
     strengths = median_distance / np.maximum(distances, _MIN_RELATIVE_DISTANCE * median_distance)
     graph = networkx.Graph()
     graph.add_nodes_from(range(rows * columns))
-    graph.add_weighted_edges_from(zip(first_ends.tolist(), second_ends.tolist(), strengths.tolist(), strict=True))
+    graph.add_weighted_edges_from(zip(first_neurons.tolist(), second_neurons.tolist(), strengths.tolist(), strict=True))
     grid = np.stack(np.unravel_index(np.arange(rows * columns), learnt.shape), axis=1) / max(rows, columns)
     grid = grid + 1e-3 * np.asarray(jax.random.normal(key, grid.shape))
     initial_places = dict(enumerate(grid))
@@ -291,8 +292,8 @@ def drawn_map(learnt: SelfOrganisingMap, key: Array) -> Float[np.ndarray, "R C 2
 def neighbours(shape: tuple[int, int]) -> tuple[Int[np.ndarray, " e"], Int[np.ndarray, " e"]]:
     """Return the indices, counted row by row, of the neurons at both ends of every edge of a grid of this `shape`."""
     indices = np.arange(shape[0] * shape[1]).reshape(shape)
-    first_ends = np.concatenate([indices[:-1].ravel(), indices[:, :-1].ravel()])
-    return first_ends, np.concatenate([indices[1:].ravel(), indices[:, 1:].ravel()])
+    first_neurons = np.concatenate([indices[:-1].ravel(), indices[:, :-1].ravel()])
+    return first_neurons, np.concatenate([indices[1:].ravel(), indices[:, 1:].ravel()])
 
 
 def write_map(learnt: SelfOrganisingMap | PlacedMap, path: str | Path) -> None:
@@ -316,11 +317,11 @@ def write_map(learnt: SelfOrganisingMap | PlacedMap, path: str | Path) -> None:
     if Path(path).is_dir():
         raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / 'map.npz'}.")
     has_places = isinstance(learnt, PlacedMap)
-    plain_map = learnt.learnt if has_places else learnt
+    map_without_places = learnt.learnt if has_places else learnt
     place_arrays = {name: getattr(learnt, name) for name in _PLACE_FIELDS} if has_places else {}
     place_arrays = {name: value for name, value in place_arrays.items() if value is not None}
-    with written_whole(path) as file:
-        np.savez_compressed(file, weights=plain_map.weights, scale=plain_map.scale, **place_arrays)
+    with atomically_written_file(path) as file:
+        np.savez_compressed(file, weights=map_without_places.weights, scale=map_without_places.scale, **place_arrays)
 
 
 def read_map(path: str | Path) -> SelfOrganisingMap | PlacedMap:

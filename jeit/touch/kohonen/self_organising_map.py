@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_key, check_kind, counted, describe, is_number, real_array
-from jeit.arguments.extras import optional
+from jeit.arguments.extras import import_optional
 from jeit.touch.kohonen.training import MapSchedule, train
 
 # Minimum number of frames from which a map is learnt: fewer frames define no order.
@@ -190,11 +190,11 @@ def learn_weights(
     pairs = [(key, schedule) for key in keys for schedule in schedules]
     initial_weights = np.stack([_draw_initial_weights(frames, key, shape) for key, _ in pairs])
     orders = np.stack([_draw_order(key, len(frames), schedule.steps) for key, schedule in pairs])
-    rates = np.stack([schedule.rates() for _, schedule in pairs])
+    learning_rates = np.stack([schedule.rates() for _, schedule in pairs])
     max_ordering = max(schedule.ordering for schedule in schedules)
     radii = np.stack([_extend_radii(schedule.radii(shape), max_ordering) for _, schedule in pairs])
     train_maps = jax.vmap(train, in_axes=(0, None, 0, 0, 0)) if len(pairs) > 1 else _train_single_map
-    weights, curves = train_maps(jnp.asarray(initial_weights), jnp.asarray(frames), orders, rates, radii)
+    weights, curves = train_maps(jnp.asarray(initial_weights), jnp.asarray(frames), orders, learning_rates, radii)
     return np.asarray(weights), np.asarray(curves)
 
 
@@ -227,8 +227,10 @@ def _extend_radii(radii: Float[np.ndarray, " O"], max_ordering: int) -> Float[np
     return np.concatenate([radii, np.full(max_ordering - len(radii), _WINNER_ONLY_RADIUS)])
 
 
-def _train_single_map(initial_weights, frames, orders, rates, radii):
-    return tuple(array[None] for array in train(initial_weights[0], frames, orders[0], rates[0], radii[0]))
+def _train_single_map(initial_weights, frames, frame_orders, learning_rates, radii):
+    return tuple(
+        array[None] for array in train(initial_weights[0], frames, frame_orders[0], learning_rates[0], radii[0])
+    )
 
 
 def _create_map(weights: np.ndarray, frames: np.ndarray, scale: float | None) -> SelfOrganisingMap:
@@ -301,7 +303,7 @@ def map_quality(learnt: SelfOrganisingMap, frames: ArrayLike) -> MapQuality:
     print(quality)
     ```
     """
-    trustworthiness = optional("sklearn.manifold", "the trustworthiness of a map").trustworthiness
+    trustworthiness = import_optional("sklearn.manifold", "the trustworthiness of a map").trustworthiness
 
     check_kind("learnt", learnt, SelfOrganisingMap, "a map, as of SelfOrganisingMap.fit")
     frames = learnt.checked(frames)
@@ -312,8 +314,8 @@ def map_quality(learnt: SelfOrganisingMap, frames: ArrayLike) -> MapQuality:
     grid_distances = np.maximum(np.abs(row[:, 0] - row[:, 1]), np.abs(column[:, 0] - column[:, 1]))
     compared_frames = np.unique(np.linspace(0, len(frames) - 1, _MAX_COMPARED_FRAMES).astype(int))
     grid_positions = np.stack([row[compared_frames, 0], column[compared_frames, 0]], axis=1).astype(float)
-    trust_score = trustworthiness(frames[compared_frames], grid_positions, n_neighbors=_NUM_NEIGHBOURS)
-    return MapQuality(float(distances[:, 0].mean()), float(np.mean(grid_distances > 1)), float(trust_score))
+    trustworthiness_score = trustworthiness(frames[compared_frames], grid_positions, n_neighbors=_NUM_NEIGHBOURS)
+    return MapQuality(float(distances[:, 0].mean()), float(np.mean(grid_distances > 1)), float(trustworthiness_score))
 
 
 def learning_curves(

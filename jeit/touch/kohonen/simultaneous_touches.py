@@ -12,7 +12,7 @@ from jeit.arguments import check_kind, describe, is_number, real_array
 from jeit.touch.kohonen.placed_map import PlacedMap
 
 # Minimum strength of a touch, relative to the strongest touch.
-_MIN_STRENGTH = 0.08
+_MIN_RELATIVE_STRENGTH = 0.08
 # Minimum distance between touches, relative to the extent of the places of a map's neurons.
 _RELATIVE_SEPARATION = 0.1
 # Minimum decrease of the residual sum of squares by each further touch, divided by the residual variance of a
@@ -44,9 +44,9 @@ def neuron_shares(placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> 
     and Hanson 1974). Raises `ValueError` if `placed` is no map with places, and for more than one frame, a number of
     channels that is not that of the map, and NaN.
     """
-    touch_sum = _TouchSuperposition.from_frame(placed, frame, reference)
+    superposition = _TouchSuperposition.from_frame(placed, frame, reference)
     neuron_weights = np.zeros(placed.learnt.shape)
-    neuron_weights[placed.placed] = touch_sum.fit_weights(np.ones(len(touch_sum.places), bool))[0]
+    neuron_weights[placed.placed] = superposition.fit_weights(np.ones(len(superposition.places), bool))[0]
     return neuron_weights
 
 
@@ -55,7 +55,7 @@ def touches_reported(
     frame: ArrayLike,
     reference: ArrayLike,
     *,
-    least: float = _MIN_STRENGTH,
+    least: float = _MIN_RELATIVE_STRENGTH,
     apart: float | None = None,
 ) -> list[MapTouch]:
     """Detect the touches in a frame by a self-organising map: at most six, the strongest first.
@@ -87,20 +87,20 @@ def touches_reported(
         raise ValueError(f"least must be a share, from 0 to below 1; it is {describe(least)}.")
     if apart is not None and not (is_number(apart) and apart > 0):
         raise ValueError(f"apart must be positive, in metres; it is {describe(apart)}.")
-    touch_sum = _TouchSuperposition.from_frame(placed, frame, reference)
+    superposition = _TouchSuperposition.from_frame(placed, frame, reference)
     if apart is None:
-        apart = _RELATIVE_SEPARATION * float(np.ptp(touch_sum.places, axis=0).max())
-    neuron_weights, residual = touch_sum.fit_weights(np.ones(len(touch_sum.places), bool))
+        apart = _RELATIVE_SEPARATION * float(np.ptp(superposition.places, axis=0).max())
+    neuron_weights, residual = superposition.fit_weights(np.ones(len(superposition.places), bool))
     num_neurons = np.count_nonzero(neuron_weights)
     if not num_neurons:
         return []
-    variance = max(residual / max(len(touch_sum.change) - num_neurons, 1), touch_sum.variance)
-    selected_groups = _select_groups(touch_sum, touch_sum.group_neurons(neuron_weights, apart), variance)
+    variance = max(residual / max(len(superposition.change) - num_neurons, 1), superposition.variance)
+    selected_groups = _select_groups(superposition, superposition.group_neurons(neuron_weights, apart), variance)
     if not selected_groups:
         return []
-    neuron_weights, _ = touch_sum.fit_weights(np.any(selected_groups, axis=0))
+    neuron_weights, _ = superposition.fit_weights(np.any(selected_groups, axis=0))
     touches = [
-        _create_touch(touch_sum.places[group], neuron_weights[group])
+        _create_touch(superposition.places[group], neuron_weights[group])
         for group in selected_groups
         if neuron_weights[group].any()
     ]

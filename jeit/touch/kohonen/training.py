@@ -33,7 +33,7 @@ from jeit_solvers.module import Module
 _ORDERING_FRAMES, _TUNING_FRAMES = 16, 64
 # Mode of indexing arrays in JAX: all indices are within bounds, since they are indices of neurons. In other modes, JAX
 # copies all distances.
-_IN_BOUNDS = "promise_in_bounds"
+_INDEXING_MODE = "promise_in_bounds"
 
 
 class MapSchedule(Module):
@@ -101,10 +101,10 @@ def train(
     """
     shape, mean_frame, num_ordering = weights.shape[:2], frames.mean(axis=0), len(radii)
 
-    def train_phase(phase, weight_rows, block_size, frame_order, rates, *radii):
+    def train_phase(phase, weight_rows, block_size, frame_order, learning_rates, *radii):
         num_padding = -len(frame_order) % block_size
         # Frames are appended to fill the last block; their learning rate is 0, so they change no weights.
-        order_rates = [jnp.pad(values, (0, num_padding)) for values in (frame_order, rates)]
+        order_rates = [jnp.pad(values, (0, num_padding)) for values in (frame_order, learning_rates)]
         blocks = *order_rates, *(jnp.pad(values, (0, num_padding), "edge") for values in radii)
 
         def train_block(weight_rows, block):
@@ -166,19 +166,21 @@ def _tuning_phase(shape, weights, frames, rates):
     Returns the weights (neurons, channels) after these frames, and the mean of all weights after each frame."""
 
     def show_frame(state, step):
-        distances, weight_means, (winner, winner_distances) = state
+        distances, weight_means, (winning_neuron, winning_distances) = state
         frame_index, rate, frame_distances, frame_mean = step
         # The distances of the previous frame's winner are written before any distances are read, which avoids a copy of
         # the array.
-        distances = distances.at[:, winner].set(winner_distances, mode=_IN_BOUNDS)
+        distances = distances.at[:, winning_neuron].set(winning_distances, mode=_INDEXING_MODE)
         row, column = _find_winner(distances[frame_index], shape)
-        winner = row * shape[1] + column
-        old_distances = distances.at[:, winner].get(mode=_IN_BOUNDS)
-        winner_distances = (1 - rate) * old_distances + rate * (
-            frame_distances - (1 - rate) * old_distances[frame_index]
+        winning_neuron = row * shape[1] + column
+        distances_before_move = distances.at[:, winning_neuron].get(mode=_INDEXING_MODE)
+        winning_distances = (1 - rate) * distances_before_move + rate * (
+            frame_distances - (1 - rate) * distances_before_move[frame_index]
         )
-        weight_means = weight_means.at[winner].add(rate * (frame_mean - weight_means[winner]), mode=_IN_BOUNDS)
-        return (distances, weight_means, (winner, winner_distances)), (winner, weight_means.mean())
+        weight_means = weight_means.at[winning_neuron].add(
+            rate * (frame_mean - weight_means[winning_neuron]), mode=_INDEXING_MODE
+        )
+        return (distances, weight_means, (winning_neuron, winning_distances)), (winning_neuron, weight_means.mean())
 
     distances, frame_distances = _squared_distances(frames, weights), _squared_distances(frames, frames)
     initial_state = distances, weights.mean(axis=1), (jnp.zeros((), int), distances[:, 0])
@@ -198,17 +200,17 @@ def _find_winner(distances, shape):
 
     The minimum of each column of the grid is found first, for many columns at once.
     """
-    distance_grid = distances.reshape(shape)
-    column = jnp.argmin(distance_grid.min(axis=0))
-    return jnp.argmin(distance_grid[:, column]), column
+    distances_on_grid = distances.reshape(shape)
+    column = jnp.argmin(distances_on_grid.min(axis=0))
+    return jnp.argmin(distances_on_grid[:, column]), column
 
 
 def _move_weights(weights, move_fractions, frames):
     """Move the weights of neurons towards frames, one frame after another, by `move_fractions` (frames, neurons) of the
     remaining way."""
 
-    def split_remaining_weight(remaining, share):
-        return remaining * (1 - share), remaining * share
+    def split_remaining_weight(remaining_weight, share):
+        return remaining_weight * (1 - share), remaining_weight * share
 
     # From the last frame to the first: later frames reduce the contribution of a frame by their own shares.
     weight_shares, frame_shares = jax.lax.scan(

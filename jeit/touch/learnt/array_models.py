@@ -78,8 +78,10 @@ class Forest:
                 nodes = regressor_tree.nodes
                 value = np.zeros((len(nodes), len(models)))
                 value[:, target] = nodes["value"]
-                leaf = nodes["is_leaf"].astype(bool)
-                trees.append((nodes["feature_idx"], nodes["num_threshold"], nodes["left"], nodes["right"], leaf, value))
+                is_leaf = nodes["is_leaf"].astype(bool)
+                trees.append(
+                    (nodes["feature_idx"], nodes["num_threshold"], nodes["left"], nodes["right"], is_leaf, value)
+                )
         start = np.array([float(np.ravel(model._baseline_prediction)[0]) for model in models])
         return cls._pack_trees(trees, start, np.arange(len(models)))
 
@@ -95,9 +97,11 @@ class Forest:
             for target, tree in enumerate(round_trees):
                 nodes = tree.nodes
                 class_weights = np.array([-0.5, 0.5]) if num_classes == 2 else np.eye(num_classes)[target]
-                leaf = nodes["is_leaf"].astype(bool)
+                is_leaf = nodes["is_leaf"].astype(bool)
                 value = np.outer(nodes["value"], class_weights)
-                trees.append((nodes["feature_idx"], nodes["num_threshold"], nodes["left"], nodes["right"], leaf, value))
+                trees.append(
+                    (nodes["feature_idx"], nodes["num_threshold"], nodes["left"], nodes["right"], is_leaf, value)
+                )
         start = np.ravel(model._baseline_prediction).astype(float)
         start = np.array([-0.5, 0.5]) * start[0] if num_classes == 2 else start
         return cls._pack_trees(trees, start, model.classes_)
@@ -108,31 +112,31 @@ class Forest:
         trees = []
         for model in models:
             tree = model.tree_
-            leaf = tree.children_left < 0
+            is_leaf = tree.children_left < 0
             value = tree.value[:, :, 0] / len(models)
-            trees.append((tree.feature, tree.threshold, tree.children_left, tree.children_right, leaf, value))
+            trees.append((tree.feature, tree.threshold, tree.children_left, tree.children_right, is_leaf, value))
         targets = trees[0][-1].shape[1]
         return cls._pack_trees(trees, np.zeros(targets), np.arange(targets))
 
     @classmethod
     def from_classification_trees(
-        cls, models: list[Any], weights: np.ndarray, classes: np.ndarray, *, votes: bool
+        cls, models: list[Any], weights: np.ndarray, classes: np.ndarray, *, is_voting: bool
     ) -> "Forest":
         """Convert scikit-learn's classification trees to a forest that predicts the weighted sum of the class shares in
         the trees' leaves.
 
-        If `votes`, each tree instead gives one weighted vote to the most frequent class of the leaf.
+        If `is_voting`, each tree instead gives one weighted vote to the most frequent class of the leaf.
         """
         trees = []
         for model, weight in zip(models, weights, strict=True):
             tree = model.tree_
-            class_shares = tree.value[:, 0] / tree.value[:, 0].sum(axis=1, keepdims=True)
-            if votes:
-                class_shares = np.eye(class_shares.shape[1])[class_shares.argmax(axis=1)]
-            value = np.zeros((len(class_shares), len(classes)))
-            value[:, model.classes_.astype(int)] = weight * class_shares
-            leaf = tree.children_left < 0
-            trees.append((tree.feature, tree.threshold, tree.children_left, tree.children_right, leaf, value))
+            class_fractions = tree.value[:, 0] / tree.value[:, 0].sum(axis=1, keepdims=True)
+            if is_voting:
+                class_fractions = np.eye(class_fractions.shape[1])[class_fractions.argmax(axis=1)]
+            value = np.zeros((len(class_fractions), len(classes)))
+            value[:, model.classes_.astype(int)] = weight * class_fractions
+            is_leaf = tree.children_left < 0
+            trees.append((tree.feature, tree.threshold, tree.children_left, tree.children_right, is_leaf, value))
         return cls._pack_trees(trees, np.zeros(len(classes)), classes)
 
     @classmethod
@@ -169,15 +173,17 @@ class Forest:
         feature, left, right = (np.zeros((len(trees), max_nodes), np.int32) for _ in range(3))
         threshold = np.zeros((len(trees), max_nodes))
         value = np.zeros((len(trees), max_nodes, len(start)))
-        for tree_index, (tested_features, thresholds, left_children, right_children, leaf, values) in enumerate(trees):
+        for tree_index, (tested_features, thresholds, left_children, right_children, is_leaf, values) in enumerate(
+            trees
+        ):
             num_nodes, node_indices = len(tested_features), np.arange(len(tested_features))
-            feature[tree_index, :num_nodes] = np.where(leaf, 0, tested_features)
-            threshold[tree_index, :num_nodes] = np.where(leaf, 0.0, thresholds)
-            left[tree_index, :num_nodes] = np.where(leaf, node_indices, left_children)
-            right[tree_index, :num_nodes] = np.where(leaf, node_indices, right_children)
+            feature[tree_index, :num_nodes] = np.where(is_leaf, 0, tested_features)
+            threshold[tree_index, :num_nodes] = np.where(is_leaf, 0.0, thresholds)
+            left[tree_index, :num_nodes] = np.where(is_leaf, node_indices, left_children)
+            right[tree_index, :num_nodes] = np.where(is_leaf, node_indices, right_children)
             value[tree_index, :num_nodes] = values
             level = np.zeros(num_nodes, int)
-            for node in node_indices[~leaf]:  # parents come before their children
+            for node in node_indices[~is_leaf]:  # parents come before their children
                 level[[left[tree_index, node], right[tree_index, node]]] = level[node] + 1
             depth = max(depth, int(level.max()))
         return cls(feature, threshold, left, right, value, depth, start, classes)
@@ -185,7 +191,7 @@ class Forest:
 
 # Number of frames whose distances from all presses of the training set are computed at once.
 _NEIGHBOUR_CHUNK_SIZE = 128
-_CANDIDATE_COUNTS = (3, 5, 8, 12)
+_CANDIDATE_NEIGHBOUR_COUNTS = (3, 5, 8, 12)
 
 
 @dataclass(frozen=True)
@@ -207,13 +213,13 @@ class NearestNeighbours:
     def fit_regressor(cls, features, targets) -> "NearestNeighbours":
         """Create a regressor of targets (presses, targets), with the number of neighbours that has the lowest
         leave-one-out error."""
-        count = min(max(_CANDIDATE_COUNTS), len(features) - 1)
+        count = min(max(_CANDIDATE_NEIGHBOUR_COUNTS), len(features) - 1)
         all_neighbours = cls(features, targets, count + 1, np.arange(targets.shape[1]))
         distances, indices = (array[:, 1:] for array in all_neighbours._nearest_presses(features))
         weights = 1 / np.maximum(distances, 1e-12)[..., None]
         cumulative_means = np.cumsum(weights * targets[indices], axis=1) / np.cumsum(weights, axis=1)
         errors = np.linalg.norm(cumulative_means - targets[:, None], axis=-1).mean(axis=0)
-        best_count = min([k for k in _CANDIDATE_COUNTS if k <= count] or [count], key=lambda k: errors[k - 1])
+        best_count = min([k for k in _CANDIDATE_NEIGHBOUR_COUNTS if k <= count] or [count], key=lambda k: errors[k - 1])
         return cls(features, targets, best_count, all_neighbours.classes_)
 
     @classmethod
@@ -301,9 +307,9 @@ class SupportVectorMachine:
         with equal counts.
         """
         distances, side_signs = self._boundary_distances(features)
-        votes = (distances > 0) @ (side_signs > 0).astype(float) + (distances <= 0) @ (side_signs < 0).astype(float)
-        confidences = distances @ side_signs
-        return votes + confidences / (3 * (np.abs(confidences) + 1))
+        num_votes = (distances > 0) @ (side_signs > 0).astype(float) + (distances <= 0) @ (side_signs < 0).astype(float)
+        summed_distances = distances @ side_signs
+        return num_votes + summed_distances / (3 * (np.abs(summed_distances) + 1))
 
     def pair_odds(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
         """Compute the score of each class (frames, classes): the sum of its log-probabilities relative to every other

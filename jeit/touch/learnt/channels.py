@@ -25,7 +25,7 @@ from scipy.spatial import KDTree
 # Number of channel patterns whose scores are compared; maximum number of presses stored. Distances are divided by the
 # norm of the frame's scores plus this fraction of the presses' median norm.
 _NUM_SCORES, _MAX_STORED_PRESSES, _NORM_OFFSET_FRACTION = 8, 4000, 0.5
-_USUAL_QUANTILE = 0.99
+_USUAL_NOVELTY_QUANTILE = 0.99
 
 
 @dataclass(frozen=True)
@@ -48,16 +48,16 @@ class Neighbourhood:
         stored_scores = scores[:: -(-len(scores) // _MAX_STORED_PRESSES), :_NUM_SCORES]
         size = float(np.median(np.linalg.norm(stored_scores, axis=1))) or 1.0
         unscaled_neighbourhood = cls(stored_scores, size, 1.0)
-        distances = unscaled_neighbourhood._relative_distances(stored_scores, skip_first=True)
-        return cls(stored_scores, size, max(float(np.quantile(distances, _USUAL_QUANTILE)), 1e-6))
+        distances = unscaled_neighbourhood._relative_distances(stored_scores, excludes_nearest=True)
+        return cls(stored_scores, size, max(float(np.quantile(distances, _USUAL_NOVELTY_QUANTILE)), 1e-6))
 
     def __call__(self, scores: Float[np.ndarray, "n K"]) -> Float[np.ndarray, " n"]:
         """Compute the distance of each frame from the nearest training press, from pattern scores (frames, patterns),
         relative to the usual distance between presses."""
         return self._relative_distances(scores[:, :_NUM_SCORES]) / self.usual
 
-    def _relative_distances(self, scores: np.ndarray, *, skip_first: bool = False) -> np.ndarray:
-        distance = np.asarray(self._search_tree.query(scores, 2)[0])[:, int(skip_first)]
+    def _relative_distances(self, scores: np.ndarray, *, excludes_nearest: bool = False) -> np.ndarray:
+        distance = np.asarray(self._search_tree.query(scores, 2)[0])[:, int(excludes_nearest)]
         return distance / (np.linalg.norm(scores, axis=1) + _NORM_OFFSET_FRACTION * self.size)
 
     @cached_property
@@ -80,7 +80,7 @@ _MAX_RANGE_EXCESS, _MAX_EXCEEDING_FRACTION = 2.0, 0.1
 # Variation of a channel below this fraction of the largest change counts as rounding error.
 _ROUNDING_ERROR = 1e-13
 # Candidate values added to the diagonal of the covariance of channels, which are scaled to variance 1.
-_DIAGONALS = np.logspace(-6, 0, 13)
+_CANDIDATE_DIAGONAL_TERMS = np.logspace(-6, 0, 13)
 # Fraction of dead channels in a frame at which the search for further dead channels stops.
 _MAX_DEAD_FRACTION = 0.34
 # Number of consecutive frames with a unique set of dead channels after which frames are processed one by one.
@@ -136,13 +136,17 @@ class Channels:
             raise ValueError("frames: no channel changes; are these frames, and the skin connected?")
         scale = deviation[is_used]
         scaled = np.where(missing[:, is_used], 0.0, changes[:, is_used]) / scale
-        has_reading, half_index = ~missing[:, is_used], len(scaled) // 2
+        has_reading, index_of_half = ~missing[:, is_used], len(scaled) // 2
         # Residuals are larger for frames outside the training set than in it, so each half of the frames is evaluated
         # with the patterns that were fitted to the other half.
-        residuals, novelties, leave_one_out_errors = [], [], np.zeros((2, len(_DIAGONALS), int(is_used.sum())))
+        residuals, novelties, leave_one_out_errors = (
+            [],
+            [],
+            np.zeros((2, len(_CANDIDATE_DIAGONAL_TERMS), int(is_used.sum()))),
+        )
         for training_rows, test_rows in (
-            (slice(None, half_index), slice(half_index, None)),
-            (slice(half_index, None), slice(None, half_index)),
+            (slice(None, index_of_half), slice(index_of_half, None)),
+            (slice(index_of_half, None), slice(None, index_of_half)),
         ):
             variance, directions = _variances(scaled[training_rows])
             leave_one_out_errors += _leave_one_out_errors(scaled[test_rows], variance, directions)
@@ -156,7 +160,7 @@ class Channels:
         variance, directions = _variances(scaled)
         best_diagonal = int(leave_one_out_errors[0].sum(axis=1).argmin())
         weight, leave_one_out_variance = (
-            variance / (variance + _DIAGONALS[best_diagonal]),
+            variance / (variance + _CANDIDATE_DIAGONAL_TERMS[best_diagonal]),
             leave_one_out_errors[1, best_diagonal] / 2,
         )
         patterns, score_deviation, noise = _fit_patterns(scaled, variance, directions)
@@ -215,8 +219,8 @@ class Channels:
             relative_deviations, tried_scores, tried_residual = self._deviations(
                 completed_changes[tried_frames], has_reading[tried_frames], is_working
             )
-            agrees_with_pattern = (relative_deviations <= 1) == is_working
-            is_completed = agrees_with_pattern.all(axis=1)
+            is_consistent_with_pattern = (relative_deviations <= 1) == is_working
+            is_completed = is_consistent_with_pattern.all(axis=1)
             is_completed[0] = True
             num_unique_frames = num_unique_frames + 1 if is_completed.sum() == 1 else 0
             rows = tried_frames[is_completed]
@@ -272,9 +276,9 @@ class Channels:
     ) -> Float[np.ndarray, "n m-a"]:
         """Predict the most likely readings of the dead channels from those of the channels that are `alive`."""
         dead_directions = self.directions[~alive] * self.weight
-        right_sides = dead_directions @ (alive_readings @ self.directions[alive]).T
+        right_hand_sides = dead_directions @ (alive_readings @ self.directions[alive]).T
         return np.linalg.solve(
-            np.eye(len(dead_directions)) - dead_directions @ self.directions[~alive].T, right_sides
+            np.eye(len(dead_directions)) - dead_directions @ self.directions[~alive].T, right_hand_sides
         ).T
 
     def prediction_errors(self, alive: Bool[np.ndarray, "n m"], max_errors: int) -> Float[np.ndarray, "q n m"]:
@@ -333,12 +337,12 @@ def _variances(scaled: Float[np.ndarray, "N m"]) -> tuple[Float[np.ndarray, " r"
     """Compute the principal directions of frames, and the variance along each direction, in decreasing order."""
     num_frames, num_channels = scaled.shape
     if num_channels <= num_frames:
-        squares, directions = np.linalg.eigh(scaled.T @ scaled)
+        eigenvalues, directions = np.linalg.eigh(scaled.T @ scaled)
     else:  # the Gram matrix of frames is smaller than that of channels
-        squares, combinations = np.linalg.eigh(scaled @ scaled.T)
-        directions = scaled.T @ combinations / np.sqrt(np.maximum(squares, 1e-300))
-    significant_indices = np.flatnonzero(squares > _ROUNDING_ERROR * squares[-1])[::-1]
-    return squares[significant_indices] / num_frames, directions[:, significant_indices]
+        eigenvalues, eigenvectors = np.linalg.eigh(scaled @ scaled.T)
+        directions = scaled.T @ eigenvectors / np.sqrt(np.maximum(eigenvalues, 1e-300))
+    significant_indices = np.flatnonzero(eigenvalues > _ROUNDING_ERROR * eigenvalues[-1])[::-1]
+    return eigenvalues[significant_indices] / num_frames, directions[:, significant_indices]
 
 
 def _fit_patterns(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -369,7 +373,7 @@ def _leave_one_out_errors(scaled, variance, directions) -> Float[np.ndarray, "2 
     the second array.
     """
     scores, errors = scaled @ directions, []
-    for diagonal in _DIAGONALS:
+    for diagonal in _CANDIDATE_DIAGONAL_TERMS:
         weight = variance / (variance + diagonal)
         residual_factor = 1 - np.sum(directions**2 * weight, axis=1)
         mean_square = np.mean((scaled - (scores * weight) @ directions.T) ** 2, axis=0)
@@ -417,15 +421,15 @@ def choose_channels(
     initial_norms = np.sum(candidates**2, axis=0)
     selected_channels: list[int] = []
     for _ in range(min(num_channels, scaled.shape[1])):
-        norms = np.sum(candidates**2, axis=0)
+        squared_norms = np.sum(candidates**2, axis=0)
         gain = np.sum((candidates.T @ unexplained_targets) ** 2, axis=1) / np.where(
-            norms > 1e-8 * initial_norms, norms, np.inf
+            squared_norms > 1e-8 * initial_norms, squared_norms, np.inf
         )
         gain[selected_channels] = -1
         best_channel = int(gain.argmax())
         selected_channels.append(best_channel)
-        if norms[best_channel] > 1e-8 * initial_norms[best_channel]:
-            direction = candidates[:, best_channel] / np.sqrt(norms[best_channel])
+        if squared_norms[best_channel] > 1e-8 * initial_norms[best_channel]:
+            direction = candidates[:, best_channel] / np.sqrt(squared_norms[best_channel])
             unexplained_targets = unexplained_targets - np.outer(direction, direction @ unexplained_targets)
             candidates = candidates - np.outer(direction, direction @ candidates)
     return np.array(selected_channels)

@@ -55,17 +55,17 @@ class ImageReconstruction:
         notes, conductivity, mask = [], 1.0, as_array(is_used)
         if reference is not None and np.abs(reference[is_used]).max() > 0:
             # -1 if the polarity of the channels is reversed.
-            polarity = np.sign(np.where(is_used, model.voltages(1.0), 0.0) @ reference)
-            calibration = calibrate(model, as_array(polarity * reference), mask=mask, contact="fixed")
+            polarity_sign = np.sign(np.where(is_used, model.voltages(1.0), 0.0) @ reference)
+            calibration = calibrate(model, as_array(polarity_sign * reference), mask=mask, contact="fixed")
             if np.isfinite(calibration.misfit):
                 model, conductivity = calibration.model, calibration.conductivity
                 notes += [calibration.note] if calibration.note else []
         matrix = np.asarray(one_step(model, conductivity, mask=mask).matrix).T[is_used]
         centres, sizes = np.asarray(centroids(model.mesh)), np.asarray(measures(model.mesh))
-        around = KDTree(centres).query(centres, max(1, int(_NEIGHBOUR_FRACTION * len(centres))))[1]
+        neighbour_indices = KDTree(centres).query(centres, max(1, int(_NEIGHBOUR_FRACTION * len(centres))))[1]
         image = changes @ matrix
         sign = np.sign(np.median(image.max(axis=1) + image.min(axis=1))) or 1.0
-        return cls(sign * matrix, centres, sizes, np.reshape(around, (len(centres), -1))), notes
+        return cls(sign * matrix, centres, sizes, np.reshape(neighbour_indices, (len(centres), -1))), notes
 
     def contacts(self, images: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n d+3"]:
         """Compute features of the strongest contact of each image: the centroid, and the logarithms of the peak, the
@@ -244,7 +244,7 @@ FORMS = {
     "shapes": _normalise_changes,
 }
 # Functions that fit a learnt form of features to changes (presses, channels) and targets (presses, targets).
-Maker = Callable[[np.ndarray, np.ndarray], WhitenedChanges | ContactFeatures | ImageFeatures]
+FeatureMaker = Callable[[np.ndarray, np.ndarray], WhitenedChanges | ContactFeatures | ImageFeatures]
 
 
 @dataclass(frozen=True)
@@ -312,8 +312,8 @@ def standardisation(form: str, changes: np.ndarray, reference: np.ndarray) -> tu
 
 def _replace_zeros_by_infinity(deviation: np.ndarray) -> np.ndarray:
     """Replace standard deviations of features by infinity if they are negligible compared with the largest."""
-    is_nonzero = deviation > 1e-9 * max(deviation.max(), 1e-300)
-    return np.where(is_nonzero, deviation, np.inf)
+    is_nonzero_deviation = deviation > 1e-9 * max(deviation.max(), 1e-300)
+    return np.where(is_nonzero_deviation, deviation, np.inf)
 
 
 @dataclass(frozen=True)
@@ -325,7 +325,7 @@ class Forms:
     """
 
     names: tuple[str, ...]
-    makers: dict[str, Maker]
+    makers: dict[str, FeatureMaker]
 
     @classmethod
     def available(
@@ -333,7 +333,7 @@ class Forms:
     ) -> "Forms":
         """Return the forms of features that the data allow: reference voltages, if `has_reference`, repeated targets in
         `targets`, and images."""
-        makers: dict[str, Maker] = {"whitened": WhitenedChanges.learn} if are_repeated(targets) else {}
+        makers: dict[str, FeatureMaker] = {"whitened": WhitenedChanges.learn} if are_repeated(targets) else {}
         if imaged is not None:
             makers |= {"contacts": lambda changes, targets: ContactFeatures(imaged)}
             makers |= {"images": lambda changes, targets: ImageFeatures(imaged)}

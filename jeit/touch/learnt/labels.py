@@ -108,10 +108,14 @@ def _cross_validate(method, form, forms: Forms, changes, reference, true_classes
     odds = np.full((len(true_classes), num_classes), -1e3)
 
     def predict(fold: int) -> None:
-        is_test = folds == fold
-        features = forms.learn(form, changes[~is_test], reference[~is_test], true_classes[~is_test, None])
-        model = CLASSIFIERS[method](features(changes[~is_test], reference[~is_test]), true_classes[~is_test])
-        odds[np.ix_(is_test, model.classes_)] = log_odds(model, features(changes[is_test], reference[is_test]))
+        is_held_out = folds == fold
+        features = forms.learn(form, changes[~is_held_out], reference[~is_held_out], true_classes[~is_held_out, None])
+        model = CLASSIFIERS[method](
+            features(changes[~is_held_out], reference[~is_held_out]), true_classes[~is_held_out]
+        )
+        odds[np.ix_(is_held_out, model.classes_)] = log_odds(
+            model, features(changes[is_held_out], reference[is_held_out])
+        )
 
     apply_over_folds(predict, folds.max() + 1)
     predicted_classes = odds.argmax(axis=1)
@@ -302,9 +306,9 @@ def _fit_discriminant(values, is_pressed):
 def _fit_trees(values, is_pressed):
     from sklearn.ensemble import ExtraTreesClassifier
 
-    ensemble = ExtraTreesClassifier(_NUM_TREES, **_TREE_OPTIONS).fit(values, is_pressed)
+    tree_classifier = ExtraTreesClassifier(_NUM_TREES, **_TREE_OPTIONS).fit(values, is_pressed)
     return Forest.from_classification_trees(
-        ensemble.estimators_, np.full(_NUM_TREES, 1 / _NUM_TREES), ensemble.classes_, votes=False
+        tree_classifier.estimators_, np.full(_NUM_TREES, 1 / _NUM_TREES), tree_classifier.classes_, is_voting=False
     )
 
 

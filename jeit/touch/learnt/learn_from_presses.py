@@ -58,9 +58,9 @@ def time_folds(
     elif group is not None:
         notes.append("all presses are of one group: folds are intervals of time.")
     frame_indices = np.unique(np.nan_to_num(frames), axis=0, return_inverse=True)[1].ravel()
-    num_copies = num_presses - frame_indices.max() - 1
-    if num_copies:
-        notes.append(f"{num_copies} frames are copies of others: kept in one fold with them.")
+    num_repeated_frames = num_presses - frame_indices.max() - 1
+    if num_repeated_frames:
+        notes.append(f"{num_repeated_frames} frames are copies of others: kept in one fold with them.")
         unit = _number_connected_sets(unit, frame_indices)
     has_repeated_places = False
     if positions is not None and positions.shape[1] > 1 and not is_grouped:
@@ -89,11 +89,11 @@ def _assign_to_folds(unit: np.ndarray, rank: np.ndarray, num_folds: int, num_int
     """Assign presses to folds: `num_intervals` intervals of presses, in order of their `rank` in time, are assigned to
     the folds in turn; presses with the same `unit` are in one fold."""
     sizes = np.bincount(unit)
-    unit_order = np.argsort(np.bincount(unit, rank) / sizes, kind="stable")
-    middle_ranks = np.cumsum(sizes[unit_order]) - sizes[unit_order] / 2
+    order_of_units = np.argsort(np.bincount(unit, rank) / sizes, kind="stable")
+    middle_positions = np.cumsum(sizes[order_of_units]) - sizes[order_of_units] / 2
     fold_of_unit = np.empty(len(sizes), int)
-    fold_of_unit[unit_order] = (
-        np.minimum((middle_ranks * num_intervals / len(unit)).astype(int), num_intervals - 1) % num_folds
+    fold_of_unit[order_of_units] = (
+        np.minimum((middle_positions * num_intervals / len(unit)).astype(int), num_intervals - 1) % num_folds
     )
     return np.unique(fold_of_unit, return_inverse=True)[1][unit]
 
@@ -102,30 +102,36 @@ def _assign_by_class(rank: np.ndarray, kinds: np.ndarray, num_folds: int) -> Int
     """Assign the presses of each class in `kinds` to the folds in turn, for data in which some classes are rare."""
     fold = np.empty(len(kinds), int)
     for kind in np.unique(kinds):
-        class_rows = np.flatnonzero(kinds == kind)
-        fold[class_rows[np.argsort(rank[class_rows])]] = np.arange(len(class_rows)) % num_folds
+        rows_of_class = np.flatnonzero(kinds == kind)
+        fold[rows_of_class[np.argsort(rank[rows_of_class])]] = np.arange(len(rows_of_class)) % num_folds
     return fold
 
 
-def _training_sets_cover(fold: np.ndarray, positions: np.ndarray | None, kinds: np.ndarray | None) -> bool:
+def _training_sets_cover(fold_of_press: np.ndarray, positions: np.ndarray | None, kinds: np.ndarray | None) -> bool:
     """Whether each fold's training set contains the classes of the held-out presses, or places near theirs."""
     if kinds is not None and kinds.ndim == 2:
-        return all(_training_sets_cover(fold, None, column) for column in kinds.T)
+        return all(_training_sets_cover(fold_of_press, None, column) for column in kinds.T)
     if kinds is not None:
-        return all(set(kinds[fold == fold_index]) <= set(kinds[fold != fold_index]) for fold_index in np.unique(fold))
+        return all(
+            set(kinds[fold_of_press == fold_index]) <= set(kinds[fold_of_press != fold_index])
+            for fold_index in np.unique(fold_of_press)
+        )
     if positions is None:
         return True
-    random_folds = np.random.default_rng(0).permutation(fold)
-    return _largest_distance(positions, fold) <= _MAX_DISTANCE_RATIO * _largest_distance(positions, random_folds)
+    random_folds = np.random.default_rng(0).permutation(fold_of_press)
+    return _largest_distance(positions, fold_of_press) <= _MAX_DISTANCE_RATIO * _largest_distance(
+        positions, random_folds
+    )
 
 
-def _largest_distance(positions: np.ndarray, fold: np.ndarray) -> float:
+def _largest_distance(positions: np.ndarray, fold_of_press: np.ndarray) -> float:
     """Compute, for each fold, the mean distance of its presses from the nearest press of the other folds; returns the
     maximum over the folds."""
     unit = positions.std(axis=0).max() or 1.0
     return max(
-        KDTree(positions[fold != fold_index]).query(positions[fold == fold_index])[0].mean() + 1e-3 * unit
-        for fold_index in np.unique(fold)
+        KDTree(positions[fold_of_press != fold_index]).query(positions[fold_of_press == fold_index])[0].mean()
+        + 1e-3 * unit
+        for fold_index in np.unique(fold_of_press)
     )
 
 
@@ -187,7 +193,7 @@ def learn_quantities(
     """
     notes, standing = [], {}
     models: dict[str, Any] = dict.fromkeys(("place", "force", "label", "keys"))
-    all_rows = np.arange(len(changes))
+    row_indices = np.arange(len(changes))
     if presses.positions is not None:
         rows, folds, fold_notes = places_and_folds(presses)
         notes += fold_notes
@@ -198,13 +204,13 @@ def learn_quantities(
     if presses.force is not None:
         has_all_places = presses.positions is not None and np.isfinite(presses.positions).all()
         grouping_values = presses.positions if has_all_places else presses.force[:, None]
-        folds, _ = time_folds(presses.frames, *_groups_and_times(presses, all_rows), positions=grouping_values)
+        folds, _ = time_folds(presses.frames, *_groups_and_times(presses, row_indices), positions=grouping_values)
         force = presses.force[:, None]
         models["force"], standing["force"] = _learn_targets(
-            changes, reference, force, all_rows, folds, method, imaged, progress
+            changes, reference, force, row_indices, folds, method, imaged, progress
         )
     if presses.label is not None:
-        folds, fold_notes = time_folds(presses.frames, *_groups_and_times(presses, all_rows), kinds=presses.label)
+        folds, fold_notes = time_folds(presses.frames, *_groups_and_times(presses, row_indices), kinds=presses.label)
         learnt, results = learn_labels(
             changes,
             reference,
@@ -219,7 +225,7 @@ def learn_quantities(
         methods = [(f"{result.method} on {result.form}", result.error) for result in results]
         standing["label"] = Standing(methods[0][0], methods, learnt.classes[results[0].held_out], presses.label)
     if presses.touched is not None:
-        folds, fold_notes = time_folds(presses.frames, *_groups_and_times(presses, all_rows), kinds=presses.touched)
+        folds, fold_notes = time_folds(presses.frames, *_groups_and_times(presses, row_indices), kinds=presses.touched)
         notes += fold_notes
         if presses.touched.sum(axis=1).max() < 2:
             notes.append("no two keys were pressed together: predictions of keys pressed together are unreliable.")

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind, check_name, counted
-from jeit.arguments.extras import need_extra
+from jeit.arguments.extras import require_extra
 from jeit.forward import ForwardModel
 from jeit.touch.learnt import labels as label_methods
 from jeit.touch.learnt import regression
@@ -37,7 +37,7 @@ from jeit.touch.learnt.resource_limits import apply_over_threads, limit_to_one_t
 
 # A frame is unlike the training set above this novelty (about 1 for the farthest training frames), or below this
 # fraction of alive channels.
-_MAX_NOVELTY, _MIN_ALIVE = 2.0, 0.66
+_MAX_NOVELTY, _MIN_ALIVE_FRACTION = 2.0, 0.66
 _CHUNK_SIZE = 256
 # Number of principal directions of the error of readings that are predicted for dead channels. These errors are
 # propagated to predictions.
@@ -205,7 +205,7 @@ class LearntSkin:
         is_touched = np.sqrt(np.mean((completed_changes / self.channels.scale) ** 2, axis=1)) > self.quiet
         # Frames with small changes count as untouched, not as unlike; frames with too many missing channels are always
         # unlike.
-        is_unlike = (novelty > _MAX_NOVELTY) & is_touched | (alive.mean(axis=1) < _MIN_ALIVE)
+        is_unlike = (novelty > _MAX_NOVELTY) & is_touched | (alive.mean(axis=1) < _MIN_ALIVE_FRACTION)
         predictions = {"novelty": novelty, "unlike": is_unlike, "alive": np.zeros(changes.shape, bool)}
         predictions["alive"][:, self.channels.used] = alive
         if self.label is not None:
@@ -253,15 +253,15 @@ class LearntSkin:
         std = model.spread(predictions, changes)
         errors = errors.reshape(_NUM_DRAWS, len(noisy_rows), predictions.shape[1]) - predictions[noisy_rows]
         std[noisy_rows] = np.hypot(std[noisy_rows], np.sqrt(np.mean(errors**2, axis=0)))
-        partial_rows = np.flatnonzero(~alive.all(axis=1))
-        if not partial_rows.size:
+        rows_with_dead_channels = np.flatnonzero(~alive.all(axis=1))
+        if not rows_with_dead_channels.size:
             return predictions, std
-        for reading_errors in self.channels.prediction_errors(alive[partial_rows], _MAX_ERROR_DIRECTIONS):
+        for reading_errors in self.channels.prediction_errors(alive[rows_with_dead_channels], _MAX_ERROR_DIRECTIONS):
             errors = (
-                model.predict(changes[partial_rows] + reading_errors, reference[partial_rows])
-                - predictions[partial_rows]
+                model.predict(changes[rows_with_dead_channels] + reading_errors, reference[rows_with_dead_channels])
+                - predictions[rows_with_dead_channels]
             )
-            std[partial_rows] = np.hypot(std[partial_rows], errors)
+            std[rows_with_dead_channels] = np.hypot(std[rows_with_dead_channels], errors)
         return predictions, std
 
     def _check_frames(self, frames) -> np.ndarray:
@@ -286,9 +286,10 @@ class LearntSkin:
                 "reference is missing: the training presses had one; give a frame (channels,), or one for each frame."
             )
         reference = check_reference(values, frames)
-        is_read = np.isfinite(reference).any(axis=0) & self.channels.used
-        a, b = mean_reference(reference)[is_read], self.mean_reference[is_read]  # of frames, of training frames
-        if not is_read.any():
+        is_read_channel = np.isfinite(reference).any(axis=0) & self.channels.used
+        # Means of the frames, and of the training frames.
+        a, b = mean_reference(reference)[is_read_channel], self.mean_reference[is_read_channel]
+        if not is_read_channel.any():
             raise ValueError(
                 "reference has no finite reading in any channel that is used; give a frame of the untouched skin."
             )
@@ -328,7 +329,7 @@ class LearntSkin:
 
 
 def _check_fit(presses: Presses, method: str, model, num_channels: int | None, per_session: bool) -> None:
-    need_extra("learn", "learning a skin")
+    require_extra("learn", "learning a skin")
     check_kind("presses", presses, Presses, "Presses, as of read_presses(path)")
     check_name("method", method, METHODS)
     has_targets = presses.positions is not None or presses.force is not None
@@ -356,13 +357,17 @@ def _usable_presses(presses: Presses) -> tuple[Presses, list[str]]:
     Channels that have no reading in any press are left out of the count.
     """
     changes = changes_from_reference(presses.frames, presses.reference)
-    is_read = np.isfinite(changes)
-    has_data = is_read.any(axis=0)
+    has_reading = np.isfinite(changes)
+    has_readings = has_reading.any(axis=0)
     notes = []
-    if not has_data.all():
-        channels = np.flatnonzero(~has_data)
+    if not has_readings.all():
+        channels = np.flatnonzero(~has_readings)
         notes.append(f"{counted(len(channels), 'channel')} without any reading: {_list_briefly(channels)}.")
-    is_usable = is_read[:, has_data].mean(axis=1) >= _MIN_ALIVE if has_data.any() else np.zeros(len(is_read), bool)
+    is_usable = (
+        has_reading[:, has_readings].mean(axis=1) >= _MIN_ALIVE_FRACTION
+        if has_readings.any()
+        else np.zeros(len(has_reading), bool)
+    )
     if is_usable.sum() < 10:
         raise ValueError(
             f"frames: only {int(is_usable.sum())} have readings of two thirds of the channels; 10 are needed."

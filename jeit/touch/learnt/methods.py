@@ -55,12 +55,12 @@ class GaussianProcess:
         centres = features[centre_indices]
         centre_kernel = _matern_kernel(cdist(centres, centres) / length)
         if len(centres) == len(features):
-            matrix, right_side = centre_kernel + noise * np.eye(len(centre_kernel)), targets[centre_indices]
+            matrix, right_hand_side = centre_kernel + noise * np.eye(len(centre_kernel)), targets[centre_indices]
         else:
             press_kernel = _matern_kernel(cdist(features, centres) / length)
-            matrix, right_side = press_kernel.T @ press_kernel + noise * centre_kernel, press_kernel.T @ targets
+            matrix, right_hand_side = press_kernel.T @ press_kernel + noise * centre_kernel, press_kernel.T @ targets
             matrix += 1e-8 * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
-        return cls(centres, cho_solve(cho_factor(matrix), right_side), length)
+        return cls(centres, cho_solve(cho_factor(matrix), right_hand_side), length)
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
         """Predict standardised targets (frames, targets) from features (frames, features)."""
@@ -102,27 +102,27 @@ def _estimate_length_and_noise(features: np.ndarray, targets: np.ndarray) -> tup
 
     bounds = [(np.log(0.05), np.log(50.0)), (np.log(1e-6), np.log(1e3))]
     starts = [(0.5, np.log(0.05)), (2.0, np.log(0.3))]
-    optimum = min(
+    best_minimum = min(
         (
             minimize(negative_log_likelihood, start, method="Nelder-Mead", bounds=bounds, options={"maxfev": 60})
             for start in starts
         ),
         key=lambda result: result.fun,
     )
-    return mean_distance * float(np.exp(optimum.x[0])), float(np.exp(optimum.x[1]))
+    return mean_distance * float(np.exp(best_minimum.x[0])), float(np.exp(best_minimum.x[1]))
 
 
-_ALPHAS = np.logspace(-2, 5, 15)
+_RIDGE_PENALTIES = np.logspace(-2, 5, 15)
 _NUM_TREES = 100
 # Maximum number of times that each press is presented to a self-organising map, in each phase of its training.
-_MAX_PRESENTATIONS = 50
+_MAX_PRESENTATIONS_PER_PRESS = 50
 
 
 def fit_ridge(features, targets) -> Any:
     """Fit ridge regression; generalised cross-validation chooses its penalty."""
     from sklearn.linear_model import RidgeCV
 
-    return RidgeCV(_ALPHAS).fit(features, targets)
+    return RidgeCV(_RIDGE_PENALTIES).fit(features, targets)
 
 
 def fit_gradient_boosting(features, targets) -> Any:
@@ -139,10 +139,10 @@ def fit_extra_trees(features, targets) -> Any:
     from sklearn.ensemble import ExtraTreesRegressor
 
     targets = targets[:, 0] if targets.shape[1] == 1 else targets
-    ensemble = ExtraTreesRegressor(_NUM_TREES, max_features=0.3, min_samples_leaf=2, random_state=0).fit(
+    tree_regressor = ExtraTreesRegressor(_NUM_TREES, max_features=0.3, min_samples_leaf=2, random_state=0).fit(
         features, targets
     )
-    return Forest.from_averaged_trees(ensemble.estimators_)
+    return Forest.from_averaged_trees(tree_regressor.estimators_)
 
 
 def fit_self_organising_map(features, targets) -> Any:
@@ -150,7 +150,7 @@ def fit_self_organising_map(features, targets) -> Any:
     of the presses nearest to the neuron."""
     import jax
 
-    num_steps = min(MapSchedule().ordering, _MAX_PRESENTATIONS * len(features))
+    num_steps = min(MapSchedule().ordering, _MAX_PRESENTATIONS_PER_PRESS * len(features))
     fitted_map = SelfOrganisingMap.fit(features, jax.random.key(0), schedule=MapSchedule(num_steps, num_steps))
     return PlacedMap.learn(fitted_map, features, targets)
 
@@ -172,11 +172,11 @@ CHANNEL_METHODS = ("forest",)
 
 
 # Number of members of the ensembles of classifiers of Russo et al. (2017).
-_NUM_MEMBERS = 30
+_NUM_ENSEMBLE_MEMBERS = 30
 # Maximum number of leaves of a boosted tree in these ensembles.
-_MAX_LEAVES = 21
+_MAX_TREE_LEAVES = 21
 # Shrinkage of class covariances if a class has fewer presses than twice the number of features.
-_SHRINKAGE = 0.1
+_COVARIANCE_SHRINKAGE = 0.1
 # Minimum variance of a class along a principal axis, relative to the maximum.
 _MIN_VARIANCE_RATIO = 1e-4
 
@@ -186,7 +186,9 @@ def fit_decision_tree(features, label) -> Any:
     from sklearn.tree import DecisionTreeClassifier
 
     fitted_tree = DecisionTreeClassifier(min_samples_leaf=2, random_state=0).fit(features, label)
-    return Forest.from_classification_trees([_number_classes(fitted_tree)], np.ones(1), np.unique(label), votes=False)
+    return Forest.from_classification_trees(
+        [_number_classes(fitted_tree)], np.ones(1), np.unique(label), is_voting=False
+    )
 
 
 def fit_linear_discriminant(features, label) -> Any:
@@ -266,11 +268,16 @@ def fit_boosted_trees(features, label) -> Any:
     from sklearn.ensemble import AdaBoostClassifier
     from sklearn.tree import DecisionTreeClassifier
 
-    base_tree = DecisionTreeClassifier(max_leaf_nodes=_MAX_LEAVES, random_state=0)
-    ensemble = AdaBoostClassifier(base_tree, n_estimators=_NUM_MEMBERS, random_state=0).fit(features, label)
-    members, weights = ensemble.estimators_, ensemble.estimator_weights_[: len(ensemble.estimators_)]
+    weak_classifier = DecisionTreeClassifier(max_leaf_nodes=_MAX_TREE_LEAVES, random_state=0)
+    boosted_classifier = AdaBoostClassifier(weak_classifier, n_estimators=_NUM_ENSEMBLE_MEMBERS, random_state=0).fit(
+        features, label
+    )
+    members, weights = (
+        boosted_classifier.estimators_,
+        boosted_classifier.estimator_weights_[: len(boosted_classifier.estimators_)],
+    )
     return Forest.from_classification_trees(
-        [_number_classes(member, ensemble) for member in members], weights, np.unique(label), votes=True
+        [_number_classes(member, boosted_classifier) for member in members], weights, np.unique(label), is_voting=True
     )
 
 
@@ -281,13 +288,16 @@ def fit_bagged_trees(features, label) -> Any:
     from sklearn.tree import DecisionTreeClassifier
 
     classifier = BaggingClassifier(
-        DecisionTreeClassifier(random_state=0), _NUM_MEMBERS, n_jobs=number_of_cores(), random_state=0
+        DecisionTreeClassifier(random_state=0), _NUM_ENSEMBLE_MEMBERS, n_jobs=number_of_cores(), random_state=0
     )
     with parallel_config("threading"):
-        ensemble = classifier.fit(features, label)
-    weights = np.full(_NUM_MEMBERS, 1 / _NUM_MEMBERS)
+        bagged_classifier = classifier.fit(features, label)
+    weights = np.full(_NUM_ENSEMBLE_MEMBERS, 1 / _NUM_ENSEMBLE_MEMBERS)
     return Forest.from_classification_trees(
-        [_number_classes(member) for member in ensemble.estimators_], weights, np.unique(label), votes=False
+        [_number_classes(member) for member in bagged_classifier.estimators_],
+        weights,
+        np.unique(label),
+        is_voting=False,
     )
 
 
@@ -297,10 +307,10 @@ def fit_subspace_discriminant(features, label) -> Any:
     from sklearn.ensemble import BaggingClassifier
 
     discriminant = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto")
-    ensemble = BaggingClassifier(discriminant, _NUM_MEMBERS, bootstrap=False, max_features=0.5, random_state=0).fit(
-        features, label
-    )
-    return LinearEnsemble.from_bagged(ensemble, features.shape[1])
+    bagged_classifier = BaggingClassifier(
+        discriminant, _NUM_ENSEMBLE_MEMBERS, bootstrap=False, max_features=0.5, random_state=0
+    ).fit(features, label)
+    return LinearEnsemble.from_bagged(bagged_classifier, features.shape[1])
 
 
 @dataclass(frozen=True)
@@ -316,18 +326,18 @@ class LinearEnsemble:
     classes_: np.ndarray
 
     @classmethod
-    def from_bagged(cls, bagged, num_features: int) -> "LinearEnsemble":
+    def from_bagged(cls, bagging_classifier, num_features: int) -> "LinearEnsemble":
         """Convert a scikit-learn ensemble of linear discriminants, each fitted to some of `num_features` features."""
-        members = bagged.estimators_
-        weights = np.zeros((len(members), len(bagged.classes_), num_features))
+        members = bagging_classifier.estimators_
+        weights = np.zeros((len(members), len(bagging_classifier.classes_), num_features))
         intercepts = np.zeros(weights.shape[:2])
         for member, feature_indices, weight, intercept in zip(
-            members, bagged.estimators_features_, weights, intercepts, strict=True
+            members, bagging_classifier.estimators_features_, weights, intercepts, strict=True
         ):
             is_binary = len(member.coef_) == 1  # with two classes, scikit-learn gives only the log-odds of the second
             weight[-1 if is_binary else slice(None), feature_indices] = member.coef_[0] if is_binary else member.coef_
             intercept[-1 if is_binary else slice(None)] = member.intercept_[0] if is_binary else member.intercept_
-        return cls(weights, intercepts, bagged.classes_)
+        return cls(weights, intercepts, bagging_classifier.classes_)
 
     def predict_proba(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
         """Compute the probabilities of the classes (frames, classes), averaged over the members of the ensemble."""
@@ -337,11 +347,13 @@ class LinearEnsemble:
         return summed_probabilities / len(self.weights)
 
 
-def _number_classes(tree, ensemble=None):
-    """Replace the classes of a tree by their indices among the classes of the `ensemble`, or else of the tree
+def _number_classes(tree, fitted_ensemble=None):
+    """Replace the classes of a tree by their indices among the classes of the `fitted_ensemble`, or else of the tree
     itself."""
     tree.classes_ = (
-        np.arange(len(tree.classes_)) if ensemble is None else np.searchsorted(ensemble.classes_, tree.classes_)
+        np.arange(len(tree.classes_))
+        if fitted_ensemble is None
+        else np.searchsorted(fitted_ensemble.classes_, tree.classes_)
     )
     return tree
 
@@ -363,7 +375,7 @@ def covariance_shrinkage(features, label) -> float:
     """Return the shrinkage of the class covariances; 0 if every class has at least twice as many presses as
     features."""
     min_presses = np.unique(label, return_counts=True)[1].min()
-    return _SHRINKAGE if min_presses < 2 * features.shape[1] else 0.0
+    return _COVARIANCE_SHRINKAGE if min_presses < 2 * features.shape[1] else 0.0
 
 
 def log_odds(model, features) -> Float[np.ndarray, "n C"]:
@@ -382,8 +394,8 @@ def log_odds(model, features) -> Float[np.ndarray, "n C"]:
 
 def probabilities(odds: np.ndarray, sharpness: float) -> Float[np.ndarray, "n C"]:
     """Compute the probability of each class (frames, classes) as the softmax of its log-odds times the `sharpness`."""
-    scaled_odds = sharpness * odds
-    exponentials = np.exp(scaled_odds - scaled_odds.max(axis=1, keepdims=True))
+    scaled_log_odds = sharpness * odds
+    exponentials = np.exp(scaled_log_odds - scaled_log_odds.max(axis=1, keepdims=True))
     return exponentials / exponentials.sum(axis=1, keepdims=True)
 
 

@@ -94,13 +94,15 @@ def _compiled_frame_training(num_steps: int) -> Callable[..., Any]:
     def train(features, targets, batches, keys):
         sizes = features.shape[1], targets.shape[1], _FRAME_HIDDEN_SIZE, 2
         network = eqx.nn.MLP(*sizes, activation=jnp.tanh, dtype=jnp.float32, key=keys[0])
-        parameters, static_part = eqx.partition(network, eqx.is_inexact_array)
+        parameters, static_fields = eqx.partition(network, eqx.is_inexact_array)
 
         def loss(parameters, batch_rows, key):
             noisy_features = features[batch_rows] + _FRAME_FEATURE_NOISE * jax.random.normal(
                 key, (_BATCH_SIZE, features.shape[1]), features.dtype
             )
-            return jnp.mean((jax.vmap(eqx.combine(parameters, static_part))(noisy_features) - targets[batch_rows]) ** 2)
+            return jnp.mean(
+                (jax.vmap(eqx.combine(parameters, static_fields))(noisy_features) - targets[batch_rows]) ** 2
+            )
 
         def update(carry, batch_rows):
             parameters, state, key = carry
@@ -185,11 +187,11 @@ def _relu(values):
     return np.maximum(values, 0.0)
 
 
-def _concatenate_neighbouring_steps(time_course, engine):
+def _concatenate_neighbouring_steps(time_course, array_module):
     """Concatenate the values at each time step with those at the two steps before and after; zeros beyond the ends."""
     half_width, num_steps = _KERNEL_SIZE // 2, time_course.shape[-2]
-    padded_course = engine.pad(time_course, ((0, 0), (half_width, half_width), (0, 0)))
-    return engine.concatenate(
+    padded_course = array_module.pad(time_course, ((0, 0), (half_width, half_width), (0, 0)))
+    return array_module.concatenate(
         [padded_course[:, first_step : first_step + num_steps] for first_step in range(_KERNEL_SIZE)], axis=-1
     )
 

@@ -331,10 +331,10 @@ def _check_touched(values) -> np.ndarray:
     constant_keys = np.flatnonzero(touched.all(axis=0) | ~touched.any(axis=0))
     if constant_keys.size:
         raise ValueError(f"touched: key {constant_keys[0]} is the same in all presses; leave its column out.")
-    num_rarer_presses = np.minimum(touched.sum(axis=0), (~touched).sum(axis=0))
-    if num_rarer_presses.min() < _MIN_PRESSES_PER_CLASS:
+    num_rarer = np.minimum(touched.sum(axis=0), (~touched).sum(axis=0))
+    if num_rarer.min() < _MIN_PRESSES_PER_CLASS:
         raise ValueError(
-            f"touched: key {num_rarer_presses.argmin()} differs in {num_rarer_presses.min()} of the presses only; "
+            f"touched: key {num_rarer.argmin()} differs in {num_rarer.min()} of the presses only; "
             f"give {_MIN_PRESSES_PER_CLASS} or more with it and without, better twenty."
         )
     return touched
@@ -378,15 +378,15 @@ def estimate_lag(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) 
     features = Features.learn("normalised", changes, np.zeros_like(changes))
     scores = features(changes, np.zeros_like(changes))[:, :_NUM_COMPONENTS]
     errors = {lag: _place_errors(scores, positions, folds, lag) for lag in range(-_MAX_LAG, _MAX_LAG + 1)}
-    guess_error = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean())
+    error_of_mean_position = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean())
     mean_errors = {lag: float(place_errors.mean()) for lag, place_errors in errors.items()}
     best_lag, second_best_lag = sorted(mean_errors, key=lambda lag: mean_errors[lag])[:2]
     min_difference = _MIN_STANDARD_ERRORS * float(errors[best_lag].std()) / np.sqrt(len(positions))
-    is_clear = (
-        mean_errors[0] > _MAX_GUESS_ERROR_RATIO * guess_error > mean_errors[best_lag]
+    is_clear_lag = (
+        mean_errors[0] > _MAX_GUESS_ERROR_RATIO * error_of_mean_position > mean_errors[best_lag]
         and mean_errors[second_best_lag] - mean_errors[best_lag] > min_difference
     )
-    best_lag = best_lag if is_clear else 0
+    best_lag = best_lag if is_clear_lag else 0
     return best_lag, mean_errors[0], mean_errors[best_lag]
 
 

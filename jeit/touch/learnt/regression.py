@@ -15,13 +15,13 @@ from jeit.touch.learnt.features import Features, Forms, ImageReconstruction
 from jeit.touch.learnt.methods import CHANNEL_METHODS, QUICK_METHODS, REGRESSORS
 from jeit.touch.learnt.resource_limits import apply_over_folds
 
-_NUM_SIMILAR, _TARGET_COVERAGES = 40, ((1.0, 0.6827), (1.96, 0.95))
+_NUM_SIMILAR_PRESSES, _TARGET_COVERAGES = 40, ((1.0, 0.6827), (1.96, 0.95))
 # Number of similar presses from which the variance of a prediction is estimated; for calibration, pairs of a multiple
 # of the standard deviation and the share of normally distributed errors within this multiple. Weight of the logarithm
 # of the size of the changes, relative to the predicted values, in the distance between presses; weight of the mean
 # squared error of all presses in an estimated variance. The remaining weight is that of the mean squared error of
 # similar presses.
-_SIZE_WEIGHT, _GLOBAL_FRACTION = 0.3, 0.15
+_PREDICTION_SIZE_WEIGHT, _GLOBAL_VARIANCE_FRACTION = 0.3, 0.15
 # Minimum number of presses from which the coverage of standard deviations is estimated.
 _MIN_CALIBRATION_PRESSES = 30
 # Minimum predicted standard deviation, relative to the standard deviation of the predictions for the training set.
@@ -58,7 +58,7 @@ class DeviationModel:
         features = np.column_stack([predictions, _log_size(changes)])
         low, unit = features.mean(axis=0), features.std(axis=0)
         unit = np.where(unit > 0, unit, 1.0)
-        unit[-1] /= _SIZE_WEIGHT
+        unit[-1] /= _PREDICTION_SIZE_WEIGHT
         max_errors = np.quantile(
             np.abs(errors), 0.99, axis=0
         )  # a single large error is not representative of similar presses
@@ -88,14 +88,14 @@ class DeviationModel:
     def _local_deviations(self, features: np.ndarray, *, leave_one_out: bool = False) -> np.ndarray:
         """Estimate standard deviations (frames, targets) from the errors of the held-out presses nearest to
         `features`."""
-        num_neighbours = min(_NUM_SIMILAR, len(self.where) - 1)
+        num_neighbours = min(_NUM_SIMILAR_PRESSES, len(self.where) - 1)
         neighbours = np.asarray(self._search_tree.query(features, num_neighbours + leave_one_out)[1])[
             :, int(leave_one_out) :
         ]
         similar_variance = self.squares[neighbours].mean(axis=1)
         mean_variance = self.squares.mean(axis=0)
         return np.maximum(
-            np.sqrt((1 - _GLOBAL_FRACTION) * similar_variance + _GLOBAL_FRACTION * mean_variance),
+            np.sqrt((1 - _GLOBAL_VARIANCE_FRACTION) * similar_variance + _GLOBAL_VARIANCE_FRACTION * mean_variance),
             _MIN_RELATIVE_DEVIATION * self.unit[: similar_variance.shape[1]],
         )
 
@@ -115,11 +115,11 @@ def _calibration_factor(ratios: np.ndarray) -> float:
     normal distribution.
     """
     candidates = np.geomspace(0.2, 5, 200)
-    coverage_errors = [
+    coverage_deviations = [
         max(abs(np.mean(ratios <= multiple * candidate) - share) for multiple, share in _TARGET_COVERAGES)
         for candidate in candidates
     ]
-    return float(candidates[int(np.argmin(coverage_errors))])
+    return float(candidates[int(np.argmin(coverage_deviations))])
 
 
 BLEND = "blend"
@@ -165,12 +165,12 @@ class LearntNumbers:
         self, changes: Float[np.ndarray, "n m"], reference: Float[np.ndarray, "n m"]
     ) -> Float[np.ndarray, "n d"]:
         """Predict targets (frames, targets) from voltage changes and reference voltages (frames, channels)."""
-        summed_predictions = 0.0
+        prediction_sum = 0.0
         for features, model in self.members:
-            summed_predictions = summed_predictions + np.asarray(model.predict(features(changes, reference))).reshape(
+            prediction_sum = prediction_sum + np.asarray(model.predict(features(changes, reference))).reshape(
                 len(changes), -1
             )
-        return self.mean + self.scale * summed_predictions / len(self.members)
+        return self.mean + self.scale * prediction_sum / len(self.members)
 
 
 def learn_numbers(
@@ -241,16 +241,16 @@ def _choose_methods(results: list[MethodResult], targets: np.ndarray, *, blend: 
     true."""
     best_of_each_method = list({result.method: result for result in reversed(results)}.values())
     best_of_each_method = sorted(best_of_each_method, key=_mean_error)[:_MAX_BLENDED_METHODS]
-    blends = [best_of_each_method[:num_members] for num_members in range(2, len(best_of_each_method) + 1)]
-    best_blend = min(
-        blends,
+    method_combinations = [best_of_each_method[:num_members] for num_members in range(2, len(best_of_each_method) + 1)]
+    best_method_combination = min(
+        method_combinations,
         key=lambda blend_results: _mean_distance(
             np.mean([result.held_out for result in blend_results], axis=0), targets
         ),
     )
-    error = _mean_distance(np.mean([result.held_out for result in best_blend], axis=0), targets)
+    error = _mean_distance(np.mean([result.held_out for result in best_method_combination], axis=0), targets)
     return (
-        best_blend
+        best_method_combination
         if blend or error < _MAX_BLEND_ERROR_RATIO * best_of_each_method[0].error
         else best_of_each_method[:1]
     )
@@ -281,7 +281,7 @@ class _CrossValidation:
         def predict(fold: int) -> None:
             is_held_out = self.folds == fold
             training_features, held_out_features = self._fold_features(
-                form, fold, is_held_out, rotated=method not in CHANNEL_METHODS
+                form, fold, is_held_out, rotated_data=method not in CHANNEL_METHODS
             )
             model = REGRESSORS[method](training_features, (self.targets[~is_held_out] - self.mean) / self.scale)
             predictions[is_held_out] = self.mean + self.scale * np.asarray(model.predict(held_out_features)).reshape(
@@ -292,12 +292,12 @@ class _CrossValidation:
         return MethodResult(method, form, predictions, _mean_distance(predictions, self.targets))
 
     def _fold_features(
-        self, form: str, fold: int, is_held_out: np.ndarray, *, rotated: bool
+        self, form: str, fold: int, is_held_out: np.ndarray, *, rotated_data: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        if (form, fold, rotated) not in self.features:
+        if (form, fold, rotated_data) not in self.features:
             training_data = self.changes[~is_held_out], self.reference[~is_held_out], self.targets[~is_held_out]
-            features = self.forms.learn(form, *training_data, rotated=rotated)
-            self.features[form, fold, rotated] = tuple(
+            features = self.forms.learn(form, *training_data, rotated=rotated_data)
+            self.features[form, fold, rotated_data] = tuple(
                 features(self.changes[rows], self.reference[rows]) for rows in (~is_held_out, is_held_out)
             )
-        return self.features[form, fold, rotated]
+        return self.features[form, fold, rotated_data]

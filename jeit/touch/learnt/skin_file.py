@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from jeit.arguments import describe, names_text
-from jeit.arguments.extras import need_extra
-from jeit.files import check_archive, error_text, written_whole
+from jeit.arguments.extras import require_extra
+from jeit.files import atomically_written_file, check_archive, error_text
 from jeit.touch.kohonen.placed_map import PlacedMap
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 from jeit.touch.learnt.array_models import Forest, NearestNeighbours, SupportVectorMachine
@@ -66,15 +66,15 @@ def verify_checksum(path: Path) -> None:
 
 def _checksum(members: dict[str, bytes]) -> bytes:
     """Compute the checksum of the names and contents of the files in an archive."""
-    digest = hashlib.sha256()
+    sha256 = hashlib.sha256()
     for name in sorted(members):
-        digest.update(f"{name} {len(members[name])}\n".encode() + members[name])
-    return b"jeit " + digest.hexdigest().encode()
+        sha256.update(f"{name} {len(members[name])}\n".encode() + members[name])
+    return b"jeit " + sha256.hexdigest().encode()
 
 
 _FILE_KIND, _FILE_VERSION = "a jeit learnt skin", 2
 # Names of fields in files that jeit 0.2 wrote, and the present names of these fields.
-_OLD_FIELDS = {"unforetold": "unpredicted"}
+_RENAMED_FIELDS = {"unforetold": "unpredicted"}
 # Classes of the objects that a file can store, by their names in the file.
 _STORED_CLASSES: dict[str, type] = {
     "Channels": Channels,
@@ -157,10 +157,10 @@ def write_fields(path: str | Path, kind: str, version: int, fields_by_name: dict
     `fields_by_name`: the fields, by name; `kind` and `version` identify the type of file; `example`: a file name that
     the error message suggests. Raises `ValueError` if `path` is a folder.
     """
-    need_extra("learn", "a file of a learnt skin")
+    require_extra("learn", "a file of a learnt skin")
     if Path(path).is_dir():
         raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / example}.")
-    with written_whole(path) as file:
+    with atomically_written_file(path) as file:
         write_with_checksum({"kind": kind, "version": version, "skin": _to_dictionaries(fields_by_name)}, file)
 
 
@@ -171,7 +171,7 @@ def read_fields(path: Path, kind: str, version: int, description: str, make: Cal
     `ValueError` if the file is of another `kind` or contains anything but arrays, estimators and objects of jeit's
     classes.
     """
-    need_extra("learn", "a file of a learnt skin")
+    require_extra("learn", "a file of a learnt skin")
     from skops.io import get_untrusted_types, load
 
     try:
@@ -212,7 +212,7 @@ def _from_dictionaries(value):
     recursively."""
     if isinstance(value, dict):
         restored_values = {
-            _OLD_FIELDS.get(key, key): _from_dictionaries(item) for key, item in value.items() if key != "jeit"
+            _RENAMED_FIELDS.get(key, key): _from_dictionaries(item) for key, item in value.items() if key != "jeit"
         }
         return _STORED_CLASSES[value["jeit"]](**restored_values) if "jeit" in value else restored_values
     return [_from_dictionaries(item) for item in value] if isinstance(value, list) else value

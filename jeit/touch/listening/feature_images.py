@@ -56,9 +56,9 @@ class SoundImages:
         """Number of windows."""
         return len(self.times)
 
-    def __getitem__(self, selection) -> "SoundImages":
+    def __getitem__(self, window_selection) -> "SoundImages":
         """Select windows by a slice, indices or a boolean mask."""
-        return SoundImages(*(getattr(self, name)[selection] for name in self.__dataclass_fields__))
+        return SoundImages(*(getattr(self, name)[window_selection] for name in self.__dataclass_fields__))
 
     @property
     def loudness(self) -> Float[np.ndarray, " W"]:

@@ -16,7 +16,7 @@ from jeit.arguments import check_kind, counted
 from jeit.touch.listening.feature_images import MIN_HIGHEST
 
 # Maximum number of unreadable files that are described in a note.
-_MAX_DESCRIBED = 4
+_MAX_DESCRIBED_FILES = 4
 # Relative difference of sampling rates below which they are considered equal.
 _RATE_TOLERANCE = 1e-3
 
@@ -108,11 +108,11 @@ class LabelledClips:
             all_notes.append(f"clips have {' or '.join(map(str, channel_counts))} channels: all were mixed to one.")
         lowest_rate, highest_rate = min(rates), max(rates)
         if highest_rate > lowest_rate * (1 + _RATE_TOLERANCE):
-            num_lower = sum(rate < highest_rate * (1 - _RATE_TOLERANCE) for rate in rates)
+            num_lower_rates = sum(rate < highest_rate * (1 - _RATE_TOLERANCE) for rate in rates)
             all_notes.append(
-                f"{num_lower} of {counted(len(rates), 'clip')} have fewer than {highest_rate:g} samples a second, the "
-                f"fewest '{recordings[int(np.argmin(rates))].name}': nothing above {lowest_rate / 2:g} Hz is used, "
-                "which all of them have."
+                f"{num_lower_rates} of {counted(len(rates), 'clip')} have fewer than {highest_rate:g} samples a "
+                f"second, the fewest '{recordings[int(np.argmin(rates))].name}': nothing above {lowest_rate / 2:g} Hz "
+                "is used, which all of them have."
             )
         num_channels = channel_counts[0] if len(channel_counts) == 1 else 1
         return cls(
@@ -168,7 +168,7 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
         raise ValueError(
             f"'{folder}' must have a sub-folder of clips for each of two classes or more; it has {description}."
         )
-    stray_files = [entry.name for entry in folder.iterdir() if entry.is_file() and not entry.name.startswith(".")]
+    outside_files = [entry.name for entry in folder.iterdir() if entry.is_file() and not entry.name.startswith(".")]
     paths, labels, groups, failures = [], [], [], []
     for class_folder in class_folders:
         files = sorted(
@@ -191,9 +191,10 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
             reason = failures[-1][1] if files else "it is empty"
             raise ValueError(f"'{class_folder}': there is no clip in it that can be read ({reason}).")
     notes = [_describe_unread(failures)] if failures else []
-    if stray_files:
+    if outside_files:
         notes.append(
-            f"{counted(len(stray_files), 'file')} of no class, beside their folders, left out ('{min(stray_files)}')."
+            f"{counted(len(outside_files), 'file')} of no class, beside their folders, left out "
+            f"('{min(outside_files)}')."
         )
     return LabelledClips.from_recordings(
         _RecordingFiles(paths), labels, groups, notes=notes, name=folder.name or str(folder)
@@ -208,8 +209,12 @@ def _describe_unread(failures: list[tuple[str, str]]) -> str:
         num_previous[suffix] = num_previous.get(suffix, -1) + 1
         sort_keys.append((num_previous[suffix], failure_index, reason))
     reasons = [reason for *_, reason in sorted(sort_keys)]
-    omitted = f"; and {len(reasons) - _MAX_DESCRIBED} more" if len(reasons) > _MAX_DESCRIBED else ""
-    return f"{counted(len(reasons), 'file')} not read: {'; '.join(reasons[:_MAX_DESCRIBED])}{omitted}"
+    number_of_omitted_text = (
+        f"; and {len(reasons) - _MAX_DESCRIBED_FILES} more" if len(reasons) > _MAX_DESCRIBED_FILES else ""
+    )
+    return (
+        f"{counted(len(reasons), 'file')} not read: {'; '.join(reasons[:_MAX_DESCRIBED_FILES])}{number_of_omitted_text}"
+    )
 
 
 def _check_clip(clip: Recording | Intensities, name: str) -> None:

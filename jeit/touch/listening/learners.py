@@ -31,19 +31,19 @@ from jeit.touch.listening.window_features import Levels, sound_features, spectru
 from jeit.touch.training import TrainingPlan
 
 # Number of rounds in which trees are boosted.
-_NUM_ROUNDS = 100
+_NUM_BOOSTING_ROUNDS = 100
 # Number of leaves of a boosted tree.
 _NUM_LEAVES = 15
 # Minimum number of windows in a leaf of a boosted tree, in large training sets.
 _MIN_LEAF_WINDOWS = 10
-BATCHES = 1500
+MAX_TRAINING_BATCHES = 1500
 """Default of the maximum number of training batches."""
 # Maximum number of passes through the windows of a small training set.
-_MAX_PASSES = 40
+_MAX_TRAINING_PASSES = 40
 # Number of batches that are allowed even if they require more passes.
 _MIN_BATCHES = 100
 # One in this number of groups of clips of each class is held out for early stopping of the network's training.
-_STOPPING_RATIO = 6
+_GROUPS_PER_HELD_OUT_GROUP = 6
 
 
 class TrainingSet(NamedTuple):
@@ -60,7 +60,7 @@ class TrainingSet(NamedTuple):
     groups: Int[np.ndarray, " W"]
     classes: int
     key: Array
-    batches: int = BATCHES
+    batches: int = MAX_TRAINING_BATCHES
     checkpoint: Path | None = None
     progress: Callable[[str], None] | None = None
 
@@ -105,7 +105,7 @@ class NetworkLearner:
         if training_set.checkpoint is not None:
             training_set.checkpoint.parent.mkdir(parents=True, exist_ok=True)
         num_windows = int((~is_held_out).sum())
-        max_batches = max(_MIN_BATCHES, _MAX_PASSES * num_windows // 64)
+        max_batches = max(_MIN_BATCHES, _MAX_TRAINING_PASSES * num_windows // 64)
         plan = self.plan(num_windows, batches=min(training_set.batches, max_batches))
         result = train_network(
             level_images[~is_held_out],
@@ -147,7 +147,7 @@ class TreesListener:
 
         min_class_windows = int(np.bincount(training_set.labels, minlength=training_set.classes).min())
         model = HistGradientBoostingClassifier(
-            max_iter=_NUM_ROUNDS,
+            max_iter=_NUM_BOOSTING_ROUNDS,
             max_leaf_nodes=_NUM_LEAVES,
             min_samples_leaf=int(np.clip(min_class_windows // 4, 1, _MIN_LEAF_WINDOWS)),
             l2_regularization=1.0,
@@ -297,8 +297,8 @@ def select_early_stopping_windows(window_classes: Int[np.ndarray, " W"], groups:
     for class_index in np.unique(window_classes):
         class_groups = np.unique(groups[window_classes == class_index])
         num_wanted = (
-            len(class_groups) // _STOPPING_RATIO
-            if len(class_groups) >= _STOPPING_RATIO
+            len(class_groups) // _GROUPS_PER_HELD_OUT_GROUP
+            if len(class_groups) >= _GROUPS_PER_HELD_OUT_GROUP
             else int(len(class_groups) >= 3)
         )
         already_held_out = held_out_groups & set(class_groups.tolist())

@@ -13,13 +13,13 @@ from jaxtyping import Array
 
 from jeit.acoustic import Calibration, Recording, locate_touches
 from jeit.arguments import check_key, check_kind, check_name, counted
-from jeit.arguments.extras import need_extra
+from jeit.arguments.extras import require_extra
 from jeit.files import error_text
 from jeit.touch.learnt.learn_from_presses import Standing
 from jeit.touch.learnt.methods import fit_sharpness, probabilities
 from jeit.touch.listening.feature_images import NUM_BANDS, WINDOW_INTERVAL, image_blocks
 from jeit.touch.listening.labelled_clips import LabelledClips, mix_channels
-from jeit.touch.listening.learners import BATCHES, LEARNERS
+from jeit.touch.listening.learners import LEARNERS, MAX_TRAINING_BATCHES
 from jeit.touch.listening.sound_labels import SoundLabels
 from jeit.touch.listening.windows import MIN_RELATIVE_LOUDNESS, Windows, held_out_folds
 from jeit.touch.training import read_model, write_model
@@ -31,9 +31,9 @@ _AUTO_METHODS = tuple(name for name in LEARNERS if name != "paper-network")
 # Maximum number of folds in which clips are held out.
 _MAX_FOLDS = 3
 # Power below which a window counts as quiet, relative to the power of the quietest training window.
-_QUIET_RATIO = 0.25
+_MAX_QUIET_POWER_RATIO = 0.25
 # Minimum ratio of a recording's loudness to that of the softest training clip that is attributed to a lower gain.
-_MIN_GAIN = 1 / 16
+_MIN_RECORDING_GAIN = 1 / 16
 # Minimum number of windows for which a network is tried.
 _MIN_NETWORK_WINDOWS = 3000
 # Number of samples within which the readings of a working microphone change.
@@ -84,7 +84,7 @@ class Listener:
         method: str = "auto",
         loudness: bool | None = None,
         key: Array | None = None,
-        batches: int = BATCHES,
+        batches: int = MAX_TRAINING_BATCHES,
         folder: str | Path | None = None,
         progress: Callable[[str], None] | None = None,
     ) -> "Listener":
@@ -101,7 +101,7 @@ class Listener:
         that is called with a description of the progress. Raises `ValueError` for invalid clips, key or method;
         `ImportError` without the extra `learn`.
         """
-        need_extra("learn", "learning to classify sounds")
+        require_extra("learn", "learning to classify sounds")
         check_kind("clips", clips, LabelledClips, "clips as of read_clips(folder)")
         check_name("method", method, METHODS)
         key = jax.random.key(0) if key is None else key
@@ -137,10 +137,10 @@ class Listener:
         ranked_methods.sort(key=lambda entry: (*entry[0], -entry[1]))
         (_, _, best_method, odds) = ranked_methods[0]
         report(f"{best_method}, all clips")
-        full_set = windows.training_set(
+        full_training_set = windows.training_set(
             np.ones(len(windows.clip), bool), key, batches, _checkpoint_path(folder, best_method), report
         )
-        model = LEARNERS[best_method].learn(full_set)
+        model = LEARNERS[best_method].learn(full_training_set)
         is_held_out = np.isfinite(odds).all(axis=1)
         standing = None
         if is_held_out.any():
@@ -259,9 +259,10 @@ class Listener:
         gain = (
             1.0
             if self.loudness
-            else float(np.clip(max_loudness / softest_clip, _MIN_GAIN, 1)) * max(1.0, max_loudness / loudest_clip)
+            else float(np.clip(max_loudness / softest_clip, _MIN_RECORDING_GAIN, 1))
+            * max(1.0, max_loudness / loudest_clip)
         )
-        return _QUIET_RATIO * self.quietest * gain
+        return _MAX_QUIET_POWER_RATIO * self.quietest * gain
 
     def write(self, path: str | Path) -> None:
         """Write the listener, without its `standing`, to one file that consists of a JSON header and arrays.

@@ -29,7 +29,7 @@ from jeit_solvers.module import Module
 # Sizes of the kernels and of the pools in pixels, and numbers of channels, of the first and second layer.
 _KERNEL_SIZES, _POOL_SIZES, _NUM_CHANNELS = (5, 3), (3, 2), (32, 64)
 # Weight of the mean and variance of a batch in the update of the running mean and variance.
-_RUNNING_WEIGHT = 0.05
+_RUNNING_MEAN_UPDATE_WEIGHT = 0.05
 # Constant added to variances.
 _VARIANCE_FLOOR = 1e-5
 NOISE_DEVIATION, NUM_COPIES = 0.2, 5
@@ -96,7 +96,9 @@ class ModalityNetwork(Module):
         """
         log_odds, means, variances = self._forward(images, None, None)
         running_statistics = jax.tree.map(
-            lambda old, new: (1 - _RUNNING_WEIGHT) * old + _RUNNING_WEIGHT * jax.lax.stop_gradient(new),
+            lambda old, new: (
+                (1 - _RUNNING_MEAN_UPDATE_WEIGHT) * old + _RUNNING_MEAN_UPDATE_WEIGHT * jax.lax.stop_gradient(new)
+            ),
             (self.mean, self.variance),
             (means, variances),
         )
@@ -162,8 +164,8 @@ class NetworkAnswers:
     def _evaluate_block(self, images: np.ndarray) -> np.ndarray:
         values = images[..., None]
         for kernel, offset, size, pool_size in zip(self.kernels, self.offsets, _KERNEL_SIZES, _POOL_SIZES, strict=True):
-            patches = sliding_window_view(values, (size, size), axis=(1, 2))
-            values = patches.reshape(*patches.shape[:3], -1) @ kernel
+            image_patches = sliding_window_view(values, (size, size), axis=(1, 2))
+            values = image_patches.reshape(*image_patches.shape[:3], -1) @ kernel
             values += offset
             values = _max_pool(np.maximum(values, 0, out=values), pool_size, np)
         return values.reshape(len(images), -1) @ self.dense + self.bias
@@ -217,7 +219,7 @@ def train_network(
     """
     draw_key, training_key = jax.random.split(key)
     network = ModalityNetwork.draw(draw_key, images.shape[1], images.shape[2], classes)
-    is_running = eqx.tree_at(
+    is_running_statistic = eqx.tree_at(
         lambda tree: (tree.mean, tree.variance), jax.tree.map(lambda _: True, network), ((False, False), (False, False))
     )
 
@@ -235,7 +237,7 @@ def train_network(
     validation = (np.asarray(validation_set[0], np.float32), np.asarray(validation_set[1], np.int32))
     return fit_network(
         network,
-        TrainingObjective(loss, validation_loss, is_running),
+        TrainingObjective(loss, validation_loss, is_running_statistic),
         data,
         validation,
         plan,

@@ -98,12 +98,12 @@ class SoundLabels:
         """Sounds of the recording: intervals of consecutive windows of the same class."""
         names, events = self.named, []
         # An event extends half way to the previous and to the next window.
-        edge_parts = [
+        boundary_segments = [
             self.times[:1] - WINDOW_INTERVAL / 2,
             (self.times[1:] + self.times[:-1]) / 2,
             self.times[-1:] + WINDOW_INTERVAL / 2,
         ]
-        edges = np.maximum(np.concatenate(edge_parts), 0).tolist()
+        edges = np.maximum(np.concatenate(boundary_segments), 0).tolist()
         boundaries = np.flatnonzero(names[1:] != names[:-1]) + 1
         for indices in np.split(np.arange(len(names)), boundaries):
             if not indices.size:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from jeit.touch.listening.feature_images import FRAME_INTERVAL, NUM_BANDS, NUM_FRAMES, SoundImages
 
 # Range of levels below the loudest level, decibels.
-_LEVEL_RANGE = 60.0
+_LEVEL_RANGE_DB = 60.0
 # Quantile of the powers that counts as the loudest.
 _LOUDEST_QUANTILE = 0.999
 
@@ -35,7 +35,7 @@ class Levels:
         max_levels, mean_levels, level_deviations = [], [], []
         for power in (images.intensity, images.spectrum):
             max_level = _to_decibels(np.quantile(power, _LOUDEST_QUANTILE), -np.inf)
-            levels = _to_decibels(power, float(max_level) - _LEVEL_RANGE)
+            levels = _to_decibels(power, float(max_level) - _LEVEL_RANGE_DB)
             max_levels.append(float(max_level))
             mean_levels.append(float(levels.mean(dtype=float)))
             level_deviations.append(float(levels.std(dtype=float)) or 1.0)
@@ -57,7 +57,7 @@ class Levels:
         loudness_order = np.argsort(-images.intensity.sum(axis=2), axis=1, kind="stable")
         intensity = np.take_along_axis(images.intensity, loudness_order[..., None], axis=1)
         level_images = [
-            (_to_decibels(power, self.loudest[image_index] - _LEVEL_RANGE) - self.mean[image_index])
+            (_to_decibels(power, self.loudest[image_index] - _LEVEL_RANGE_DB) - self.mean[image_index])
             / self.deviation[image_index]
             for image_index, power in enumerate((intensity, images.spectrum))
         ]
@@ -70,7 +70,7 @@ def _to_decibels(power, min_level: float) -> np.ndarray:
 
 
 # Minimum prominence of a peak of the loudness, decibels.
-_MIN_PROMINENCE = 6.0
+_MIN_PEAK_PROMINENCE_DB = 6.0
 # Number of bands of the mean spectrum.
 _NUM_SPECTRUM_BANDS = 16
 # Number of bands whose decay is measured.
@@ -145,7 +145,7 @@ def spectrum_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
 def _relative_decibels(power: np.ndarray) -> np.ndarray:
     """Convert powers to levels in decibels (W, …), clipped at 60 dB below the maximum of each window."""
     level = 10 * np.log10(np.maximum(power, 1e-30))
-    return np.maximum(level, level.max(axis=tuple(range(1, level.ndim)), keepdims=True) - _LEVEL_RANGE)
+    return np.maximum(level, level.max(axis=tuple(range(1, level.ndim)), keepdims=True) - _LEVEL_RANGE_DB)
 
 
 def _loudness_features(level: Float[np.ndarray, "W 41"]) -> np.ndarray:
@@ -160,10 +160,14 @@ def _loudness_features(level: Float[np.ndarray, "W 41"]) -> np.ndarray:
     first_peak = np.where(num_peaks > 0, np.argmax(peaks, axis=1), 0)
     last_peak = np.where(num_peaks > 0, NUM_FRAMES - 1 - np.argmax(peaks[:, ::-1], axis=1), 0)
     interval = np.where(num_peaks > 1, (last_peak - first_peak) / np.maximum(num_peaks - 1, 1), NUM_FRAMES)
-    modulation = np.abs(np.fft.rfft(level - level.mean(axis=1, keepdims=True), axis=1))[:, 1 : _NUM_MODULATIONS + 1]
-    level_change = np.diff(level, axis=1)
-    late_decay = level[rows, np.minimum(loudest_frame + _NUM_DECAY_FRAMES, NUM_FRAMES - 1)] - max_level
-    early_decay = level[rows, np.minimum(loudest_frame + _NUM_DECAY_FRAMES // 4, NUM_FRAMES - 1)] - max_level
+    modulation_spectrum = np.abs(np.fft.rfft(level - level.mean(axis=1, keepdims=True), axis=1))[
+        :, 1 : _NUM_MODULATIONS + 1
+    ]
+    level_differences = np.diff(level, axis=1)
+    level_at_end_of_decay = level[rows, np.minimum(loudest_frame + _NUM_DECAY_FRAMES, NUM_FRAMES - 1)] - max_level
+    level_at_quarter_of_decay = (
+        level[rows, np.minimum(loudest_frame + _NUM_DECAY_FRAMES // 4, NUM_FRAMES - 1)] - max_level
+    )
     level_before = level[rows, np.maximum(loudest_frame - _NUM_DECAY_FRAMES // 4, 0)] - max_level
     return np.column_stack(
         [
@@ -176,14 +180,14 @@ def _loudness_features(level: Float[np.ndarray, "W 41"]) -> np.ndarray:
             interval * FRAME_INTERVAL,
             loudest_frame * FRAME_INTERVAL,
             (frame_index * 10 ** (-level_below_max / 10)).sum(axis=1) / (10 ** (-level_below_max / 10)).sum(axis=1),
-            late_decay,
-            early_decay,
+            level_at_end_of_decay,
+            level_at_quarter_of_decay,
             level_before,
-            level_change.max(axis=1),
-            level_change.min(axis=1),
-            np.abs(level_change).mean(axis=1),
-            modulation / NUM_FRAMES,
-            modulation.argmax(axis=1),
+            level_differences.max(axis=1),
+            level_differences.min(axis=1),
+            np.abs(level_differences).mean(axis=1),
+            modulation_spectrum / NUM_FRAMES,
+            modulation_spectrum.argmax(axis=1),
         ]
     )
 
@@ -202,7 +206,7 @@ def _loudness_peaks(level: np.ndarray) -> np.ndarray:
     return (
         (level >= local_max)
         & (level > np.pad(level, ((0, 0), (1, 0)), mode="constant")[:, :-1])
-        & (level - surrounding_min >= _MIN_PROMINENCE)
+        & (level - surrounding_min >= _MIN_PEAK_PROMINENCE_DB)
     )
 
 
@@ -210,12 +214,12 @@ def _spectral_features(spectrum: Float[np.ndarray, "W 64 41"], level: np.ndarray
     """Compute features (W, k) of the spectrogram (W, 64, 41) of each window; `level` (W, 41): loudness, decibels."""
     rows = np.arange(len(spectrum))
     power = spectrum.mean(axis=2) + 1e-30
-    band_shares = power / power.sum(axis=1, keepdims=True)
+    band_power_fractions = power / power.sum(axis=1, keepdims=True)
     band_index = np.arange(NUM_BANDS)
-    spectrum_levels = _relative_decibels(power.reshape(len(power), _NUM_SPECTRUM_BANDS, -1).mean(axis=2))
-    spectrum_levels = spectrum_levels - spectrum_levels.max(axis=1, keepdims=True)
-    centroid = band_shares @ band_index
-    width = np.sqrt(np.maximum(band_shares @ band_index**2 - centroid**2, 0))
+    spectrum_levels_db = _relative_decibels(power.reshape(len(power), _NUM_SPECTRUM_BANDS, -1).mean(axis=2))
+    spectrum_levels_db = spectrum_levels_db - spectrum_levels_db.max(axis=1, keepdims=True)
+    centroid = band_power_fractions @ band_index
+    width = np.sqrt(np.maximum(band_power_fractions @ band_index**2 - centroid**2, 0))
     spectral_flatness = np.exp(np.log(power).mean(axis=1)) / power.mean(axis=1)
     frame_power = spectrum.sum(axis=1) + 1e-30
     frame_centroid = np.einsum("wbt,b->wt", spectrum, band_index) / frame_power
@@ -233,8 +237,8 @@ def _spectral_features(spectrum: Float[np.ndarray, "W 64 41"], level: np.ndarray
             _relative_decibels(spectrum.reshape(len(power), _NUM_SPECTRUM_BANDS, -1, NUM_FRAMES).mean(axis=2)), axis=2
         )
     )
-    slope = np.polyfit(np.log(np.arange(1, _NUM_SPECTRUM_BANDS + 1)), spectrum_levels.T, 1)[0]
-    scalar_features = [
+    slope = np.polyfit(np.log(np.arange(1, _NUM_SPECTRUM_BANDS + 1)), spectrum_levels_db.T, 1)[0]
+    features_per_window = [
         centroid,
         width,
         spectral_flatness,
@@ -244,21 +248,25 @@ def _spectral_features(spectrum: Float[np.ndarray, "W 64 41"], level: np.ndarray
         flux.max(axis=2).mean(axis=1),
         slope,
     ]
-    return np.column_stack([spectrum_levels, *scalar_features, later_levels - max_levels, decay_levels.std(axis=2)])
+    return np.column_stack(
+        [spectrum_levels_db, *features_per_window, later_levels - max_levels, decay_levels.std(axis=2)]
+    )
 
 
 def _microphone_features(intensity: Float[np.ndarray, "W M 41"]) -> np.ndarray:
     """Compute features (W, k) of the distribution of the power `intensity` over M microphones and 41 frames."""
     mean_power = intensity.mean(axis=2) + 1e-30
-    power_shares = mean_power / mean_power.sum(axis=1, keepdims=True)
-    sorted_shares = np.sort(power_shares, axis=1)[:, ::-1]
-    normalised_entropy = -(power_shares * np.log(power_shares)).sum(axis=1) / np.log(max(power_shares.shape[1], 2))
+    power_fractions = mean_power / mean_power.sum(axis=1, keepdims=True)
+    sorted_power_fractions = np.sort(power_fractions, axis=1)[:, ::-1]
+    normalised_entropy = -(power_fractions * np.log(power_fractions)).sum(axis=1) / np.log(
+        max(power_fractions.shape[1], 2)
+    )
     level = _relative_decibels(intensity)
     level_deviation = level - level.mean(axis=2, keepdims=True)
     # Correlation of each microphone's level over time with the level of the loudest microphone.
-    loudest_deviation = level_deviation[np.arange(len(level_deviation)), power_shares.argmax(axis=1)]
-    norms = np.sqrt((level_deviation**2).sum(axis=2) * (loudest_deviation**2).sum(axis=1)[:, None]) + 1e-9
-    correlations = np.einsum("wmt,wt->wm", level_deviation, loudest_deviation) / norms
+    loudest_deviation = level_deviation[np.arange(len(level_deviation)), power_fractions.argmax(axis=1)]
+    norm_products = np.sqrt((level_deviation**2).sum(axis=2) * (loudest_deviation**2).sum(axis=1)[:, None]) + 1e-9
+    correlations = np.einsum("wmt,wt->wm", level_deviation, loudest_deviation) / norm_products
     first_half_power, last_half_power = (
         intensity[..., half].mean(axis=2) + 1e-30 for half in (slice(NUM_FRAMES // 2), slice(NUM_FRAMES // 2, None))
     )
@@ -271,11 +279,11 @@ def _microphone_features(intensity: Float[np.ndarray, "W M 41"]) -> np.ndarray:
     change_rate = (np.diff(loudest_microphone, axis=1) != 0).mean(axis=1)
     return np.column_stack(
         [
-            sorted_shares[:, 0],
-            sorted_shares[:, : max(1, power_shares.shape[1] // 6)].sum(axis=1),
+            sorted_power_fractions[:, 0],
+            sorted_power_fractions[:, : max(1, power_fractions.shape[1] // 6)].sum(axis=1),
             normalised_entropy,
             correlations.mean(axis=1),
-            np.sort(correlations, axis=1)[:, power_shares.shape[1] // 2],
+            np.sort(correlations, axis=1)[:, power_fractions.shape[1] // 2],
             distribution_change,
             change_rate,
             level.mean(axis=2).std(axis=1),

@@ -37,12 +37,13 @@ def held_out_folds(
             continue
         for group in sorted(class_groups.tolist(), key=lambda group: -int((groups == group).sum())):
             if group not in fold_of_group:
-                num_assigned = [
+                num_groups_per_fold = [
                     sum(fold_of_group.get(other_group) == fold_index for other_group in class_groups.tolist())
                     for fold_index in range(max_folds)
                 ]
                 fold_of_group[group] = min(
-                    range(max_folds), key=lambda fold_index: (num_assigned[fold_index], counts[fold_index], fold_index)
+                    range(max_folds),
+                    key=lambda fold_index: (num_groups_per_fold[fold_index], counts[fold_index], fold_index),
                 )
                 counts[fold_of_group[group]] += int((groups == group).sum())
     for group, fold_index in fold_of_group.items():
@@ -112,10 +113,10 @@ class Windows:
                 else [np.arange(len(loud_windows))]
             )
             for piece_index, piece in enumerate(clip_pieces):
-                selection = piece[
+                selected_windows = piece[
                     np.linspace(0, len(piece) - 1, min(len(piece), _MAX_PIECE_WINDOWS)).round().astype(int)
                 ]
-                image_blocks.append(images[loud_windows[selection]])
+                image_blocks.append(images[loud_windows[selected_windows]])
                 clip_of_piece.append(clip_index)
                 group_of_piece.append(
                     (

@@ -1,9 +1,9 @@
 from .depth_maps import FrameDepth, resting_frame, stream_depths
-from .image_network import DESIGNS, ImageNetwork, read_network, write_network
+from .image_network import NETWORK_DESIGNS, ImageNetwork, read_network, write_network
 from .learn import PRESETS, ImageStanding, LearntImages, NetworkPreset, learn_images
 
 __all__ = [
-    "DESIGNS",
+    "NETWORK_DESIGNS",
     "PRESETS",
     "FrameDepth",
     "ImageNetwork",

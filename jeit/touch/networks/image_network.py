@@ -29,7 +29,7 @@ from jeit.touch.simulate.contact.indent_sets import pixel_places
 from jeit.touch.simulate.contact.indents import relative_voltage_changes
 from jeit.touch.training import check_same, read_model, write_model
 
-DESIGNS = ("unrolled", "three-stages")
+NETWORK_DESIGNS = ("unrolled", "three-stages")
 _FILE_KIND, _FILE_VERSION = "a jeit image network", 1
 # Maximum number of refinement steps of an unrolled network.
 _MAX_STEPS = 100
@@ -52,10 +52,10 @@ _MAX_RELATIVE_CHANGE = 100.0
 class ImageNetwork:
     """A trained network that estimates depth maps of touches from the voltages of one skin.
 
-    **Fields**: `network`: the neural network; `design`: design of the network, one of `DESIGNS`; `thickness`: thickness
-    of the skin, metres; `shape`: (rows, columns) of the depth maps; `extent`: (x_min, x_max, y_min, y_max) of the maps,
-    metres, with row 0 at y_min; `noise`: relative noise of a channel in training; `made_for`: description of the skin,
-    electrodes and protocol that the network was trained for, as plain values.
+    **Fields**: `network`: the neural network; `design`: design of the network, one of `NETWORK_DESIGNS`; `thickness`:
+    thickness of the skin, metres; `shape`: (rows, columns) of the depth maps; `extent`: (x_min, x_max, y_min, y_max) of
+    the maps, metres, with row 0 at y_min; `noise`: relative noise of a channel in training; `made_for`: description of
+    the skin, electrodes and protocol that the network was trained for, as plain values.
 
     **Example:**
 
@@ -118,9 +118,9 @@ class ImageNetwork:
         worst_frame = int(is_missing.sum(axis=1).argmax()) if len(is_missing) else 0
         if is_missing.any() and is_missing[worst_frame].sum() > max_missing:
             missing_channels = np.flatnonzero(is_missing[worst_frame])
-            listed_channels = ", ".join(map(str, missing_channels[:6])) + (", …" if len(missing_channels) > 6 else "")
+            channels_text = ", ".join(map(str, missing_channels[:6])) + (", …" if len(missing_channels) > 6 else "")
             raise ValueError(
-                f"voltages: no reading of {len(missing_channels)} of {num_channels} channels ({listed_channels}); "
+                f"voltages: no reading of {len(missing_channels)} of {num_channels} channels ({channels_text}); "
                 + (
                     "half of them are needed."
                     if max_missing
@@ -254,7 +254,7 @@ def write_network(network: ImageNetwork, path: str | Path) -> None:
     ```
     """
     check_kind("network", network, ImageNetwork, "an ImageNetwork, as of learn_images")
-    head = {
+    header = {
         "design": network.design,
         "steps": len(network.network.steps) if isinstance(network.network, Unrolled) else 0,
         "thickness_m": network.thickness,
@@ -264,7 +264,7 @@ def write_network(network: ImageNetwork, path: str | Path) -> None:
         "made_for": network.made_for,
         "versions": {name: version(name) for name in ("jeit", "jax", "equinox")},
     }
-    write_model(path, _FILE_KIND, _FILE_VERSION, head, network.network)
+    write_model(path, _FILE_KIND, _FILE_VERSION, header, network.network)
 
 
 def read_network(path: str | Path, *, skin: Skin | None = None) -> ImageNetwork:
@@ -289,16 +289,16 @@ def read_network(path: str | Path, *, skin: Skin | None = None) -> ImageNetwork:
     """
     path = Path(path)
     path = path / NETWORK_FILE if path.is_dir() else path
-    head, network = read_model(path, _FILE_KIND, _FILE_VERSION, _untrained_network)
-    low_x, high_x, low_y, high_y = map(float, head["extent_m"])
+    header, network = read_model(path, _FILE_KIND, _FILE_VERSION, _untrained_network)
+    low_x, high_x, low_y, high_y = map(float, header["extent_m"])
     image_network = ImageNetwork(
         network,
-        head["design"],
-        float(head["thickness_m"]),
-        (int(head["shape"][0]), int(head["shape"][1])),
+        header["design"],
+        float(header["thickness_m"]),
+        (int(header["shape"][0]), int(header["shape"][1])),
         (low_x, high_x, low_y, high_y),
-        float(head["noise"]),
-        head["made_for"],
+        float(header["noise"]),
+        header["made_for"],
     )
     if skin is not None:
         skin_description = describe_skin(
@@ -308,22 +308,22 @@ def read_network(path: str | Path, *, skin: Skin | None = None) -> ImageNetwork:
     return image_network
 
 
-def _untrained_network(head: dict[str, Any]) -> ThreeStages | Unrolled:
-    """Create an untrained network of the architecture that the header `head` of a network's file describes."""
-    check_name("design", head["design"], DESIGNS)
-    rows, columns = head["shape"]
-    channels, key = head["made_for"]["channels"], jax.random.key(0)
+def _untrained_network(header: dict[str, Any]) -> ThreeStages | Unrolled:
+    """Create an untrained network of the architecture that the `header` of a network's file describes."""
+    check_name("design", header["design"], NETWORK_DESIGNS)
+    rows, columns = header["shape"]
+    channels, key = header["made_for"]["channels"], jax.random.key(0)
     for count in (rows, columns, channels):
         if not (isinstance(count, int) and 1 <= count <= 10_000):
             raise ValueError(f"its header gives {describe(count)} rows, columns or channels")
-    lengths_and_noise = [head["thickness_m"], head["noise"], *head["extent_m"]]
+    lengths_and_noise = [header["thickness_m"], header["noise"], *header["extent_m"]]
     if len(lengths_and_noise) != 6 or not all(is_number(number) for number in lengths_and_noise):
         raise ValueError("its header gives no thickness, noise and extent")
-    if not (isinstance(head["steps"], int) and 0 <= head["steps"] <= _MAX_STEPS):
-        raise ValueError(f"its header gives {describe(head['steps'])} steps")
-    if head["design"] == "three-stages":
+    if not (isinstance(header["steps"], int) and 0 <= header["steps"] <= _MAX_STEPS):
+        raise ValueError(f"its header gives {describe(header['steps'])} steps")
+    if header["design"] == "three-stages":
         return ThreeStages(channels, (rows, columns), key=key)
-    return Unrolled(channels, (rows, columns), head["steps"], key=key)
+    return Unrolled(channels, (rows, columns), header["steps"], key=key)
 
 
 def _describe_protocol(protocol: Protocol) -> dict[str, Any]:

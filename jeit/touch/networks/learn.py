@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.arguments import check_kind, check_name, describe
-from jeit.arguments.extras import need_extra
+from jeit.arguments.extras import require_extra
 from jeit.design import Skin, touches_away_from_the_edge
-from jeit.design.study.store import OtherContents
+from jeit.design.study.store import DifferentContentsError
 from jeit.layout import Layout
-from jeit.touch.networks.image_network import DESIGNS, NETWORK_FILE, ImageNetwork, write_network
+from jeit.touch.networks.image_network import NETWORK_DESIGNS, NETWORK_FILE, ImageNetwork, write_network
 from jeit.touch.networks.linear_channels import (
     LinearChannels,
     depth_centroids,
@@ -45,7 +45,13 @@ from jeit.touch.training import (
 # Training of the unrolled network. Weights of the maps of the other steps and of the voltage misfit in the loss,
 # relative to the weight of the last step's map. Model error, relative to the voltage changes; maximum standard
 # deviation of the drift of log contact impedances; maximum noise, as a multiple of the given noise.
-_EARLY_MAP_WEIGHT, _MISFIT_WEIGHT, _MODEL_ERROR, _MAX_CONTACT_DRIFT, _MAX_NOISE_FACTOR = 0.3, 0.05, 0.1, 0.1, 6.0
+_EARLIER_MAP_LOSS_WEIGHT, _VOLTAGE_MISFIT_LOSS_WEIGHT, _MODEL_ERROR, _MAX_CONTACT_DRIFT, _MAX_NOISE_FACTOR = (
+    0.3,
+    0.05,
+    0.1,
+    0.1,
+    6.0,
+)
 # Squared depths are divided by this scale, so that losses are about one before training.
 _LOSS_SCALE = 0.002
 
@@ -113,7 +119,7 @@ def train_three_stages(
     def map_loss(network, batch, key):
         return jnp.mean((network(batch, key) - batch) ** 2) / _LOSS_SCALE, network
 
-    trainings = {
+    losses_by_training = {
         "voltages": runs.run(
             "voltages",
             VoltageAutoencoder(validation.change.shape[1], key=voltage_key),
@@ -131,9 +137,9 @@ def train_three_stages(
             validation.depth,
         ),
     }
-    trained_parts = (trainings["voltages"].network.encoder, trainings["maps"].network.decoder)
+    trained_parts = (losses_by_training["voltages"].network.encoder, losses_by_training["maps"].network.decoder)
     initial_network = eqx.tree_at(lambda network: (network.encoder, network.decoder), initial_network, trained_parts)
-    is_trained = eqx.tree_at(
+    is_trained_weight = eqx.tree_at(
         lambda network: network.projection,
         jax.tree.map(lambda _: False, initial_network),
         jax.tree.map(eqx.is_inexact_array, initial_network.projection),
@@ -145,10 +151,10 @@ def train_three_stages(
         return jnp.mean((network(noisy_change) - true_maps) ** 2) / _LOSS_SCALE, network
 
     rows = training.rows("change", "depth"), _add_noise(validation, noise)
-    trainings["projection"] = runs.run(
-        "projection", initial_network, TrainingObjective(projection_loss, _map_errors, is_trained), *rows
+    losses_by_training["projection"] = runs.run(
+        "projection", initial_network, TrainingObjective(projection_loss, _map_errors, is_trained_weight), *rows
     )
-    return TrainedNetwork(trainings["projection"].network, trainings)
+    return TrainedNetwork(losses_by_training["projection"].network, losses_by_training)
 
 
 def train_unrolled(
@@ -176,15 +182,15 @@ def train_unrolled(
         drift = _MAX_CONTACT_DRIFT * drift_size * jax.random.normal(keys[1], (len(change), len(contacts)), change.dtype)
         noise_levels = noise * _MAX_NOISE_FACTOR**noise_size
         noisy_change = change + noise_levels * jax.random.normal(keys[0], change.shape, change.dtype) + drift @ contacts
-        *early_maps, last_map = network.maps_after_steps(noisy_change)
+        *maps_of_earlier_steps, last_map = network.maps_after_steps(noisy_change)
         loss_value = jnp.mean((last_map - depth) ** 2)
-        for early_map in early_maps:
-            loss_value = loss_value + _EARLY_MAP_WEIGHT * jnp.mean((early_map - depth) ** 2)
+        for map_of_earlier_step in maps_of_earlier_steps:
+            loss_value = loss_value + _EARLIER_MAP_LOSS_WEIGHT * jnp.mean((map_of_earlier_step - depth) ** 2)
         expected_misfit = noise_levels[:, 0] ** 2 + _MODEL_ERROR**2 * jnp.mean(change**2, axis=1)
         relative_misfit = jnp.mean((network.predicted_changes(last_map) - change) ** 2, axis=1) / expected_misfit
         # The logarithm of the misfit is used, since touches on electrodes, which the model explains least, would
         # otherwise dominate.
-        return loss_value / _LOSS_SCALE + _MISFIT_WEIGHT * jnp.mean(jnp.log1p(relative_misfit)), network
+        return loss_value / _LOSS_SCALE + _VOLTAGE_MISFIT_LOSS_WEIGHT * jnp.mean(jnp.log1p(relative_misfit)), network
 
     rows = training.rows("change", "depth"), _add_noise(validation, noise)
     result = runs.run("unrolled", untrained, TrainingObjective(loss, _map_errors, untrained.trained), *rows)
@@ -223,7 +229,7 @@ def _add_noise(examples: TouchExamples, noise: float) -> tuple[Float[np.ndarray,
     return np.asarray(examples.change + noise * random, np.float32), examples.depth
 
 
-SHAPE = (48, 48)
+DEPTH_MAP_SHAPE = (48, 48)
 # Number of simulated touches of a chunk; seed offsets of the training, held-out and test sets. No choice depends on the
 # test set.
 _CHUNK_SIZE, _SEED_OFFSETS = 250, (0, 1, 2)
@@ -340,15 +346,15 @@ def learn_images(
     learnt_images = learn_images(sheet, "network", preset=preset)
     ```
     """
-    need_extra("learn", "a network that images touches")
-    need_extra("cluster", "a store of simulated touches")
+    require_extra("learn", "a network that images touches")
+    require_extra("cluster", "a store of simulated touches")
     check_kind("skin", skin, Skin, "a Skin, as of read_described_skin('skin.toml')")
     if not isinstance(skin.layout, Layout):
         raise ValueError(
             f"skin: networks image flat skins, and {describe(skin.layout.name)} is of a curved one; give its surface "
             "as a rectangle, skin.width_mm and skin.height_mm in place of the table [surface]."
         )
-    check_name("design", design, DESIGNS)
+    check_name("design", design, NETWORK_DESIGNS)
     if not isinstance(preset, NetworkPreset):
         check_name("preset", preset, PRESETS)
         preset = PRESETS[preset]
@@ -362,7 +368,7 @@ def learn_images(
     seconds, start = {}, time.monotonic()
     report("noise")
     noise = detection_noise(skin)
-    sets = {}
+    simulated_sets = {}
     for name, num_touches, seed_offset in zip(
         ("learnt", "held-out", "standing"),
         (preset.number, preset.held_out, preset.held_out),
@@ -370,7 +376,7 @@ def learn_images(
         strict=True,
     ):
         indents = IndentSet(
-            skin, touch_draws(skin), num_touches, seed=3 * seed + seed_offset, shape=SHAPE, chunk=_CHUNK_SIZE
+            skin, touch_draws(skin), num_touches, seed=3 * seed + seed_offset, shape=DEPTH_MAP_SHAPE, chunk=_CHUNK_SIZE
         )
         path = working_folder / f"{name}.zarr"
         try:
@@ -380,26 +386,28 @@ def learn_images(
                 client=client,
                 progress=lambda state, name=name: report(f"touches {name}: {state.points} of {state.all_points}"),
             )
-        except OtherContents:
+        except DifferentContentsError:
             raise ValueError(
                 f"folder '{folder}' was begun for another skin, seed or number of touches; give another folder, or "
                 f"delete '{working_folder}' to learn anew."
             ) from None
-        sets[name] = StoredTouches(indents, path)
-    held_out_examples, test_examples = (sets[name].in_memory() for name in ("held-out", "standing"))
+        simulated_sets[name] = StoredTouches(indents, path)
+    held_out_examples, test_examples = (simulated_sets[name].in_memory() for name in ("held-out", "standing"))
     seconds["touches"] = time.monotonic() - start
     key = jax.random.key(seed)
     runs = TrainingRuns(preset.plan_of(design), key, working_folder, progress)
     if design == "unrolled":
-        channels = LinearChannels.from_skin(skin, SHAPE)
-        initial_network = Unrolled(held_out_examples.change.shape[1], SHAPE, key=jax.random.fold_in(key, 3))
-        pixel_positions = image_places(skin, SHAPE[1], SHAPE[0])
+        channels = LinearChannels.from_skin(skin, DEPTH_MAP_SHAPE)
+        initial_network = Unrolled(held_out_examples.change.shape[1], DEPTH_MAP_SHAPE, key=jax.random.fold_in(key, 3))
+        pixel_positions = image_places(skin, DEPTH_MAP_SHAPE[1], DEPTH_MAP_SHAPE[0])
         initial_network = initial_network.adapted_to_skin(channels, pixel_positions, skin.layout.centres, noise)
-        trained_network = train_unrolled(initial_network, channels, sets["learnt"], held_out_examples, noise, runs)
+        trained_network = train_unrolled(
+            initial_network, channels, simulated_sets["learnt"], held_out_examples, noise, runs
+        )
     else:
-        trained_network = train_three_stages(sets["learnt"], held_out_examples, noise, runs)
+        trained_network = train_three_stages(simulated_sets["learnt"], held_out_examples, noise, runs)
     seconds["training"] = time.monotonic() - start - seconds["touches"]
-    network = ImageNetwork.from_skin(trained_network.network, skin, noise, SHAPE)
+    network = ImageNetwork.from_skin(trained_network.network, skin, noise, DEPTH_MAP_SHAPE)
     report("standing")
     standing = evaluate_network(network, skin, test_examples)
     seconds["all"] = time.monotonic() - start

@@ -46,10 +46,10 @@ def depth_centroids(maps: Float[np.ndarray, "n r c"], places: Float[np.ndarray, 
     depth, of the pixels deeper than half of the map's maximum depth. `places` (rows, columns, 2): positions of the
     pixels, metres."""
     flat_maps = maps.reshape(len(maps), -1)
-    max_depths = flat_maps.max(axis=1, keepdims=True)
-    weights = np.where(flat_maps > _TOUCH_FRACTION * max_depths, np.maximum(flat_maps, 0), 0)
+    max_depth_per_map = flat_maps.max(axis=1, keepdims=True)
+    weights = np.where(flat_maps > _TOUCH_FRACTION * max_depth_per_map, np.maximum(flat_maps, 0), 0)
     # The centroid of a map without any depth is the middle of the skin.
-    weights = np.where(max_depths > 0, weights, 1.0)
+    weights = np.where(max_depth_per_map > 0, weights, 1.0)
     return weights @ places.reshape(-1, 2) / weights.sum(axis=1, keepdims=True)
 
 
@@ -63,11 +63,11 @@ def error_statistics(
 
 
 # Minimum and maximum depth of a simulated touch, divided by the skin's thickness; in Park et al., 1 and 8 mm of 10 mm.
-DEPTHS = (0.1, 0.8)
+RELATIVE_DEPTH_RANGE = (0.1, 0.8)
 # Maximum number of bodies that touch the skin at once.
 _MAX_BODIES = 3
 # Limit of detection of Park et al., newtons, for a ball of 15 mm diameter.
-_DETECTION_LIMIT = 0.7
+_DETECTION_LIMIT_FORCE = 0.7
 # Voltage change at the limit of detection, in standard deviations of the noise.
 _DETECTION_DEVIATIONS = 3.0
 # Number of places along a side at which the voltage change is computed.
@@ -76,7 +76,7 @@ _PLACES_PER_SIDE = 15
 _EDGE_MARGIN = 0.04
 
 
-def wrench() -> JoinedIndenters:
+def wrench_outline() -> JoinedIndenters:
     """Create the shape of an open-ended wrench laid flat, 100 mm long."""
     jaw = PlacedIndenter(RingIndenter(0.030, 0.014), (0.040, 0.0))
     return JoinedIndenters(PlacedIndenter(BarIndenter(0.070, 0.010), (-0.010, 0.0)), jaw)
@@ -89,7 +89,7 @@ def touching_bodies() -> list[AbstractIndenter]:
         *(ball_indenter(diameter) for diameter in (0.015, 0.020, 0.030)),
         *(DiscIndenter(diameter) for diameter in (0.010, 0.020, 0.030)),
         *(BarIndenter(length, width) for length, width in ((0.040, 0.008), (0.030, 0.015), (0.060, 0.010))),
-        wrench(),
+        wrench_outline(),
     ]
 
 
@@ -98,12 +98,12 @@ def touch_draws(skin: Skin) -> IndentDraws:
     angle."""
     thickness = float(skin.thickness)
     low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
-    depth = (DEPTHS[0] * thickness, DEPTHS[1] * thickness)
+    depth = (RELATIVE_DEPTH_RANGE[0] * thickness, RELATIVE_DEPTH_RANGE[1] * thickness)
     edge_margin = _EDGE_MARGIN * min(high_x - low_x, high_y - low_y)
     return IndentDraws(touching_bodies(), skin.flat_outline, depth, margin=edge_margin, at_once=_MAX_BODIES)
 
 
-def detection_noise(skin: Skin, limit: float = _DETECTION_LIMIT) -> float:
+def detection_noise(skin: Skin, limit: float = _DETECTION_LIMIT_FORCE) -> float:
     """Compute the relative noise of a channel at which a ball of 15 mm diameter, pressed with `limit` newtons, is just
     detected.
 
@@ -156,7 +156,7 @@ class LinearChannels(NamedTuple):
         point_shares = np.ones(points.shape[:2])
         if skin.num_layers:
             depths = (points[..., 2].max() - points[..., 2]) / float(skin.thickness)
-            min_depth, max_depth = DEPTHS
+            min_depth, max_depth = RELATIVE_DEPTH_RANGE
             point_shares = np.maximum(max_depth - np.maximum(depths, min_depth), 0) / (
                 (max_depth**2 - min_depth**2) / 2
             )
@@ -164,7 +164,9 @@ class LinearChannels(NamedTuple):
         for point_index, cell_pixels in enumerate(pixel_indices.reshape(points.shape[:2]).T):
             np.add.at(operator, cell_pixels, cell_changes * point_shares[:, point_index, None] / points.shape[1])
         return cls(
-            round_relative(operator.T), round_relative(_contact_changes(skin, rest_voltages, conductivity)), shape
+            round_relative_to_maximum(operator.T),
+            round_relative_to_maximum(_contact_changes(skin, rest_voltages, conductivity)),
+            shape,
         )
 
     def coarser_operator(self) -> Float[np.ndarray, "M p"]:
@@ -175,7 +177,7 @@ class LinearChannels(NamedTuple):
         return pixel_blocks.sum(axis=(2, 4)).reshape(len(pixel_blocks), -1)
 
 
-def round_relative(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+def round_relative_to_maximum(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Round values to a millionth of their maximum, or finer, to remove effects of the order of summation.
 
     NumPy's order of summation depends on the memory addresses of arrays. After rounding, training depends only on the

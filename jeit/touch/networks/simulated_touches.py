@@ -64,9 +64,9 @@ class StoredTouches:
         self._arrays = store.open_dataset()
         # The chunks are of similar size, so that no chunk is smaller than a batch.
         num_chunks = min(-(-indents.number // max_chunk_size), len(chunks))
-        chunk_groups = np.array_split(np.arange(len(chunks)), num_chunks)
+        grouped_chunks = np.array_split(np.arange(len(chunks)), num_chunks)
         self.row_ranges = [
-            range(chunks[chunk_group[0]].start, chunks[chunk_group[-1]].stop) for chunk_group in chunk_groups
+            range(chunks[chunk_group[0]].start, chunks[chunk_group[-1]].stop) for chunk_group in grouped_chunks
         ]
 
     def rows(self, *names: str) -> "StoredRows":

@@ -52,8 +52,11 @@ class Convolution(Module):
     def __call__(self, image: Float[Array, "b r c i"]) -> Float[Array, "b p q o"]:
         """Apply the layer to a batch of images (images, rows, columns, channels)."""
         layout = ("NHWC", "HWIO", "NHWC")
-        strides = (self.stride, self.stride)
-        return jax.lax.conv_general_dilated(image, self.weight, strides, "SAME", dimension_numbers=layout) + self.bias
+        convolution_strides = (self.stride, self.stride)
+        return (
+            jax.lax.conv_general_dilated(image, self.weight, convolution_strides, "SAME", dimension_numbers=layout)
+            + self.bias
+        )
 
     def apply_to_repeated(self, image: Float[Array, "b r c i"]) -> Float[Array, "b s d o"]:
         """Compute the convolution of the enlarged image `repeat_pixels(image)` with four ninths of the multiplications.
@@ -104,8 +107,10 @@ class Chain(Module):
             if layer_index:
                 values = jax.nn.elu(values)
                 if key is not None and self.dropout:
-                    is_kept = jax.random.bernoulli(jax.random.fold_in(key, layer_index), 1 - self.dropout, values.shape)
-                    values = jnp.where(is_kept, values / (1 - self.dropout), 0.0)
+                    is_not_dropped = jax.random.bernoulli(
+                        jax.random.fold_in(key, layer_index), 1 - self.dropout, values.shape
+                    )
+                    values = jnp.where(is_not_dropped, values / (1 - self.dropout), 0.0)
             values = layer(values)  # pyright: ignore[reportCallIssue]
         return values
 
@@ -262,5 +267,5 @@ class ThreeStages(Module):
 
     def __call__(self, changes: Float[Array, "b M"]) -> Float[Array, "b r c"]:
         """Compute depth maps, divided by the thickness of the skin, from relative voltage changes."""
-        latent = jax.nn.elu(self.encoder(self.standardise(changes)))
-        return self.decoder(jax.nn.elu(self.projection(latent)))
+        latent_code = jax.nn.elu(self.encoder(self.standardise(changes)))
+        return self.decoder(jax.nn.elu(self.projection(latent_code)))

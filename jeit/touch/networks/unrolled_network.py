@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.touch.networks.linear_channels import LinearChannels, depth_from_strength, round_relative, strength
+from jeit.touch.networks.linear_channels import LinearChannels, depth_from_strength, round_relative_to_maximum, strength
 from jeit.touch.networks.three_stage_network import Convolution, channels_to_pixels, repeat_pixels
 from jeit_solvers.module import Module
 
@@ -56,12 +56,16 @@ class Refinement(Module):
     def __call__(self, images: Float[Array, "b r c i"]) -> Float[Array, "b s d"]:
         """Compute corrections of depth maps from a batch of images (maps, rows, columns, channels)."""
         elu = jax.nn.elu
-        full_features = elu(self.inwards[0](images))
-        half_features = elu(self.inwards[2](elu(self.inwards[1](full_features))))
-        quarter_features = elu(self.inwards[4](elu(self.inwards[3](half_features))))
-        half_decoded = elu(self.outwards[0](half_features + repeat_pixels(quarter_features)))
-        full_decoded = elu(self.outwards[2](full_features + repeat_pixels(elu(self.outwards[1](half_decoded)))))
-        return channels_to_pixels(self.last(full_decoded))
+        full_resolution_features = elu(self.inwards[0](images))
+        half_resolution_features = elu(self.inwards[2](elu(self.inwards[1](full_resolution_features))))
+        quarter_resolution_features = elu(self.inwards[4](elu(self.inwards[3](half_resolution_features))))
+        half_resolution_decoded = elu(
+            self.outwards[0](half_resolution_features + repeat_pixels(quarter_resolution_features))
+        )
+        full_resolution_decoded = elu(
+            self.outwards[2](full_resolution_features + repeat_pixels(elu(self.outwards[1](half_resolution_decoded))))
+        )
+        return channels_to_pixels(self.last(full_resolution_decoded))
 
 
 class Unrolled(Module):
@@ -128,15 +132,16 @@ class Unrolled(Module):
             [distances / distances.max(), (response - response.mean()) / response.std()], axis=-1
         )
         arrays = [
-            jnp.asarray(round_relative(array), jnp.float32) for array in (channels.operator, imagers, constant_images)
+            jnp.asarray(round_relative_to_maximum(array), jnp.float32)
+            for array in (channels.operator, imagers, constant_images)
         ]
         return eqx.tree_at(lambda network: (network.operator, network.imagers, network.constant_images), self, arrays)
 
     @property
     def trained(self) -> "Unrolled":
         """Tree of booleans with the structure of the network: true for the arrays that are trained."""
-        all_false = jax.tree.map(lambda _: False, self)
-        return eqx.tree_at(lambda network: network.steps, all_false, jax.tree.map(eqx.is_inexact_array, self.steps))
+        false_mask = jax.tree.map(lambda _: False, self)
+        return eqx.tree_at(lambda network: network.steps, false_mask, jax.tree.map(eqx.is_inexact_array, self.steps))
 
     def covariance(self, pixel_positions: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "M M"]:
         """Compute the covariance (channels, channels) of the relative voltage changes due to touches that are

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind
 from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Mesh
-from jeit.plot.axes import axes_or_new, draw_scale_bar, hide_axes
+from jeit.plot.axes import draw_scale_bar, get_or_create_axes, hide_axes
 from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, ColourScale, choose_si_prefix, draw_colour_bar
 from jeit.plot.imaging.image import plot_image
 from jeit.touch.contacts import Contact, RasterStages
@@ -62,7 +62,7 @@ def draw_contacts(contacts: Sequence[Contact], *, ax: Axes | None = None) -> Axe
     """Draw outlines, centroids and coordinates of contacts, on axes in metres. Raises `ValueError` for elements of
     `contacts` that are not contacts."""
     check_contacts(contacts)
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     for contact in contacts:
         x, y = contact.centroid
         ax.add_patch(Polygon(contact.contour, fill=False, edgecolor=DARK_GREY, linewidth=1.2, zorder=3))

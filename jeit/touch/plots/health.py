@@ -8,7 +8,7 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind
-from jeit.plot.axes import axes_or_new, draw_scale_bar, extent_of, hide_axes, soften_axes
+from jeit.plot.axes import draw_scale_bar, extent_of, get_or_create_axes, hide_axes, style_graph_axes
 from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, LIGHT_GREY, SERIES_COLOURS, ColourScale
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import draw_outline, plot_image
@@ -58,7 +58,7 @@ def plot_health(
     if image is not None:
         ax = plot_image(mesh, image, electrodes, scale=scale, title=title, ax=ax)
     else:
-        ax = axes_or_new(ax)
+        ax = get_or_create_axes(ax)
         extent = extent_of(np.asarray(mesh.points))
         draw_outline(mesh, ax)
         draw_electrodes(mesh, electrodes, ax=ax)
@@ -144,7 +144,7 @@ def plot_health_course(
         has_reading, (frame_values - healthy.reference) / np.where(healthy.used, healthy.scale, np.inf), np.nan
     )
     relative_sizes = np.where(has_reading.any(axis=1), change_size(scaled_changes) / healthy.limit, np.nan)
-    ax = axes_or_new(ax, (9.0, 3.2))
+    ax = get_or_create_axes(ax, (9.0, 3.2))
     ax.plot(time_values, relative_sizes, color=DARK_GREY, linewidth=0.8)
     ax.axhline(1.0, color=LIGHT_GREY, linewidth=1, linestyle=(0, (4, 3)))
     ax.text(1, 1.0, " limit", color=LIGHT_GREY, fontsize=8, va="center", transform=ax.get_yaxis_transform())
@@ -167,7 +167,7 @@ def plot_health_course(
     ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     ax.set_ylim(0, max(_MIN_AXIS_LIMIT, 1.6 * float(np.nanmax(relative_sizes, initial=1.0))))
     ax.set_ylabel("Change, times the limit", color=DARK_GREY)
-    soften_axes(ax)
+    style_graph_axes(ax)
     if title is not None:
         ax.set_title(title)
     return ax

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 from jeit.arguments import check_kind, real_array
-from jeit.plot.axes import axes_or_new, draw_scale_bar, extent_of, hide_axes
-from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SEQUENTIAL, draw_colour_bar
+from jeit.plot.axes import draw_scale_bar, extent_of, get_or_create_axes, hide_axes
+from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SEQUENTIAL_COLOUR_MAP, draw_colour_bar
 from jeit.touch.kohonen import MapTouch
 
 # Area of a neuron's marker, points², in a map of the reference size.
@@ -63,13 +63,13 @@ def plot_map(
     if values is not None and np.shape(values) != places.shape[:2]:
         raise ValueError(f"values must be one for each neuron, {places.shape[:2]}; they have shape {np.shape(values)}.")
     check_kind("touches", touches, (list, tuple), "a list of touches, as of touches_reported")
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     extent = extent_of(places[has_place])
     hide_axes(ax, extent, numbered=False)
     edges = [
         edge
-        for first_ends, second_ends in ((places[:-1], places[1:]), (places[:, :-1], places[:, 1:]))
-        for edge in np.stack([first_ends, second_ends], axis=-2).reshape(-1, 2, 2)
+        for line_starts, line_ends in ((places[:-1], places[1:]), (places[:, :-1], places[:, 1:]))
+        for edge in np.stack([line_starts, line_ends], axis=-2).reshape(-1, 2, 2)
         if np.isfinite(edge).all()
     ]
     ax.add_collection(
@@ -81,7 +81,7 @@ def plot_map(
             *places[has_place].T,
             c=np.asarray(values)[has_place],
             s=marker_area,
-            cmap=SEQUENTIAL,
+            cmap=SEQUENTIAL_COLOUR_MAP,
             linewidths=0,
             zorder=2,
         )

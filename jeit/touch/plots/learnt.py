@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 
 from jeit.arguments import check_kind, counted, real_array
-from jeit.plot.axes import axes_or_new, draw_legend_above, draw_scale_bar, extent_of, hide_axes, soften_axes
-from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SEQUENTIAL, SERIES_COLOURS, draw_colour_bar
+from jeit.plot.axes import draw_legend_above, draw_scale_bar, extent_of, get_or_create_axes, hide_axes, style_graph_axes
+from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SEQUENTIAL_COLOUR_MAP, SERIES_COLOURS, draw_colour_bar
 from jeit.touch import Standing, Touches
 from jeit.touch.training import TrainingResult
 
@@ -29,7 +29,7 @@ def plot_places(touches: Touches, *, title: str | None = None, ax: Axes | None =
     """
     if touches.position is None:
         raise ValueError("touches have no places: the skin did not learn any.")
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     touched_frames = np.flatnonzero(np.isfinite(touches.position).all(axis=1))
     if not touched_frames.size:
         ax.set_axis_off()
@@ -56,7 +56,7 @@ def plot_places(touches: Touches, *, title: str | None = None, ax: Axes | None =
             alpha=0.35,
         )
     )
-    points = ax.scatter(*places.T, c=touched_frames, s=12, cmap=SEQUENTIAL, linewidths=0, zorder=3)
+    points = ax.scatter(*places.T, c=touched_frames, s=12, cmap=SEQUENTIAL_COLOUR_MAP, linewidths=0, zorder=3)
     draw_scale_bar(ax, extent)
     draw_colour_bar(ax, points, "Frame")
     ax.set_title(f"{len(touched_frames)} touches, ellipses of one standard deviation" if title is None else title)
@@ -65,7 +65,7 @@ def plot_places(touches: Touches, *, title: str | None = None, ax: Axes | None =
 
 def plot_answers(touches: Touches, *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Draw what a learnt skin predicts for consecutive frames: pressed keys, labels, or forces in newtons."""
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     frame = np.arange(len(touches))
     if touches.touched is not None:
         ax.imshow(
@@ -95,10 +95,10 @@ def plot_answers(touches: Touches, *, title: str | None = None, ax: Axes | None 
     for unlike_frame in frame[touches.unlike]:
         ax.axvline(unlike_frame, color=SERIES_COLOURS[1], linewidth=0.6, alpha=0.5, zorder=0)
     ax.set_xlabel("Frame", color=DARK_GREY)
-    num_unlike = int(touches.unlike.sum())
-    unlike_text = f"red: {counted(num_unlike, 'frame')} unlike any learnt from" if num_unlike else ""
+    num_unlike_touches = int(touches.unlike.sum())
+    unlike_text = f"red: {counted(num_unlike_touches, 'frame')} unlike any learnt from" if num_unlike_touches else ""
     ax.set_title(unlike_text if title is None else title)
-    soften_axes(ax)
+    style_graph_axes(ax)
     return ax
 
 
@@ -134,14 +134,14 @@ def plot_depth_map(
     depth = real_array("depth", depth, "a map (rows, columns) of depths in metres")
     if depth.ndim != 2:
         raise ValueError(f"depth must be a map (rows, columns); it has shape {depth.shape}.")
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     hide_axes(ax, extent, numbered=False)
     colour_limit = 1e3 * (float(depth.max()) if most is None else most) or 1.0
     mesh_image = ax.imshow(
         1e3 * depth,
         origin="lower",
         extent=extent,
-        cmap=SEQUENTIAL,
+        cmap=SEQUENTIAL_COLOUR_MAP,
         vmin=0.0,
         vmax=colour_limit,
         interpolation="nearest",
@@ -158,11 +158,11 @@ def plot_losses(courses: Mapping[str, TrainingResult], *, title: str | None = No
     """Draw a network's loss on held-out touches during each training, relative to its first value, and mark its
     minimum.
 
-    `courses`: results of `jeit.touch.fit_network`, by the names of the trainings. Raises `ValueError` for anything but
-    such results.
+    `courses`: results of `jeit.touch.fit_network`, by the names of the trainings. Raises `ValueError` for
+    anything but such results.
     """
     check_kind("courses", courses, Mapping, "trainings by name, such as learnt.courses")
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     for (name, result), colour in zip(courses.items(), SERIES_COLOURS * len(courses), strict=False):
         check_kind(f"courses[{name!r}]", result, TrainingResult, "a TrainingResult, as of fit")
         course = result.course
@@ -171,7 +171,7 @@ def plot_losses(courses: Mapping[str, TrainingResult], *, title: str | None = No
         ax.plot(course.steps[course.best], relative_losses[course.best], marker="o", color=colour, markersize=5)
     ax.set_xlabel("Batches", color=DARK_GREY)
     ax.set_ylabel("Loss of touches held out, of that at first", color=DARK_GREY)
-    soften_axes(ax)
+    style_graph_axes(ax)
     draw_legend_above(ax)
     if title is not None:
         ax.set_title(title)
@@ -183,7 +183,7 @@ def plot_place_errors(place: Standing, *, title: str | None = None, ax: Axes | N
 
     `place`: accuracy of the places learnt by a `LearntSkin`, its `standing["place"]`.
     """
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     errors_mm = 1e3 * np.linalg.norm(place.held_out - place.right, axis=1)
     extent = extent_of(place.right)
     hide_axes(ax, extent, numbered=False)
@@ -193,7 +193,7 @@ def plot_place_errors(place: Standing, *, title: str | None = None, ax: Axes | N
         *place.right[sort_order, :2].T,
         c=errors_mm[sort_order],
         s=22,
-        cmap=SEQUENTIAL,
+        cmap=SEQUENTIAL_COLOUR_MAP,
         vmin=0,
         vmax=colour_limit,
         linewidths=0,
@@ -210,7 +210,7 @@ def plot_place_errors(place: Standing, *, title: str | None = None, ax: Axes | N
 
 def plot_force_errors(force: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Draw the forces that a learnt skin estimates for held-out presses against the true forces, in newtons."""
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     true_forces, estimated_forces = force.right[:, 0], force.held_out[:, 0]
     limits = [min(true_forces.min(), estimated_forces.min()), max(true_forces.max(), estimated_forces.max())]
     ax.plot(limits, limits, color=LIGHT_GREY, linewidth=1, zorder=1)
@@ -229,7 +229,7 @@ def plot_force_errors(force: Standing, *, title: str | None = None, ax: Axes | N
     ax.set_title(
         f"Forces: {np.abs(estimated_forces - true_forces).mean():.3g} N off on average" if title is None else title
     )
-    soften_axes(ax)
+    style_graph_axes(ax)
     return ax
 
 
@@ -249,7 +249,7 @@ def plot_confusion(label: Standing, *, title: str | None = None, ax: Axes | None
     ax.figure.savefig("confusion.png")
     ```
     """
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     labels = np.unique(label.right)
     counts = np.array(
         [
@@ -277,7 +277,7 @@ def plot_confusion(label: Standing, *, title: str | None = None, ax: Axes | None
 
 def plot_key_errors(keys: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Draw, for each key of a learnt skin, the share of held-out presses in which it was classified wrongly."""
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     error_rates = 100 * np.mean(keys.held_out != keys.right, axis=0)
     ax.bar(range(len(error_rates)), error_rates, color=SERIES_COLOURS[0], width=0.7)
     ax.set_xticks(range(len(error_rates)))
@@ -287,13 +287,13 @@ def plot_key_errors(keys: Standing, *, title: str | None = None, ax: Axes | None
     pattern_share = 100 * np.mean((keys.held_out == keys.right).all(axis=1))
     default_title = f"Keys: {100 - error_rates.mean():.1f} % right, whole patterns {pattern_share:.1f} %"
     ax.set_title(default_title if title is None else title)
-    soften_axes(ax)
+    style_graph_axes(ax)
     return ax
 
 
 def plot_tried(label: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Draw the accuracy, in per cent, of each tried classifier on held-out presses, the best at the top."""
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     names, percentages = [name for name, _ in label.tried], [100 * (1 - error) for _, error in label.tried]
     colours = [SERIES_COLOURS[0] if name == label.method else "#c9d3de" for name in names]
     ax.barh(range(len(names)), percentages, color=colours, height=0.7)
@@ -304,5 +304,5 @@ def plot_tried(label: Standing, *, title: str | None = None, ax: Axes | None = N
     ax.set_xlim(0, 105)
     ax.set_xlabel("Right of what was held out (%)", color=DARK_GREY)
     ax.set_title("What was tried" if title is None else title)
-    soften_axes(ax)
+    style_graph_axes(ax)
     return ax

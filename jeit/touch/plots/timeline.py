@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind
 from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Mesh
-from jeit.plot.axes import axes_or_new, draw_scale_bar, extent_of, hide_axes, soften_axes
+from jeit.plot.axes import draw_scale_bar, extent_of, get_or_create_axes, hide_axes, style_graph_axes
 from jeit.plot.colours import DARK_GREY, LIGHT_GREY, SERIES_COLOURS, choose_si_prefix, draw_colour_bar
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import draw_outline
@@ -28,7 +28,7 @@ _MAX_POINTS = 3000
 _MIN_BAR_SHARE = 0.003
 # Maximum number of touches with numbers.
 _MAX_NUMBERED = 60
-_UNLIKE_COLOUR = "#b9bdc4"
+_UNKNOWN_TOUCH_COLOUR = "#b9bdc4"
 
 
 def plot_changes(
@@ -50,14 +50,14 @@ def plot_changes(
         raise ValueError(
             f"peaks have shape {values.shape} and seconds {times.shape}; give one of each for every frame."
         )
-    ax = axes_or_new(ax, (9.0, 2.6))
+    ax = get_or_create_axes(ax, (9.0, 2.6))
     factor, prefixed_unit = choose_si_prefix(float(np.nanmax(values, initial=level)), unit)
     ax.plot(*_reduce_points(*_interrupt_at_gaps(times, factor * values)), color=DARK_GREY, linewidth=0.8)
     ax.axhline(factor * level, color=LIGHT_GREY, linewidth=1, linestyle=(0, (4, 3)))
     ax.text(1, factor * level, " level", color=LIGHT_GREY, fontsize=8, va="center", transform=ax.get_yaxis_transform())
     ax.set_ylabel(f"Greatest change ({prefixed_unit})", color=DARK_GREY)
     ax.set_ylim(bottom=min(0.0, factor * float(np.nanmin(values, initial=0.0))))
-    soften_axes(ax)
+    style_graph_axes(ax)
     if title is not None:
         ax.set_title(title)
     return ax
@@ -87,15 +87,15 @@ def plot_timeline(
     ```
     """
     check_named_touches(touches)
-    ax = axes_or_new(ax, (9.0, 2.6))
-    lanes = [*names, *(["unlike any"] if any(touch.unlike for touch in touches) else [])]
+    ax = get_or_create_axes(ax, (9.0, 2.6))
+    row_names = [*names, *(["unlike any"] if any(touch.unlike for touch in touches) else [])]
     offsets = [touch.touch.offset for touch in touches]
     duration = max(offsets, default=1.0) - min((touch.touch.onset for touch in touches), default=0.0)
     for touch in touches:
-        lane = len(names) if touch.unlike else lanes.index(touch.gesture)
+        row_index = len(names) if touch.unlike else row_names.index(touch.gesture)
         length = max(touch.touch.offset - touch.touch.onset, _MIN_BAR_SHARE * duration)
         bar = Rectangle(
-            (touch.touch.onset, lane - 0.36),
+            (touch.touch.onset, row_index - 0.36),
             length,
             0.72,
             color=gesture_colour(touch, names),
@@ -106,13 +106,13 @@ def plot_timeline(
         if not touch.touch.whole:
             ax.plot(
                 touch.touch.offset if touch.touch.cut_off else touch.touch.onset,
-                lane,
+                row_index,
                 marker="|",
                 color=DARK_GREY,
                 markersize=14,
             )
         if len(touches) <= _MAX_NUMBERED:
-            label_position = (touch.touch.onset + length / 2, lane - 0.42)
+            label_position = (touch.touch.onset + length / 2, row_index - 0.42)
             ax.annotate(
                 f"{touch.number}",
                 label_position,
@@ -122,11 +122,11 @@ def plot_timeline(
                 color=DARK_GREY,
                 fontsize=7,
             )
-    ax.set_yticks(range(len(lanes)), lanes)
-    ax.set_ylim(len(lanes) - 0.4, -0.75)
+    ax.set_yticks(range(len(row_names)), row_names)
+    ax.set_ylim(len(row_names) - 0.4, -0.75)
     ax.autoscale_view(scaley=False)
     ax.set_xlabel("Time (s)", color=DARK_GREY)
-    soften_axes(ax)
+    style_graph_axes(ax)
     if title is not None:
         ax.set_title(title)
     return ax
@@ -164,7 +164,7 @@ def plot_touch_paths(
     ```
     """
     check_named_touches(touches)
-    ax = axes_or_new(ax)
+    ax = get_or_create_axes(ax)
     extent = extent_of(np.asarray(mesh.points))
     draw_outline(mesh, ax)
     if electrodes is not None:
@@ -203,7 +203,11 @@ def plot_touch_paths(
 
 def gesture_colour(touch: NamedTouch, names: Sequence[str]) -> str:
     """Return the colour of a touch's gesture in plots; grey for touches unlike any in the training set."""
-    return _UNLIKE_COLOUR if touch.unlike else SERIES_COLOURS[list(names).index(touch.gesture) % len(SERIES_COLOURS)]
+    return (
+        _UNKNOWN_TOUCH_COLOUR
+        if touch.unlike
+        else SERIES_COLOURS[list(names).index(touch.gesture) % len(SERIES_COLOURS)]
+    )
 
 
 def check_named_touches(touches) -> None:
@@ -258,7 +262,7 @@ def plot_sound_labels(labels: SoundLabels, *, title: str | None = None, ax: Axes
     ax.figure.savefig("sounds.png")
     ```
     """
-    ax = axes_or_new(ax, (8.0, 3.2))
+    ax = get_or_create_axes(ax, (8.0, 3.2))
     names, times = labels.names, labels.times
     shown_probabilities = np.where((labels.named != "")[:, None], labels.probabilities, np.nan).T
     extent = (float(times[0]) - WINDOW_INTERVAL / 2, float(times[-1]) + WINDOW_INTERVAL / 2, -0.5, len(names) - 0.5)
@@ -285,5 +289,5 @@ def plot_sound_labels(labels: SoundLabels, *, title: str | None = None, ax: Axes
         f"; blank, {num_quiet} of {len(labels)} windows quiet" if num_quiet else ""
     )
     ax.set_title(default_title if title is None else title)
-    soften_axes(ax)
+    style_graph_axes(ax)
     return ax

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jeit.arguments import counted
-from jeit.files import clear_unfinished, written_whole
+from jeit.files import atomically_written_file, remove_unfinished_files
 from jeit.report.folder import package_version, results, results_folder, to_plain_values, write_json
-from jeit.report.stream import PICTURES, GrowingRows, GrowingTable, Sample, reporting_partial_results
+from jeit.report.stream import PICTURES, GrowingRows, GrowingTable, SeriesSample, reporting_partial_results
 from jeit.touch.networks import ImageNetwork, LearntImages
 from jeit.touch.networks.depth_maps import FrameDepth
 from jeit.touch.networks.linear_channels import depth_centroids
@@ -42,7 +42,7 @@ def write_learnt_images(learnt: LearntImages, folder: str | Path) -> None:
 def report_learnt_images(learnt: LearntImages) -> dict[str, Any]:
     """Report the accuracy and the trainings of an image network as plain numbers, strings, lists and dictionaries."""
     network = learnt.network
-    trainings = {
+    training_reports = {
         name: {
             "ended": training.reason,
             "batches": training.course.steps[-1],
@@ -62,7 +62,7 @@ def report_learnt_images(learnt: LearntImages) -> dict[str, Any]:
             "share_of_squared_depth_explained": learnt.standing.explained,
             "error_of_a_ball_m": learnt.standing.place,
             "estimated_depth_of_a_ball": learnt.standing.deepest,
-            "trainings": trainings,
+            "trainings": training_reports,
             "seconds": learnt.seconds,
             "versions": {package: package_version(package) for package in _PACKAGES},
         }
@@ -146,7 +146,7 @@ def write_depths(
     result_folder = results_folder(folder, DEPTH_FILES)
     for file_name in DEPTH_FILES[1:]:
         (result_folder / file_name).unlink(missing_ok=True)  # files of earlier frames
-    clear_unfinished(result_folder)
+    remove_unfinished_files(result_folder)
     report = drawing or (lambda message: None)
     with GrowingRows(result_folder, network.shape) as rows:
         statistics = _FrameStatistics(network)
@@ -178,7 +178,7 @@ def write_depths(
         report(PICTURES[0])
         row_indices, frame_numbers = statistics.row.values().astype(int), statistics.number.values().astype(int)
         drawn_indices = np.unique(np.linspace(0, len(row_indices) - 1, _MAX_DRAWN_MAPS).round().astype(int))
-        with written_whole(result_folder / "depth.png") as file:
+        with atomically_written_file(result_folder / "depth.png") as file:
             _draw_depths(
                 rows.read(row_indices[drawn_indices]),
                 frame_numbers[drawn_indices],
@@ -196,7 +196,7 @@ class _FrameStatistics:
         self._empty_map = np.full(network.shape, np.nan)
         self.imaged, self.number_refused, self.first_reason = 0, 0, ""
         self.refused_frames: list[int] = []
-        self.row, self.number, self.latency = Sample(), Sample(), Sample()
+        self.row, self.number, self.latency = SeriesSample(), SeriesSample(), SeriesSample()
         self.deepest_frame = DeepestFrame(-1, -np.inf, np.full(2, np.nan))
 
     def add_frame(self, frame: FrameDepth) -> tuple[list[object], Float[np.ndarray, "rows columns"]]:

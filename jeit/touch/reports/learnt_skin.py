@@ -76,17 +76,22 @@ def summary(name: str, standing: Standing) -> str:
     """Summarise in one line how well a skin has learnt the quantity `name`, such as "place"."""
     statistics = _error_statistics(name, standing)
     if name == "place":
-        mean, median, high_error, guess_error = (
+        mean, median, high_percentile_error, guess_error = (
             f"{1e3 * statistics[key]:.3g} mm"
             for key in ("mean_error_m", "median_error_m", "error_of_95_percent_m", "mean_error_of_a_guess_m")
         )
-        return f"{mean} off on average, median {median}, 95 % within {high_error}; guessing the middle: {guess_error}"
+        return (
+            f"{mean} off on average, median {median}, 95 % within {high_percentile_error}; guessing "
+            f"the middle: {guess_error}"
+        )
     if name == "force":
         guess_error = statistics["mean_error_of_a_guess_N"]
         return f"{statistics['mean_error_N']:.3g} N off on average; guessing the mean: {guess_error:.3g} N"
     if name == "label":
-        commonest_share = 100 * statistics["right_by_the_commonest"]
-        return f"{100 * statistics['right']:.1f} % right; the commonest label alone: {commonest_share:.1f} %"
+        percentage_of_commonest_class = 100 * statistics["right_by_the_commonest"]
+        return (
+            f"{100 * statistics['right']:.1f} % right; the commonest label alone: {percentage_of_commonest_class:.1f} %"
+        )
     pattern_share = 100 * statistics["right_of_whole_patterns"]
     return f"{100 * statistics['right_of_each_key']:.1f} % of the keys right, {pattern_share:.1f} % of whole patterns"
 
@@ -139,12 +144,12 @@ def _error_statistics(name: str, standing: Standing) -> dict[str, Any]:
         return statistics | {
             "tried": [{"method": method, f"mean_error_{unit}": error} for method, error in standing.tried]
         }
-    is_right = standing.held_out == standing.right
+    is_correct = standing.held_out == standing.right
     if name == "label":
         counts = np.unique(standing.right, return_counts=True)[1]
-        statistics |= {"right": is_right.mean(), "right_by_the_commonest": counts.max() / counts.sum()}
+        statistics |= {"right": is_correct.mean(), "right_by_the_commonest": counts.max() / counts.sum()}
         return statistics | {"tried": [{"method": method, "right": 1 - error} for method, error in standing.tried]}
-    statistics |= {"right_of_each_key": is_right.mean(), "right_of_whole_patterns": is_right.all(axis=1).mean()}
+    statistics |= {"right_of_each_key": is_correct.mean(), "right_of_whole_patterns": is_correct.all(axis=1).mean()}
     return statistics | {"keys": [{"method": method, "right": 1 - error} for method, error in standing.tried]}
 
 

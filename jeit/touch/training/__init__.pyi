@@ -1,6 +1,6 @@
 from .batches import ArrayRows, MappedRows, Rows
 from .fitting import TrainingObjective, TrainingPlan, TrainingResult, fit_network
-from .model_file import check_same, read_head, read_model, write_model
+from .model_file import check_same, read_file_header, read_model, write_model
 
 __all__ = [
     "ArrayRows",
@@ -11,7 +11,7 @@ __all__ = [
     "TrainingResult",
     "check_same",
     "fit_network",
-    "read_head",
+    "read_file_header",
     "read_model",
     "write_model",
 ]

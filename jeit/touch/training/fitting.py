@@ -17,12 +17,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jeit.arguments import check_key, check_kind, describe, is_number
-from jeit.arguments.extras import need_extra
+from jeit.arguments.extras import require_extra
 from jeit.touch.training.batches import ArrayRows, BatchOrder
-from jeit.touch.training.model_file import Checkpoint, Course, State
+from jeit.touch.training.model_file import Checkpoint, Course, TrainingState
 
 # Number of training batches after which a checkpoint may be written.
-_CHECKPOINT_BATCHES = 32
+_BATCHES_PER_CHECKPOINT = 32
 # Maximum number of held-out rows evaluated at once.
 _MAX_BATCH_SIZE = 256
 
@@ -145,7 +145,7 @@ def fit_network(
     print(trained.network)
     ```
     """
-    need_extra("learn", "training")
+    require_extra("learn", "training")
     check_key(key)
     check_kind("objective", objective, TrainingObjective, "a TrainingObjective(loss, held_out)")
     plan = TrainingPlan() if plan is None else plan
@@ -169,10 +169,14 @@ def fit_network(
     checkpoint_file = None if checkpoint is None else Checkpoint(checkpoint, fingerprint)
     state = run.initial_state() if checkpoint_file is None else checkpoint_file.read(run.initial_state())
     evaluation_interval = plan.look_every or batch_order.batches_per_epoch
-    last_batch, last_saved, loaded_chunk = plan.epochs * batch_order.batches_per_epoch, time.monotonic(), (-1, None)
-    while (reason := _end_reason(state, plan, last_batch)) is None:
-        next_evaluation = min(last_batch, (state.step // evaluation_interval + 1) * evaluation_interval)
-        for batches in batch_order.chunk_batches(state.step, next_evaluation, _CHECKPOINT_BATCHES):
+    num_batches_in_total, time_of_last_checkpoint, loaded_chunk = (
+        plan.epochs * batch_order.batches_per_epoch,
+        time.monotonic(),
+        (-1, None),
+    )
+    while (reason := _end_reason(state, plan, num_batches_in_total)) is None:
+        next_evaluation = min(num_batches_in_total, (state.step // evaluation_interval + 1) * evaluation_interval)
+        for batches in batch_order.chunk_batches(state.step, next_evaluation, _BATCHES_PER_CHECKPOINT):
             if loaded_chunk[0] != batches.chunk:
                 loaded_chunk = -1, None  # drops the chunk, so that two chunks are never in memory
                 loaded_chunk = batches.chunk, jax.tree.map(jnp.asarray, rows.chunk(batches.chunk))
@@ -180,20 +184,20 @@ def fit_network(
             if (
                 state.step < next_evaluation
                 and checkpoint_file is not None
-                and time.monotonic() - last_saved >= plan.seconds
+                and time.monotonic() - time_of_last_checkpoint >= plan.seconds
             ):
                 checkpoint_file.write(state)
-                last_saved = time.monotonic()
+                time_of_last_checkpoint = time.monotonic()
         state = run.evaluate(
             state, held_out_arrays, next_evaluation - (next_evaluation - 1) // evaluation_interval * evaluation_interval
         )
         if progress is not None:
             progress(_describe_progress(state, plan, batch_order.batches_per_epoch))
         if checkpoint_file is not None and (
-            time.monotonic() - last_saved >= plan.seconds or _end_reason(state, plan, last_batch)
+            time.monotonic() - time_of_last_checkpoint >= plan.seconds or _end_reason(state, plan, num_batches_in_total)
         ):
             checkpoint_file.write(state)
-            last_saved = time.monotonic()
+            time_of_last_checkpoint = time.monotonic()
     return TrainingResult(run.combine(state.best), state.course, reason)
 
 
@@ -206,19 +210,19 @@ class _CompiledTraining:
 
         steps = plan.decay_epochs * batch_order.batches_per_epoch
         rate = plan.rate if plan.decay == 1 else optax.exponential_decay(plan.rate, steps, plan.decay, staircase=True)
-        adam = optax.adam(rate)
+        adam_optimiser = optax.adam(rate)
         self.arrays, self.fixed = eqx.partition(network, eqx.is_array)
         combine, trained = self.combine, objective.trained
 
         def update(arrays, state, batch, key):
-            trained_part, fixed_part = eqx.partition(combine(arrays), trained)
+            trained_part, untrained_part = eqx.partition(combine(arrays), trained)
 
             def loss(trained_part):
-                loss_value, updated_network = objective.loss(eqx.combine(trained_part, fixed_part), batch, key)
+                loss_value, updated_network = objective.loss(eqx.combine(trained_part, untrained_part), batch, key)
                 return loss_value, eqx.filter(eqx.partition(updated_network, trained)[1], eqx.is_array)
 
             (loss_value, updated_fixed_part), gradients = eqx.filter_value_and_grad(loss, has_aux=True)(trained_part)
-            updates, state = adam.update(gradients, state, eqx.filter(trained_part, eqx.is_inexact_array))
+            updates, state = adam_optimiser.update(gradients, state, eqx.filter(trained_part, eqx.is_inexact_array))
             trained_part = eqx.apply_updates(trained_part, updates)
             return eqx.combine(eqx.filter(trained_part, eqx.is_array), updated_fixed_part), state, loss_value
 
@@ -232,17 +236,19 @@ class _CompiledTraining:
             return objective.held_out(combine(arrays), jax.tree.map(lambda array: array[rows], data))
 
         self._train_batch, self._held_out_loss = jax.jit(train_batch), jax.jit(held_out_loss)
-        self.optimiser = jax.jit(adam.init)(eqx.filter(eqx.partition(network, trained)[0], eqx.is_inexact_array))
+        self.optimiser = jax.jit(adam_optimiser.init)(
+            eqx.filter(eqx.partition(network, trained)[0], eqx.is_inexact_array)
+        )
 
     def combine(self, arrays) -> Any:
         """Combine the given arrays with the fixed parts of the network."""
         return eqx.combine(arrays, self.fixed)
 
-    def initial_state(self) -> State:
+    def initial_state(self) -> TrainingState:
         """Return the state of the training before the first batch."""
-        return State(0, Course([], [], []), self.arrays, self.optimiser, self.arrays, jnp.zeros(()))
+        return TrainingState(0, Course([], [], []), self.arrays, self.optimiser, self.arrays, jnp.zeros(()))
 
-    def train_batches(self, state: State, data, rows: Int[np.ndarray, "b batch"]) -> State:
+    def train_batches(self, state: TrainingState, data, rows: Int[np.ndarray, "b batch"]) -> TrainingState:
         """Train the network on batches of `data` with the indices `rows` (batches, batch size); returns the new
         state."""
         arrays, optimiser, total_loss = state.arrays, state.optimiser, state.total
@@ -250,9 +256,9 @@ class _CompiledTraining:
             arrays, optimiser, total_loss = self._train_batch(
                 arrays, optimiser, total_loss, data, batch, state.step + offset
             )
-        return State(state.step + len(rows), state.course, arrays, optimiser, state.best, total_loss)
+        return TrainingState(state.step + len(rows), state.course, arrays, optimiser, state.best, total_loss)
 
-    def evaluate(self, state: State, data, num_batches: int) -> State:
+    def evaluate(self, state: TrainingState, data, num_batches: int) -> TrainingState:
         """Evaluate the loss of the held-out rows, `num_batches` batches after the last evaluation; returns the new
         state.
 
@@ -278,11 +284,11 @@ class _CompiledTraining:
             )
         finite_losses = [value if np.isfinite(value) else np.inf for value in course.validation]
         course = course._replace(validation=finite_losses)
-        best_arrays = state.arrays if course.best == len(finite_losses) - 1 else state.best
-        return State(state.step, course, state.arrays, state.optimiser, best_arrays, jnp.zeros(()))
+        arrays_with_lowest_loss = state.arrays if course.best == len(finite_losses) - 1 else state.best
+        return TrainingState(state.step, course, state.arrays, state.optimiser, arrays_with_lowest_loss, jnp.zeros(()))
 
 
-def _end_reason(state: State, plan: TrainingPlan, last_batch: int) -> str | None:
+def _end_reason(state: TrainingState, plan: TrainingPlan, last_batch: int) -> str | None:
     """Return the reason why the training has ended, or None if the training has not ended."""
     num_evaluations = len(state.course.validation)
     if num_evaluations and num_evaluations - 1 - state.course.best >= plan.patience:
@@ -290,7 +296,7 @@ def _end_reason(state: State, plan: TrainingPlan, last_batch: int) -> str | None
     return f"{plan.epochs} epochs done" if state.step >= last_batch else None
 
 
-def _describe_progress(state: State, plan: TrainingPlan, batches_per_epoch: int) -> str:
+def _describe_progress(state: TrainingState, plan: TrainingPlan, batches_per_epoch: int) -> str:
     course = state.course
     return (
         f"epoch {state.step / batches_per_epoch:.3g} of {plan.epochs}: {course.training[-1]:.4g}, held out "

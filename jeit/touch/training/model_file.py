@@ -15,40 +15,41 @@ import jax
 import numpy as np
 
 from jeit.arguments import describe
-from jeit.files import error_text, written_whole
+from jeit.files import atomically_written_file, error_text
 from jeit_solvers.engines import as_array
 
 # First bytes of a model file; maximum size of its header, and of all its arrays together, bytes.
-_MAGIC, _MAX_HEADER_SIZE, _MAX_ARRAY_SIZE = b"jeit model\n", 2**20, 2**31
+_FILE_SIGNATURE, _MAX_HEADER_SIZE, _MAX_ARRAY_SIZE = b"jeit model\n", 2**20, 2**31
 
 
-def write_model(path: str | Path, kind: str, version: int, head: dict[str, Any], model: Any) -> None:
+def write_model(path: str | Path, kind: str, version: int, header: dict[str, Any], model: Any) -> None:
     """Write the arrays of a `model`, any tree of arrays, to a file; an earlier file is replaced only when the new file
     is complete.
 
-    `kind` and `version`: type of the file, such as "a jeit network of images", which `read_model` checks; `head`: all
+    `kind` and `version`: type of the file, such as "a jeit network of images", which `read_model` checks; `header`: all
     other data that are needed to create the model again and to know the model's purpose, as JSON values. Raises
-    `ValueError` if `path` is a folder, or the head or the model is too large; `OSError` if the file cannot be written.
+    `ValueError` if `path` is a folder, or the header or the model is too large; `OSError` if the file cannot be
+    written.
     """
     path = Path(path)
     if path.is_dir():
         raise ValueError(f"'{path}' is a folder; give a file, such as {path / 'network.jeit'}.")
-    text = json.dumps({"kind": kind, "version": version, **head}, allow_nan=True).encode()
+    text = json.dumps({"kind": kind, "version": version, **header}, allow_nan=True).encode()
     if len(text) > _MAX_HEADER_SIZE:
         raise ValueError(
-            f"head has {len(text)} bytes as JSON, more than {_MAX_HEADER_SIZE}; put arrays into the model."
+            f"header has {len(text)} bytes as JSON, more than {_MAX_HEADER_SIZE}; put arrays into the model."
         )
     arrays = [leaf for leaf in jax.tree.leaves(model) if eqx.is_array(leaf)]
     if _num_bytes(arrays) > _MAX_ARRAY_SIZE:
         raise ValueError(f"model has {_num_bytes(arrays)} bytes of arrays, and a file {_MAX_ARRAY_SIZE} at most.")
-    with written_whole(path) as file:
-        file.write(_MAGIC + text + b"\n")
+    with atomically_written_file(path) as file:
+        file.write(_FILE_SIGNATURE + text + b"\n")
         for array in arrays:
             np.lib.format.write_array(file, np.asarray(array), allow_pickle=False)
 
 
-def read_head(path: str | Path, kind: str, version: int) -> dict[str, Any]:
-    """Read the head of a file that `write_model` wrote, but not its arrays.
+def read_file_header(path: str | Path, kind: str, version: int) -> dict[str, Any]:
+    """Read the header of a file that `write_model` wrote, but not its arrays.
 
     Raises `FileNotFoundError` if the file does not exist, and `ValueError` if the file is of another kind or version,
     or was not written by jeit.
@@ -60,18 +61,18 @@ def read_head(path: str | Path, kind: str, version: int) -> dict[str, Any]:
 def read_model(
     path: str | Path, kind: str, version: int, make: Callable[[dict[str, Any]], Any]
 ) -> tuple[dict[str, Any], Any]:
-    """Read the head and the model of a file that `write_model` wrote.
+    """Read the header and the model of a file that `write_model` wrote.
 
-    `make`: function that returns a model of the architecture that a head describes; only the shapes of the model's
-    arrays are evaluated, so that no head can cause large use of memory. Nothing in the file is executed: before an
+    `make`: function that returns a model of the architecture that a header describes; only the shapes of the model's
+    arrays are evaluated, so that no header can cause large use of memory. Nothing in the file is executed: before an
     array is read, its shape and dtype must be those of the architecture. Raises `FileNotFoundError` if the file does
     not exist, and `ValueError` if the file is of another kind or version, is cut short or too long, or has arrays of a
     different architecture.
     """
     with _open_file(Path(path), kind) as file:
-        head = _read_header(file, kind, version)
+        header = _read_header(file, kind, version)
         try:
-            architecture = eqx.filter_eval_shape(make, head)
+            architecture = eqx.filter_eval_shape(make, header)
         except (KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
             raise ValueError(
                 f"its header does not describe such a model ({type(error).__name__}: {error_text(error)})"
@@ -86,7 +87,7 @@ def read_model(
         model = jax.tree.map(lambda leaf: _read_array(file, leaf), architecture)
         if file.read(1):
             raise ValueError("it has more bytes after its last array")
-    return head, model
+    return header, model
 
 
 def check_same(path: str | Path, actual_description: dict[str, Any], expected_description: dict[str, Any]) -> None:
@@ -121,21 +122,21 @@ def _open_file(path: Path, kind: str) -> Iterator[BinaryIO]:
 
 def _read_header(file: BinaryIO, kind: str, version: int) -> dict[str, Any]:
     """Read the header of a model file. Raises `ValueError` if the file is of another kind or version."""
-    if file.read(len(_MAGIC)) != _MAGIC:
+    if file.read(len(_FILE_SIGNATURE)) != _FILE_SIGNATURE:
         raise ValueError("it is a file of another kind")
     line = file.readline(_MAX_HEADER_SIZE + 1)
     if not line.endswith(b"\n"):
         raise ValueError("its header is truncated, or too long")
     try:
-        head = json.loads(line)
+        header = json.loads(line)
     except (ValueError, RecursionError):
         raise ValueError("its header is not JSON") from None
-    if not isinstance(head, dict) or head.get("kind") != kind:
-        stored_kind = head.get("kind") if isinstance(head, dict) else head
+    if not isinstance(header, dict) or header.get("kind") != kind:
+        stored_kind = header.get("kind") if isinstance(header, dict) else header
         raise ValueError(f"it is {describe(stored_kind)}")
-    if head.get("version") != version:
-        raise ValueError(f"it is of version {describe(head.get('version'))}, and this jeit reads {version}")
-    return head
+    if header.get("version") != version:
+        raise ValueError(f"it is of version {describe(header.get('version'))}, and this jeit reads {version}")
+    return header
 
 
 def _num_bytes(arrays) -> int:
@@ -196,7 +197,7 @@ class Course(NamedTuple):
         return min(range(len(self.validation)), key=self.validation.__getitem__, default=0)
 
 
-class State(NamedTuple):
+class TrainingState(NamedTuple):
     """The whole state of a network's training, from which the training can be resumed.
 
     `step`: number of batches processed; `course`: history of the losses; `arrays`: current arrays of the network,
@@ -218,12 +219,12 @@ class Checkpoint:
     def __init__(self, path: str | Path, fingerprint: dict[str, Any]):
         self.path, self.fingerprint = Path(path), fingerprint
 
-    def write(self, state: State) -> None:
+    def write(self, state: TrainingState) -> None:
         """Write the state of the training; an earlier file is replaced only when the new file is complete."""
-        head = {"training": self.fingerprint, "step": state.step, "course": list(state.course)}
-        write_model(self.path, _CHECKPOINT_KIND, _CHECKPOINT_VERSION, head, state[2:])
+        header = {"training": self.fingerprint, "step": state.step, "course": list(state.course)}
+        write_model(self.path, _CHECKPOINT_KIND, _CHECKPOINT_VERSION, header, state[2:])
 
-    def read(self, initial_state: State) -> State:
+    def read(self, initial_state: TrainingState) -> TrainingState:
         """Read the state of the training; without a file, return `initial_state`, the state before the first batch.
 
         Raises `ValueError`, which states the first difference, if the file belongs to a different training.
@@ -231,14 +232,14 @@ class Checkpoint:
         if not self.path.exists():
             return initial_state
 
-        def make(head: dict[str, Any]) -> Any:
+        def make(header: dict[str, Any]) -> Any:
             for name, value in json.loads(json.dumps(self.fingerprint)).items():
-                if head["training"].get(name) != value:
+                if header["training"].get(name) != value:
                     raise ValueError(
-                        f"it is of another training ({name} was {head['training'].get(name)}, and is {value} now); "
+                        f"it is of another training ({name} was {header['training'].get(name)}, and is {value} now); "
                         "delete it, or give another file"
                     )
             return jax.tree.map(lambda leaf: leaf, initial_state[2:])
 
-        head, arrays = read_model(self.path, _CHECKPOINT_KIND, _CHECKPOINT_VERSION, make)
-        return State(head["step"], Course(*head["course"]), *arrays)
+        header, arrays = read_model(self.path, _CHECKPOINT_KIND, _CHECKPOINT_VERSION, make)
+        return TrainingState(header["step"], Course(*header["course"]), *arrays)

@@ -193,11 +193,11 @@ def projected_gradient(
 
     def step(carry):
         point, state = carry
-        extrapolated = state.velocity
+        extrapolated_point = state.velocity
         point, state = solver.update(point, state, hyperparams_proj=(lower, upper))
         # jaxopt extrapolates beyond the bounds, where the objective may not be defined, and takes two equal points in
         # succession for a minimum, although the gradient was computed elsewhere.
-        error = jnp.linalg.norm(point - extrapolated) / state.stepsize
+        error = jnp.linalg.norm(point - extrapolated_point) / state.stepsize
         return point, state._replace(velocity=jnp.clip(state.velocity, lower, upper), error=error)
 
     solution, state = jax.lax.while_loop(is_unfinished, step, (start, solver.init_state(start)))
@@ -258,7 +258,7 @@ def scipy_lbfgsb(
 
 # Minimum scale of a shortened step, and fraction of the predicted decrease of the cost that an accepted step must
 # achieve.
-_MIN_SCALE = 2.0**-20
+_MIN_STEP_SCALE = 2.0**-20
 _SUFFICIENT_DECREASE = 1e-4
 # Relative rounding error of a cost, which is a sum of many squares, divided by the machine precision.
 _ROUNDING_FACTOR = 100.0
@@ -278,7 +278,7 @@ class DescentState(Module):
     num_accepted: Int[Array, ""]
     history: Float[Array, " steps"]
     converged: Bool[Array, ""]
-    stuck: Bool[Array, ""]
+    is_stuck: Bool[Array, ""]
 
 
 class Descent(optx.AbstractLeastSquaresSolver):
@@ -318,20 +318,20 @@ class Descent(optx.AbstractLeastSquaresSolver):
         if "expand" not in options:
             raise ValueError("Descent needs options={'expand': function}; see its documentation.")
         xp = namespace(y)
-        zero, zero_count = xp.zeros((), y.dtype), xp.zeros((), int)
+        zero_scalar, zero_count = xp.zeros((), y.dtype), xp.zeros((), int)
         return DescentState(
             trial=y,
             direction=xp.zeros_like(y),
-            scale=zero + 1,
-            slope=zero,
-            curvature=zero,
-            cost=zero + np.inf,
-            damping=zero + self.damping,
+            scale=zero_scalar + 1,
+            slope=zero_scalar,
+            curvature=zero_scalar,
+            cost=zero_scalar + np.inf,
+            damping=zero_scalar + self.damping,
             num_steps=zero_count,
             num_accepted=zero_count,
             history=xp.full(self.history, np.nan, y.dtype),
             converged=xp.zeros((), bool),
-            stuck=xp.zeros((), bool),
+            is_stuck=xp.zeros((), bool),
         )
 
     def step(self, fn, y, args, options, state, tags):
@@ -362,25 +362,27 @@ class Descent(optx.AbstractLeastSquaresSolver):
                 num_accepted=state.num_accepted + 1,
                 history=replace_at(state.history, state.num_accepted, cost),
                 converged=abs(slope + 0.5 * curvature) <= self.rtol * cost + self.atol,
-                stuck=xp.zeros((), bool),
+                is_stuck=xp.zeros((), bool),
             )
 
         def rejected():
             scale = state.scale / 2
-            shorter = eqx.tree_at(
+            state_with_shorter_step = eqx.tree_at(
                 lambda descent_state: (
                     descent_state.trial,
                     descent_state.scale,
                     descent_state.damping,
                     descent_state.num_steps,
-                    descent_state.stuck,
+                    descent_state.is_stuck,
                 ),
                 state,
-                (y + scale * state.direction, scale, 4 * state.damping, state.num_steps + 1, scale < _MIN_SCALE),
+                (y + scale * state.direction, scale, 4 * state.damping, state.num_steps + 1, scale < _MIN_STEP_SCALE),
             )
             # If the cost at the start is not finite, no shorter step is possible.
             return eqx.tree_at(
-                lambda descent_state: descent_state.stuck, shorter, shorter.stuck | ~xp.isfinite(state.cost)
+                lambda descent_state: descent_state.is_stuck,
+                state_with_shorter_step,
+                state_with_shorter_step.is_stuck | ~xp.isfinite(state.cost),
             )
 
         if xp is np:
@@ -397,14 +399,14 @@ class Descent(optx.AbstractLeastSquaresSolver):
         unused: Any = None  # further arguments from optimistix, which are not used
         state = self.init(unused, point, arguments, options, unused, unused, unused)
         with np.errstate(all="ignore"):
-            while state.num_steps < max_steps and not (state.converged or state.stuck):
+            while state.num_steps < max_steps and not (state.converged or state.is_stuck):
                 point, state, _ = self.step(unused, point, arguments, options, state, unused)
         return point, state
 
     def terminate(self, fn, y, args, options, state, tags):
         """Whether the descent has converged, or is stuck because no shorter step lowers the cost."""
-        failed = optx.RESULTS.where(state.stuck, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful)
-        return state.converged | state.stuck, failed
+        failure_result = optx.RESULTS.where(state.is_stuck, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful)
+        return state.converged | state.is_stuck, failure_result
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Return the solution unchanged."""

@@ -21,11 +21,11 @@ from jeit_solvers.module import Module
 
 # Signature of a function of x (n, F) and of data whose last axis is F. It returns the values (F,), the gradients (n,
 # F), and positive definite approximations (n, n, F) of the Hessians, for instance Gauss-Newton or Fisher matrices.
-Expansion = Callable[[Array, Any], tuple[Array, Array, Array]]
+QuadraticExpansion = Callable[[Array, Any], tuple[Array, Array, Array]]
 
 _MAX_DAMPING = 1e12
 # Minimum number of gathered functions; below this number gathering the unfinished functions saves no time.
-_MIN_GATHERED = 32
+_MIN_GATHERED_FUNCTIONS = 32
 # Number of steps that the whole batch takes before the unfinished functions are gathered.
 _WHOLE_BATCH_STEPS = 8
 # Distance between the points in the finite differences of derivatives that approximate a Hessian.
@@ -213,11 +213,11 @@ class _Limits(NamedTuple):
 
 
 def minimise_small(
-    expand: Expansion,
+    expand: QuadraticExpansion,
     start: Float[Array, "n F"],
     data: Any = None,
     *,
-    finish: Expansion | None = None,
+    finish: QuadraticExpansion | None = None,
     lower: Float[Array, "n 1"],
     upper: Float[Array, "n 1"],
     largest_step: Float[Array, "n 1"],
@@ -261,7 +261,7 @@ def minimise_small(
     xp = namespace(start, data, lower, upper)
     clipped_start = xp.clip(start, lower, upper)
     num_functions = clipped_start.shape[1]
-    none_done = xp.zeros(num_functions, bool)
+    is_done = xp.zeros(num_functions, bool)
     state = _State(
         x=clipped_start,
         value=xp.full(num_functions, xp.inf),
@@ -269,11 +269,11 @@ def minimise_small(
         matrix=xp.eye(len(clipped_start))[:, :, None] * xp.ones_like(clipped_start),
         damping=xp.full(num_functions, 1e-2),
         num_taken=xp.zeros(num_functions, int),
-        is_done=none_done if skip is None else skip,
-        converged=none_done,
+        is_done=is_done if skip is None else skip,
+        converged=is_done,
     )
     num_gathered = num_functions if xp is np else num_functions // 4
-    if num_gathered < _MIN_GATHERED:
+    if num_gathered < _MIN_GATHERED_FUNCTIONS:
         state = _take_steps(state, data, max_steps + 1, finish or expand, limits)
     else:
         if skip is None:
@@ -281,11 +281,13 @@ def minimise_small(
 
         def continue_unfinished(state: _State) -> _State:
             unfinished_indices = _first_true_indices(~state.is_done, num_gathered)
-            gathered, gathered_data = jax.tree.map(
+            gathered_state, gathered_data = jax.tree.map(
                 lambda array: xp.take(array, unfinished_indices, axis=-1, mode="clip"), (state, data)
             )
-            gathered = replace(gathered, is_done=gathered.is_done | (unfinished_indices == num_functions))
-            new_state = _take_steps(gathered, gathered_data, max_steps + 1, finish or expand, limits)
+            gathered_state = replace(
+                gathered_state, is_done=gathered_state.is_done | (unfinished_indices == num_functions)
+            )
+            new_state = _take_steps(gathered_state, gathered_data, max_steps + 1, finish or expand, limits)
             return jax.tree.map(
                 lambda array, new_values: set_at(array, (..., unfinished_indices), new_values), state, new_state
             )
@@ -316,27 +318,29 @@ def _next_step(state: _State, limits: _Limits) -> tuple[Array, Array]:
     return end_point, -xp.sum((end_point - x) * gradient, axis=0)
 
 
-def _take_steps(state: _State, data, steps: int, expand: Expansion, limits: _Limits) -> _State:
+def _take_steps(state: _State, data, steps: int, expand: QuadraticExpansion, limits: _Limits) -> _State:
     """Take up to `steps` steps of the minimisation of all functions, fewer if all functions are done."""
     xp = namespace(state, data)
 
     def body(loop):
         num_iterations, state = loop
         # The first iteration only evaluates the start, from which no step has been computed yet.
-        is_start = xp.isinf(state.value)
+        is_first_evaluation = xp.isinf(state.value)
         trial_point, predicted_decrease = _next_step(state, limits)
         value, gradient, matrix = expand(trial_point, data)
         is_lower = (value <= state.value) & ~state.is_done
         # A step that is clipped at a bound may increase the value; then a more damped step, closer to the negative
         # gradient, is tried.
         is_settled = (
-            (predicted_decrease >= 0) & (predicted_decrease <= limits.tolerance * (1 + xp.abs(state.value))) & ~is_start
+            (predicted_decrease >= 0)
+            & (predicted_decrease <= limits.tolerance * (1 + xp.abs(state.value)))
+            & ~is_first_evaluation
         )
         damping = xp.where(is_lower, xp.maximum(state.damping / 10, 1e-12), 8 * xp.maximum(state.damping, 1e-4))
-        num_taken = state.num_taken + ~(state.is_done | is_start)
+        num_taken = state.num_taken + ~(state.is_done | is_first_evaluation)
         # The search also ends when steps become too small to change the value.
         converged = state.converged | (~state.is_done & (is_settled | (damping > _MAX_DAMPING)))
-        is_invalid = is_start & ~xp.isfinite(value)
+        is_invalid = is_first_evaluation & ~xp.isfinite(value)
         return num_iterations + 1, _State(
             x=xp.where(is_lower, trial_point, state.x),
             value=xp.where(is_lower, value, state.value),

@@ -299,8 +299,10 @@ def choose_solver(
         if multigrid_is_installed():
             return Multigrid(tolerance, reason=f"iterative: {comparison}")
         if factor_memory > allowed_memory:
-            cg_note = "; without pyamg (pip install 'jeit[large]') conjugate gradients take several times as long"
-            return ConjugateGradient(tolerance, reason=f"iterative: {comparison}{cg_note}")
+            conjugate_gradient_note = (
+                "; without pyamg (pip install 'jeit[large]') conjugate gradients take several times as long"
+            )
+            return ConjugateGradient(tolerance, reason=f"iterative: {comparison}{conjugate_gradient_note}")
     is_on_cpu = jax.default_backend() == "cpu"
     if fronts.num_operations > (_MAX_COMPILED_OPERATIONS_CPU if is_on_cpu else _MAX_COMPILED_OPERATIONS):
         return FrontalCholesky(fronts, f"direct: {cost}")

@@ -69,27 +69,27 @@ def _halve_parts(
     counts = np.bincount(node_parts, minlength=num_parts)
     # Fronts are padded to the largest front of their stage. The smaller the part, the more an even split is worth, and
     # the less an additional node in the separator costs.
-    is_small = counts < 400
-    price_of_imbalance = np.where(is_small, 0.5, 0.1)
-    best_side, best_cost = np.full(part_of_node.size, 2), np.full(num_parts, np.inf)
+    is_small_part = counts < 400
+    imbalance_penalty = np.where(is_small_part, 0.5, 0.1)
+    best_side_of_node, best_cost = np.full(part_of_node.size, 2), np.full(num_parts, np.inf)
     for key in _splitting_functions(graph, nodes, node_parts, num_parts, coordinates):
         sort_order = np.lexsort((key, node_parts))
         rank = np.empty(nodes.size, dtype=np.int64)
         rank[sort_order] = np.arange(nodes.size) - np.repeat(np.cumsum(counts) - counts, counts)
         for off_middle in (-1, 0, 1):
-            lower_fraction = 0.5 + off_middle * np.where(is_small, 0.04, 0.05)
+            lower_fraction = 0.5 + off_middle * np.where(is_small_part, 0.04, 0.05)
             num_below = np.maximum(1, np.rint(lower_fraction * counts)).astype(np.int64)
             side = np.zeros(part_of_node.size, dtype=np.int64)
             side[nodes] = rank >= num_below[node_parts]
             is_crossing = side[columns] > side[rows]
             side[_minimum_vertex_cover(rows[is_crossing], columns[is_crossing])] = 2
             side_counts = np.bincount(3 * node_parts + side[nodes], minlength=3 * num_parts).reshape(-1, 3)
-            cost = side_counts[:, 2] + price_of_imbalance * np.abs(side_counts[:, 0] - side_counts[:, 1])
+            cost = side_counts[:, 2] + imbalance_penalty * np.abs(side_counts[:, 0] - side_counts[:, 1])
             is_better = cost < best_cost
             best_cost[is_better] = cost[is_better]
             changed_nodes = nodes[is_better[node_parts]]
-            best_side[changed_nodes] = side[changed_nodes]
-    return best_side
+            best_side_of_node[changed_nodes] = side[changed_nodes]
+    return best_side_of_node
 
 
 def _splitting_functions(
@@ -102,8 +102,8 @@ def _splitting_functions(
     sort_order = np.argsort(part_of_node, kind="stable")
     key = np.empty(nodes.size)
     for members in np.split(sort_order, np.cumsum(np.bincount(part_of_node, minlength=num_parts))[:-1]):
-        part_nodes = nodes[members]
-        key[members] = _distance_function(graph[part_nodes][:, part_nodes])
+        nodes_of_part = nodes[members]
+        key[members] = _distance_function(graph[nodes_of_part][:, nodes_of_part])
     return [key]
 
 
@@ -180,10 +180,11 @@ def _minimum_vertex_cover(lower_nodes: np.ndarray, upper_nodes: np.ndarray) -> n
     set has as many nodes as a maximum matching has edges."""
     if lower_nodes.size == 0:
         return np.empty(0, dtype=np.int64)
-    left_nodes, left_local = np.unique(lower_nodes, return_inverse=True)
-    right_nodes, right_local = np.unique(upper_nodes, return_inverse=True)
+    left_nodes, local_left_nodes = np.unique(lower_nodes, return_inverse=True)
+    right_nodes, local_right_nodes = np.unique(upper_nodes, return_inverse=True)
     edges = csr_array(
-        (np.ones(lower_nodes.size, dtype=np.int8), (left_local, right_local)), shape=(left_nodes.size, right_nodes.size)
+        (np.ones(lower_nodes.size, dtype=np.int8), (local_left_nodes, local_right_nodes)),
+        shape=(left_nodes.size, right_nodes.size),
     )
     match_of_left = maximum_bipartite_matching(edges, perm_type="column")
     match_of_right = np.full(right_nodes.size, -1)
@@ -191,18 +192,18 @@ def _minimum_vertex_cover(lower_nodes: np.ndarray, upper_nodes: np.ndarray) -> n
     match_of_right[match_of_left[is_matched]] = np.flatnonzero(is_matched)
     # Follow alternating paths from the unmatched left nodes; the cover consists of the left nodes not reached and the
     # right nodes reached.
-    reached_left = ~is_matched
-    reached_right = np.zeros(right_nodes.size, dtype=bool)
+    reached_left_nodes = ~is_matched
+    reached_right_nodes = np.zeros(right_nodes.size, dtype=bool)
     while True:
         newly_reached = np.zeros(right_nodes.size, dtype=bool)
-        newly_reached[right_local[reached_left[left_local]]] = True
-        newly_reached &= ~reached_right
+        newly_reached[local_right_nodes[reached_left_nodes[local_left_nodes]]] = True
+        newly_reached &= ~reached_right_nodes
         if not newly_reached.any():
             break
-        reached_right |= newly_reached
-        matched_left = match_of_right[newly_reached]
-        reached_left[matched_left[matched_left >= 0]] = True
-    return np.concatenate([left_nodes[~reached_left], right_nodes[reached_right]])
+        reached_right_nodes |= newly_reached
+        matched_left_nodes = match_of_right[newly_reached]
+        reached_left_nodes[matched_left_nodes[matched_left_nodes >= 0]] = True
+    return np.concatenate([left_nodes[~reached_left_nodes], right_nodes[reached_right_nodes]])
 
 
 def _num_nodes(graph: csr_array) -> int:

@@ -28,7 +28,7 @@ _LEAF_SIZE = 128
 # Number of levels of the elimination tree above the subtrees that are eliminated in parallel.
 _LEVELS_ABOVE_SUBTREES = 3
 # Number of bits to which coordinates are rounded before rows are ordered along a space-filling curve.
-_CURVE_BITS = 10
+_COORDINATE_BITS = 10
 
 
 class Front(NamedTuple):
@@ -151,31 +151,33 @@ def _build_fronts(
     front_indices = nested_dissection(graph_of(rows, columns, size), depth, coordinates)
     nodes, front_indices = np.unique(front_indices, return_inverse=True)
     level = np.floor(np.log2(nodes + 1)).astype(int)
-    top_levels = min(_LEVELS_ABOVE_SUBTREES, depth)
+    num_top_levels = min(_LEVELS_ABOVE_SUBTREES, depth)
     # Steps: the subtrees are number 0, the levels above them 1, 2, …
-    steps_of_nodes = np.maximum(top_levels - level, 0)
-    subtree = np.where(steps_of_nodes, 0, (nodes + 1) >> np.maximum(level - top_levels, 0))
-    old_numbers = np.lexsort((_post_order_positions(nodes, level, depth), subtree, steps_of_nodes))
+    step_of_node = np.maximum(num_top_levels - level, 0)
+    subtree_of_node = np.where(step_of_node, 0, (nodes + 1) >> np.maximum(level - num_top_levels, 0))
+    old_numbers = np.lexsort((_post_order_positions(nodes, level, depth), subtree_of_node, step_of_node))
     new_numbers = np.argsort(old_numbers)
     tree = _EliminationTree(size, rows, columns, new_numbers[front_indices], level[old_numbers], coordinates)
-    part_of_front = np.where(steps_of_nodes, nodes, subtree)[old_numbers]
+    part_of_front = np.where(step_of_node, nodes, subtree_of_node)[old_numbers]
     starts = np.flatnonzero(np.diff(part_of_front, prepend=-1))
     slices = [slice(start, end) for start, end in itertools.pairwise([*starts.tolist(), len(nodes)])]
-    step_of = steps_of_nodes[old_numbers][starts]
-    steps = tuple(tuple(itertools.compress(slices, step_of == step_number)) for step_number in range(top_levels + 1))
-    top = int(tree.pivots[: np.count_nonzero(steps_of_nodes == 0)].sum())
+    step_of_front = step_of_node[old_numbers][starts]
+    steps = tuple(
+        tuple(itertools.compress(slices, step_of_front == step_number)) for step_number in range(num_top_levels + 1)
+    )
+    top = int(tree.pivots[: np.count_nonzero(step_of_node == 0)].sum())
     return Fronts(size, len(rows), tree.order, tree.entry_order, tree.fronts(top), steps, top, key)
 
 
 def _post_order_positions(nodes: np.ndarray, level: np.ndarray, depth: int) -> np.ndarray:
     """Positions of nodes of a complete binary tree in post-order: every node comes after all nodes below it."""
     position = np.full(len(nodes), 2 ** (depth + 1) - 2)
-    for above in range(depth):
-        # The ancestor of a node just below level `above`: a left ancestor comes before the whole subtree of its right
-        # sibling.
-        height = level - above - 1
-        is_left = (height >= 0) & ((((nodes + 1) >> np.maximum(height, 0)) & 1) == 0)
-        position -= np.where(height >= 0, 1 + np.where(is_left, 2 ** (depth - above) - 1, 0), 0)
+    for levels_above in range(depth):
+        # The ancestor of a node just below level `levels_above`: a left ancestor comes before the whole subtree of its
+        # right sibling.
+        height = level - levels_above - 1
+        is_left_child = (height >= 0) & ((((nodes + 1) >> np.maximum(height, 0)) & 1) == 0)
+        position -= np.where(height >= 0, 1 + np.where(is_left_child, 2 ** (depth - levels_above) - 1, 0), 0)
     return position
 
 
@@ -200,8 +202,8 @@ class _EliminationTree:
         self.border = np.bincount(self.border_front, minlength=count)
         self.border_first = np.cumsum(self.border) - self.border
         self.rows_in_parent = self._local_indices(self.parent[self.border_front], self.border_row)
-        holder = self.front[self.earlier_rows]
-        self.entry_order = np.argsort(holder, kind="stable")
+        front_of_entry = self.front[self.earlier_rows]
+        self.entry_order = np.argsort(front_of_entry, kind="stable")
 
     def _find_borders(self, count: int) -> None:
         """Find the border rows of each front and its parent. The border rows are the later rows of the front's entries,
@@ -209,17 +211,19 @@ class _EliminationTree:
         border row."""
         size, front = self.size, self.front
         first_fronts, second_fronts = front[self.earlier_rows], front[self.later_rows]
-        pending = np.unique((first_fronts * size + self.later_rows)[first_fronts != second_fronts])
+        pending_entries = np.unique((first_fronts * size + self.later_rows)[first_fronts != second_fronts])
         self.parent, borders = np.full(count, -1), [np.zeros(0, dtype=np.int64)]
         for level in range(int(self.level.max()), -1, -1):
-            is_in_level = self.level[pending // size] == level
-            border, pending = pending[is_in_level], pending[~is_in_level]
-            child, row = np.divmod(border, size)
-            borders.append(border)
+            is_in_level = self.level[pending_entries // size] == level
+            border_entries, pending_entries = pending_entries[is_in_level], pending_entries[~is_in_level]
+            child, row = np.divmod(border_entries, size)
+            borders.append(border_entries)
             start = np.flatnonzero(np.diff(child, prepend=-1))
             self.parent[child[start]] = front[row[start]]
             parent_front = self.parent[child]
-            pending = np.unique(np.concatenate([pending, (parent_front * size + row)[front[row] != parent_front]]))
+            pending_entries = np.unique(
+                np.concatenate([pending_entries, (parent_front * size + row)[front[row] != parent_front]])
+            )
         self.keys = np.sort(np.concatenate(borders))
         self.border_front, self.border_row = np.divmod(self.keys, size)
 
@@ -231,13 +235,13 @@ class _EliminationTree:
 
     def fronts(self, top: int) -> tuple[Front, ...]:
         """All fronts of the tree; `top`: number of the first row that a front above the subtrees eliminates."""
-        holder = self.front[self.earlier_rows]
+        front_of_entry = self.front[self.earlier_rows]
         height = self.pivots + self.border
-        panel_indices = (self.earlier_rows - self.first_pivots[holder]) * height[holder] + self._local_indices(
-            holder, self.later_rows
-        )
+        panel_indices = (self.earlier_rows - self.first_pivots[front_of_entry]) * height[
+            front_of_entry
+        ] + self._local_indices(front_of_entry, self.later_rows)
         panel_indices = panel_indices[self.entry_order]
-        entry_offsets = np.searchsorted(holder[self.entry_order], np.arange(len(height) + 1)).tolist()
+        entry_offsets = np.searchsorted(front_of_entry[self.entry_order], np.arange(len(height) + 1)).tolist()
         is_parent_pivot = self.rows_in_parent < self.pivots[self.parent[self.border_front]]
         num_parent_pivots = np.bincount(self.border_front[is_parent_pivot], minlength=len(height)).tolist()
         num_subtree_rows = np.bincount(self.border_front[self.border_row < top], minlength=len(height)).tolist()
@@ -264,9 +268,9 @@ def _morton_positions(coordinates: np.ndarray) -> np.ndarray:
     """Positions of points along a space-filling curve (Morton order). Rows that are near each other in space are then
     near each other in a front, so that the rows of a child are nearly consecutive rows of its parent."""
     bounding_size = max(np.ptp(coordinates, axis=0).max(), np.finfo(float).tiny)
-    cells = ((coordinates - coordinates.min(axis=0)) / bounding_size * (2**_CURVE_BITS - 1)).astype(np.int64)
+    cells = ((coordinates - coordinates.min(axis=0)) / bounding_size * (2**_COORDINATE_BITS - 1)).astype(np.int64)
     position = np.zeros(len(cells), dtype=np.int64)
-    for bit in range(_CURVE_BITS - 1, -1, -1):
+    for bit in range(_COORDINATE_BITS - 1, -1, -1):
         for axis in cells.T:
             position = 2 * position + ((axis >> bit) & 1)
     return position

@@ -33,7 +33,7 @@ from jeit_solvers.sparse.operator import LastMatrixCache
 _MIN_PARALLEL_OPERATIONS = 5e9
 # Number of rows of a child front's Schur complement that are added to the parent front together. Each such block
 # includes some entries below the diagonal, which are not needed.
-_ADDED_ROWS = 64
+_NUM_ROWS_ADDED_AT_ONCE = 64
 # Maximum number of entries of a factor that `solve_with_cached_factor` caches for the next call.
 _MAX_CACHED_ENTRIES = 100_000_000
 
@@ -201,7 +201,9 @@ def solve_with_cached_factor(
 def _solve_in_numpy(fronts: Fronts, dtype: Any, values: Any, columns: Any) -> np.ndarray:
     with np.errstate(all="ignore"):
         values, is_kept = np.asarray(values), fronts.num_factor_entries < _MAX_CACHED_ENTRIES
-        factor = _LAST_FACTOR.get_or_compute(fronts.key, values, lambda: factorise_fronts(fronts, values), keep=is_kept)
+        factor = _LAST_FACTOR.get_or_compute(
+            fronts.key, values, lambda: factorise_fronts(fronts, values), keeps_result=is_kept
+        )
         return factor.solve(np.asarray(columns)).astype(dtype)
 
 
@@ -224,8 +226,8 @@ def _eliminate_front(
         if num_parent_pivots:
             _add_rows(panel, parent_rows[:num_parent_pivots], parent_rows, schur[:num_parent_pivots])
         parent_rows = parent_rows[num_parent_pivots:] - num_pivots
-        for first_row in range(0, len(parent_rows), _ADDED_ROWS):
-            last_row, start = min(first_row + _ADDED_ROWS, len(parent_rows)), parent_rows[first_row]
+        for first_row in range(0, len(parent_rows), _NUM_ROWS_ADDED_AT_ONCE):
+            last_row, start = min(first_row + _NUM_ROWS_ADDED_AT_ONCE, len(parent_rows)), parent_rows[first_row]
             lower_rows = schur[
                 num_parent_pivots + first_row : num_parent_pivots + last_row, num_parent_pivots + first_row :
             ]
@@ -240,15 +242,15 @@ def _eliminate_front(
 def _add_rows(matrix: np.ndarray, rows: np.ndarray, columns: np.ndarray, block: np.ndarray) -> None:
     """Add a `block` (r, c) to the given rows (r,) and columns (c,) of a matrix, both in ascending order."""
     first_row, last_row = int(rows[0]), int(rows[-1]) + 1
-    column_start, column_end = int(columns[0]), int(columns[-1]) + 1
-    if column_end - column_start > len(columns):
-        spread_rows = np.zeros((len(rows), column_end - column_start), matrix.dtype)
-        spread_rows[:, columns - column_start] = block
-        block = spread_rows
+    column_start, column_stop = int(columns[0]), int(columns[-1]) + 1
+    if column_stop - column_start > len(columns):
+        expanded_rows = np.zeros((len(rows), column_stop - column_start), matrix.dtype)
+        expanded_rows[:, columns - column_start] = block
+        block = expanded_rows
     if last_row - first_row == len(rows):
-        matrix[first_row:last_row, column_start:column_end] += block
+        matrix[first_row:last_row, column_start:column_stop] += block
     else:
-        matrix[rows, column_start:column_end] += block
+        matrix[rows, column_start:column_stop] += block
 
 
 def _for_each_slice(function: Any, slices: tuple[slice, ...], operations: float) -> None:
@@ -265,12 +267,12 @@ def _for_each_slice(function: Any, slices: tuple[slice, ...], operations: float)
 def _routine(module: Any, name: str, num_arguments: int) -> Any:
     """Return a routine of SciPy's BLAS or LAPACK, callable through ctypes with pointers as its `num_arguments`
     arguments."""
-    capsule = module.__pyx_capi__[name]
-    name_of, pointer_of = ctypes.pythonapi.PyCapsule_GetName, ctypes.pythonapi.PyCapsule_GetPointer
-    name_of.restype, name_of.argtypes = ctypes.c_char_p, [ctypes.py_object]
-    pointer_of.restype, pointer_of.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
+    function_capsule = module.__pyx_capi__[name]
+    get_capsule_name, get_capsule_pointer = ctypes.pythonapi.PyCapsule_GetName, ctypes.pythonapi.PyCapsule_GetPointer
+    get_capsule_name.restype, get_capsule_name.argtypes = ctypes.c_char_p, [ctypes.py_object]
+    get_capsule_pointer.restype, get_capsule_pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
     signature = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * num_arguments)
-    return signature(pointer_of(capsule, name_of(capsule)))
+    return signature(get_capsule_pointer(function_capsule, get_capsule_name(function_capsule)))
 
 
 class _Routines(NamedTuple):
@@ -325,7 +327,10 @@ def eliminate(panel: np.ndarray, schur: np.ndarray) -> bool:
     if not np.isfinite(np.diagonal(panel)).all():
         return False
     if num_border:
-        border_address, plus_one = panel.ctypes.data + num_pivots * panel.itemsize, routines.plus_one.ctypes.data
+        border_address, plus_one = (
+            panel.ctypes.data + num_pivots * panel.itemsize,
+            routines.plus_one.ctypes.data,
+        )
         pivot_count, border_count = _c_integer(num_pivots), _c_integer(num_border)
         routines.triangle(
             b"R",

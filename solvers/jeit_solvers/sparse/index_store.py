@@ -17,7 +17,7 @@ from jaxtyping import Array, Inexact, Int
 from jeit_solvers.engines import add_into, as_array, gather, gather_or_zero, has_values, namespace, set_at
 
 
-class Slot(NamedTuple):
+class IndexSlot(NamedTuple):
     """Position and shape of an index array in an `IndexStore`."""
 
     start: int
@@ -38,9 +38,9 @@ class IndexStore:
         self._arrays: list[np.ndarray] = []
         self._total = 0
 
-    def add(self, array: np.ndarray) -> Slot:
-        """Store an integer array, and return the `Slot` from which the array is read later."""
-        slot = Slot(self._total, tuple(array.shape))
+    def add(self, array: np.ndarray) -> IndexSlot:
+        """Store an integer array, and return the `IndexSlot` from which the array is read later."""
+        slot = IndexSlot(self._total, tuple(array.shape))
         self._arrays.append(array.astype(np.int32).ravel())
         self._total += array.size
         return slot
@@ -64,9 +64,9 @@ class PaddedSum(NamedTuple):
     the sums are ascending and distinct.
     """
 
-    gather: Slot
-    overflow_sum: Slot
-    overflow_source: Slot
+    gather: IndexSlot
+    overflow_sum: IndexSlot
+    overflow_source: IndexSlot
     rounds: tuple[int, ...]
 
     @classmethod
@@ -81,14 +81,19 @@ class PaddedSum(NamedTuple):
         rank = np.arange(target.size) - np.repeat(np.cumsum(counts) - counts, counts)
         # Number of contributions beyond each width; the width with the shortest predicted time is chosen.
         num_beyond_width = target.size - np.concatenate([[0], np.cumsum(np.bincount(rank, minlength=1))])
-        width = int(np.argmin(np.arange(num_beyond_width.size) * num_sums + _SCATTER_COST * num_beyond_width))
+        width = int(np.argmin(np.arange(num_beyond_width.size) * num_sums + _RELATIVE_SCATTER_COST * num_beyond_width))
         gather = np.full((width, num_sums), num_sources, dtype=np.int32)
         is_gathered = rank < width
         gather[rank[is_gathered], target[is_gathered]] = source[is_gathered]
-        rounds = np.argsort(rank, kind="stable")
-        rounds = rounds[~is_gathered[rounds]]
-        round_ends = np.cumsum(np.bincount(rank[rounds] - width))
-        return cls(store.add(gather), store.add(target[rounds]), store.add(source[rounds]), tuple(round_ends.tolist()))
+        contribution_order = np.argsort(rank, kind="stable")
+        contribution_order = contribution_order[~is_gathered[contribution_order]]
+        ends_of_rounds = np.cumsum(np.bincount(rank[contribution_order] - width))
+        return cls(
+            store.add(gather),
+            store.add(target[contribution_order]),
+            store.add(source[contribution_order]),
+            tuple(ends_of_rounds.tolist()),
+        )
 
     def apply(
         self, indices: Int[Array, " total"], contributions: Inexact[Array, "sources *k"]
@@ -99,9 +104,9 @@ class PaddedSum(NamedTuple):
         if isinstance(contributions, np.ndarray):
             self.add_range(indices, contributions, total, 0, shape[0])
             return total
-        gathered = self.gather.read(indices)
-        for layer in range(len(gathered)):
-            total += gather_or_zero(contributions, gathered[layer])
+        gathered_values = self.gather.read(indices)
+        for layer in range(len(gathered_values)):
+            total += gather_or_zero(contributions, gathered_values[layer])
         if self.overflow_sum.shape[0]:
             overflow_values = gather(contributions, self.overflow_source.read(indices))
             total = add_into(total, self.overflow_sum.read(indices), overflow_values)
@@ -112,7 +117,7 @@ class PaddedSum(NamedTuple):
     ) -> None:
         """In NumPy, add the sums with indices from `start` up to, but not including, `stop` to `total` (sums, k) in
         place. The sums are processed in chunks, so that temporary arrays stay in the cache."""
-        chunk_size = max(1, _NUMPY_CHUNK // math.prod(contributions.shape[1:]))
+        chunk_size = max(1, _NUMPY_CHUNK_SIZE // math.prod(contributions.shape[1:]))
         gathered: Any = self.gather.read(indices)
         for first_sum in range(start, stop, chunk_size) if len(gathered) else ():
             chunk = slice(first_sum, min(first_sum + chunk_size, stop))
@@ -141,9 +146,9 @@ class PaddedSum(NamedTuple):
 
 
 # Cost of a scattered contribution relative to a gathered contribution, measured on two Zen 4 cores.
-_SCATTER_COST = 4.0
+_RELATIVE_SCATTER_COST = 4.0
 # Number of entries that NumPy gathers at a time.
-_NUMPY_CHUNK = 16384
+_NUMPY_CHUNK_SIZE = 16384
 
 
 class IndexLayout:

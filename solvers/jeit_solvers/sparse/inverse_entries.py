@@ -59,18 +59,18 @@ class Strips(Module):
         """Partition the unknowns into strips perpendicular to the longest extent of their `coordinates` (n, d).
         `selected` (n,): the unknowns between which the inverse is needed."""
         longest_axis, *other_axes = coordinates.T[np.argsort(-np.ptp(coordinates, axis=0))]
-        strip = _breadth_first_levels(pattern, longest_axis)
+        strip_of_row = _breadth_first_levels(pattern, longest_axis)
         # Sort the unknowns of a strip by their other coordinates, so that neighbours in space are neighbours in memory.
-        sort_order = np.lexsort((*other_axes[::-1], ~selected, strip))
-        counts = np.bincount(strip)
-        index_in_strip = np.empty(len(strip), int)
-        index_in_strip[sort_order] = np.arange(len(strip)) - np.repeat(np.cumsum(counts) - counts, counts)
+        sort_order = np.lexsort((*other_axes[::-1], ~selected, strip_of_row))
+        counts = np.bincount(strip_of_row)
+        index_in_strip = np.empty(len(strip_of_row), int)
+        index_in_strip[sort_order] = np.arange(len(strip_of_row)) - np.repeat(np.cumsum(counts) - counts, counts)
         strip_size = int(counts.max())
-        num_selected = int(np.bincount(strip[selected], minlength=1).max())
+        num_selected = int(np.bincount(strip_of_row[selected], minlength=1).max())
         num_selected = min(
             -(-max(num_selected, 1) // 8) * 8, strip_size
         )  # rounded to few sizes, because a program is compiled for each size
-        return cls((strip * strip_size + index_in_strip).astype(np.int32), len(counts), strip_size, num_selected)
+        return cls((strip_of_row * strip_size + index_in_strip).astype(np.int32), len(counts), strip_size, num_selected)
 
     @property
     def place(self) -> Int[np.ndarray, " n"]:
@@ -115,13 +115,13 @@ class NearInverse(Module):
     def blocks(self, places: Int[Array, "g k"]) -> Inexact[Array, "g k k"]:
         """Blocks (g, k, k) of the inverse G between the k places of each group."""
         _, selected, width = self.band.shape
-        added = self.left[places] @ jnp.swapaxes(self.right[places], 1, 2)
+        low_rank_blocks = self.left[places] @ jnp.swapaxes(self.right[places], 1, 2)
         if self.band.size >= 2**31:  # places are 32-bit integers, and their products would overflow
             places = places.astype(jnp.int64)
         row, column = places[:, :, None], places[:, None]
         row, column = jnp.minimum(row, column), jnp.maximum(row, column)
         entry_index = row * width + column - row // selected * selected
-        return self.band.reshape(-1).at[entry_index].get(mode="promise_in_bounds") + added
+        return self.band.reshape(-1).at[entry_index].get(mode="promise_in_bounds") + low_rank_blocks
 
     def add(self, left: Inexact[Array, "p r"], right: Inexact[Array, "p r"]) -> "NearInverse":
         """Return the sum G + left rightᵀ, which must be symmetric. The rows of `left` and `right` are in the order of
@@ -149,16 +149,16 @@ def near_inverse(strips: Strips, operator: SparseSymmetric, max_distance: int) -
     ```
     """
     strip_size, num_selected = strips.strip_size, strips.selected_per_strip
-    blocks, couplings = _strip_blocks(strips, operator)
+    blocks, coupling_blocks = _strip_blocks(strips, operator)
 
-    def eliminate(schur_update, strip):
-        block, coupling = strip
+    def eliminate(schur_update, strip_index):
+        block, coupling = strip_index
         pivot = symmetric_inverse(block - schur_update)
         weights = pivot @ coupling
         return coupling.T @ weights, (pivot, weights)
 
-    def substitute_strip(following_blocks, strip):
-        pivot, weights = strip
+    def substitute_strip(following_blocks, strip_index):
+        pivot, weights = strip_index
         later_blocks = -weights @ following_blocks
         diagonal_block = pivot - later_blocks[:, :strip_size] @ weights.T
         diagonal_block = (diagonal_block + diagonal_block.T) / 2
@@ -172,7 +172,7 @@ def near_inverse(strips: Strips, operator: SparseSymmetric, max_distance: int) -
         return following_blocks, selected_blocks
 
     zero_block = jnp.zeros((strip_size, strip_size), operator.values.dtype)
-    _, eliminated = jax.lax.scan(eliminate, zero_block, (blocks, couplings))
+    _, eliminated = jax.lax.scan(eliminate, zero_block, (blocks, coupling_blocks))
     zero_block = jnp.zeros((strip_size, strip_size + (max_distance - 1) * num_selected), operator.values.dtype)
     _, upper_blocks = jax.lax.scan(substitute_strip, zero_block, eliminated, reverse=True)
     empty_factors = jnp.zeros((strips.num_strips * num_selected, 0), upper_blocks.dtype)
@@ -191,16 +191,16 @@ def _strip_blocks(strips: Strips, operator: SparseSymmetric):
         smaller_indices % strips.strip_size,
         larger_indices % strips.strip_size,
     )
-    own_strip = jnp.where(larger_indices // strips.strip_size == strip, strip, strips.num_strips)
+    strip_of_diagonal_entry = jnp.where(larger_indices // strips.strip_size == strip, strip, strips.num_strips)
     coupling_strip = jnp.where(larger_indices // strips.strip_size == strip, strips.num_strips, strip)
-    is_filler = jnp.ones(strips.num_strips * strips.strip_size).at[position].set(0).reshape(shape[:2])
-    blocks = jnp.eye(strips.strip_size, dtype=operator.values.dtype) * is_filler[:, None]
-    blocks = blocks.at[own_strip, row, column].set(operator.values, mode="drop")
-    blocks = blocks.at[own_strip, column, row].set(operator.values, mode="drop")
-    couplings = (
+    is_padding = jnp.ones(strips.num_strips * strips.strip_size).at[position].set(0).reshape(shape[:2])
+    blocks = jnp.eye(strips.strip_size, dtype=operator.values.dtype) * is_padding[:, None]
+    blocks = blocks.at[strip_of_diagonal_entry, row, column].set(operator.values, mode="drop")
+    blocks = blocks.at[strip_of_diagonal_entry, column, row].set(operator.values, mode="drop")
+    coupling_blocks = (
         jnp.zeros(shape, operator.values.dtype).at[coupling_strip, row, column].set(operator.values, mode="drop")
     )
-    return blocks, couplings
+    return blocks, coupling_blocks
 
 
 def _breadth_first_levels(pattern: SparsityPattern, coordinate: np.ndarray) -> Int[np.ndarray, " n"]:
@@ -210,13 +210,13 @@ def _breadth_first_levels(pattern: SparsityPattern, coordinate: np.ndarray) -> I
     graph = csr_array((np.ones(len(rows), np.float32), (rows, columns)), shape=(pattern.size, pattern.size))
     graph = graph + graph.T
     level, level_number = np.full(pattern.size, -1), 0
-    frontier = np.zeros(pattern.size, bool)
-    while (is_unseen := level < 0).any():
-        if not frontier.any():
-            first_node = np.flatnonzero(is_unseen)[coordinate[is_unseen].argmin()]
+    is_in_frontier = np.zeros(pattern.size, bool)
+    while (is_unvisited := level < 0).any():
+        if not is_in_frontier.any():
+            first_node = np.flatnonzero(is_unvisited)[coordinate[is_unvisited].argmin()]
             neighbours = graph.indices[graph.indptr[first_node] : graph.indptr[first_node + 1]]
-            frontier = is_unseen & (coordinate <= (coordinate[first_node] + coordinate[neighbours].max()) / 2)
-        level[frontier] = level_number
+            is_in_frontier = is_unvisited & (coordinate <= (coordinate[first_node] + coordinate[neighbours].max()) / 2)
+        level[is_in_frontier] = level_number
         level_number += 1
-        frontier = (graph @ frontier.astype(np.float32) > 0) & (level < 0)
+        is_in_frontier = (graph @ is_in_frontier.astype(np.float32) > 0) & (level < 0)
     return level

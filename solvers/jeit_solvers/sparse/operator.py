@@ -210,9 +210,12 @@ class LastMatrixCache:
     def __init__(self) -> None:
         self._last_result: tuple[bytes, Any] | None = None
 
-    def get_or_compute(self, key: bytes, values: np.ndarray, compute: Callable[[], Any], *, keep: bool = True) -> Any:
+    def get_or_compute(
+        self, key: bytes, values: np.ndarray, compute: Callable[[], Any], *, keeps_result: bool = True
+    ) -> Any:
         """Return the result of `compute` for the matrix with the given values (nnz,), from the cache if the last call
-        was for the same matrix. `key` distinguishes sparsity patterns; with `keep` False the result is not cached."""
+        was for the same matrix. `key` distinguishes sparsity patterns; with `keeps_result` False the result is not
+        cached."""
         digest = hashlib.blake2b(np.ascontiguousarray(values).tobytes(), digest_size=16).digest()
         key += values.dtype.str.encode() + digest
         cached = self._last_result  # another thread may replace it meanwhile
@@ -220,5 +223,5 @@ class LastMatrixCache:
             return cached[1]
         self._last_result = cached = None  # frees the memory for the next result
         result = compute()
-        self._last_result = (key, result) if keep else None
+        self._last_result = (key, result) if keeps_result else None
         return result

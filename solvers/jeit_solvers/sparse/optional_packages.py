@@ -40,7 +40,7 @@ _MIDDLE, _HALF = (1 + 1 / 8) / 2, (1 - 1 / 8) / 2
 _WEIGHTS = tuple(1 / (_MIDDLE + sign * _HALF * np.sqrt(0.5)) for sign in (1, -1))
 
 
-class Level(NamedTuple):
+class MultigridLevel(NamedTuple):
     """A level of a multigrid hierarchy, in single precision. **Fields**: `matrix`: (n, n); `scale`: (n, 1), reciprocals
     of the sums of absolute values of the matrix's rows; `prolongation`, `restriction`: matrices (n, c) from the next
     coarser level and (c, n) to it, None on the coarsest level; `inverse`: (n, n) inverse of the matrix on the coarsest
@@ -53,13 +53,13 @@ class Level(NamedTuple):
     inverse: np.ndarray | None = None
 
 
-class Hierarchy(NamedTuple):
+class MultigridHierarchy(NamedTuple):
     """A matrix and the multigrid levels of its preconditioner. **Fields**: `matrix`: (n, n); `levels`: levels of the
     matrix's real part, from the finest to the coarsest; None if the diagonal is not positive or values are not
     finite."""
 
     matrix: csr_array
-    levels: list[Level] | None
+    levels: list[MultigridLevel] | None
 
 
 class Multigrid(NumpySolver):
@@ -134,11 +134,11 @@ def multigrid_is_installed() -> bool:
     return find_spec("pyamg") is not None
 
 
-def hierarchy(matrix: csr_array) -> Hierarchy:
+def hierarchy(matrix: csr_array) -> MultigridHierarchy:
     """Build the multigrid levels for a symmetric matrix (n, n) with positive definite real part."""
     diagonal = matrix.diagonal()
     if not (np.isfinite(matrix.data).all() and (diagonal.real > 0).all()):
-        return Hierarchy(matrix, None)
+        return MultigridHierarchy(matrix, None)
     pyamg_solver = importlib.import_module("pyamg").smoothed_aggregation_solver(
         matrix.real.tocsr(),
         symmetry="symmetric",
@@ -148,22 +148,24 @@ def hierarchy(matrix: csr_array) -> Hierarchy:
         postsmoother=None,
         max_coarse=_MAX_COARSEST_SIZE,
     )
-    return Hierarchy(matrix, [_build_level(level) for level in pyamg_solver.levels])
+    return MultigridHierarchy(matrix, [_build_level(level) for level in pyamg_solver.levels])
 
 
-def _build_level(pyamg_level: Any) -> Level:
+def _build_level(pyamg_level: Any) -> MultigridLevel:
     matrix = csr_array(pyamg_level.A)
     row_sums = abs(matrix).sum(axis=1).reshape(-1, 1)
     scale = (1 / np.where(row_sums > 0, row_sums, 1)).astype(
         np.float32
     )  # for rows of zeros, which PyAMG creates for isolated nodes
     if not hasattr(pyamg_level, "P"):
-        return Level(matrix, scale, inverse=np.linalg.pinv(matrix.toarray(), hermitian=True).astype(np.float32))
+        return MultigridLevel(
+            matrix, scale, inverse=np.linalg.pinv(matrix.toarray(), hermitian=True).astype(np.float32)
+        )
     prolongation = csr_array(pyamg_level.P).astype(np.float32)
-    return Level(matrix.astype(np.float32), scale, prolongation, csr_array(prolongation.T))
+    return MultigridLevel(matrix.astype(np.float32), scale, prolongation, csr_array(prolongation.T))
 
 
-def _v_cycle(levels: list[Level], right_hand_side: np.ndarray) -> np.ndarray:
+def _v_cycle(levels: list[MultigridLevel], right_hand_side: np.ndarray) -> np.ndarray:
     """Apply one multigrid V-cycle, started at zero, to right-hand sides (n, k)."""
     level, *coarser = levels
     if level.inverse is not None:
@@ -179,7 +181,7 @@ def _v_cycle(levels: list[Level], right_hand_side: np.ndarray) -> np.ndarray:
     return solution
 
 
-def _relax(level: Level, solution: np.ndarray, right_hand_side: np.ndarray, weight: float) -> None:
+def _relax(level: MultigridLevel, solution: np.ndarray, right_hand_side: np.ndarray, weight: float) -> None:
     """Smooth a solution (n, k): add the residual, scaled by `weight` and the inverse row sums of the matrix."""
     change = level.matrix @ solution
     np.subtract(right_hand_side, change, out=change)
@@ -187,26 +189,30 @@ def _relax(level: Level, solution: np.ndarray, right_hand_side: np.ndarray, weig
     solution += change
 
 
-def _precondition(levels: list[Level], residual: np.ndarray, norms: np.ndarray) -> np.ndarray:
-    """Apply a multigrid V-cycle to residuals (n, k). The residuals are first divided by their `norms` (k,), because
-    single precision has a limited range."""
-    scale = np.where(norms > 0, norms, 1) / np.sqrt(len(residual))
+def _precondition(levels: list[MultigridLevel], residual: np.ndarray, column_norms: np.ndarray) -> np.ndarray:
+    """Apply a multigrid V-cycle to residuals (n, k). The residuals are first divided by their `column_norms` (k,),
+    because single precision has a limited range."""
+    scale = np.where(column_norms > 0, column_norms, 1) / np.sqrt(len(residual))
     single_precision = np.complex64 if np.iscomplexobj(residual) else np.float32
     scaled = np.multiply(residual, 1 / scale, out=np.empty(residual.shape, single_precision), casting="unsafe")
     return _v_cycle(levels, scaled.view(np.float32)).view(single_precision) * scale
 
 
 def _conjugate_gradients(
-    hierarchy: Hierarchy, right_hand_side: np.ndarray, tolerance: float, max_steps: int
+    hierarchy: MultigridHierarchy, right_hand_side: np.ndarray, tolerance: float, max_steps: int
 ) -> np.ndarray:
     """Solve for right-hand sides (n, k) by preconditioned conjugate gradients. Solutions that do not converge are
     NaN."""
     assert hierarchy.levels is not None
-    solution, residual, norm = np.zeros_like(right_hand_side), right_hand_side.copy(), _column_norms(right_hand_side)
-    preconditioned = _precondition(hierarchy.levels, residual, norm)
+    solution, residual, column_norms = (
+        np.zeros_like(right_hand_side),
+        right_hand_side.copy(),
+        _column_norms(right_hand_side),
+    )
+    preconditioned = _precondition(hierarchy.levels, residual, column_norms)
     direction, weight = preconditioned.copy(), _column_products(residual, preconditioned)
-    max_norm, max_error = tolerance * norm, tolerance * _column_norms(preconditioned)
-    is_converged = norm == 0
+    max_norm, max_error = tolerance * column_norms, tolerance * _column_norms(preconditioned)
+    is_converged = column_norms == 0
     for _ in range(max_steps):
         product = hierarchy.matrix @ direction
         curvature = _column_products(direction, product)
@@ -216,10 +222,10 @@ def _conjugate_gradients(
         product *= length
         residual -= product
         solution += np.multiply(direction, length, out=product)
-        norm = _column_norms(residual)
-        preconditioned = _precondition(hierarchy.levels, residual, norm)
+        column_norms = _column_norms(residual)
+        preconditioned = _precondition(hierarchy.levels, residual, column_norms)
         last_weight, weight = weight, _column_products(residual, preconditioned)
-        is_converged |= (norm <= max_norm) & (_column_norms(preconditioned) <= max_error)
+        is_converged |= (column_norms <= max_norm) & (_column_norms(preconditioned) <= max_error)
         if is_converged.all() or not np.isfinite(weight).all():
             break
         direction *= np.divide(weight, last_weight, out=np.zeros_like(weight), where=~is_converged)
@@ -241,7 +247,7 @@ _LAST_HIERARCHY = LastMatrixCache()
 
 
 # oneMKL's numbers of matrix types: real symmetric positive definite, and real symmetric indefinite.
-_DEFINITE, _INDEFINITE = 2, -2
+_DEFINITE_MATRIX_TYPE, _INDEFINITE_MATRIX_TYPE = 2, -2
 
 
 class Pardiso(NumpySolver):
@@ -291,7 +297,9 @@ class _PardisoFactor:
         upper_triangle.sort_indices()
         package = importlib.import_module("pypardiso")
         self.upper_triangle = upper_triangle
-        self.solver = package.PyPardisoSolver(mtype=_INDEFINITE if self.is_complex else _DEFINITE)
+        self.solver = package.PyPardisoSolver(
+            mtype=_INDEFINITE_MATRIX_TYPE if self.is_complex else _DEFINITE_MATRIX_TYPE
+        )
         self.failure: type[Exception] = package.pardiso_wrapper.PyPardisoError
         self.lock = Lock()  # a solver serves one thread at a time
         weakref.finalize(self, self.solver.free_memory, everything=True)

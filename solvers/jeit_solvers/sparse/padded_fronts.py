@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 
 from jeit_solvers.module import Module
 from jeit_solvers.sparse.dissection import nested_dissection
-from jeit_solvers.sparse.index_store import IndexLayout, IndexStore, PaddedSum, Slot
+from jeit_solvers.sparse.index_store import IndexLayout, IndexSlot, IndexStore, PaddedSum
 from jeit_solvers.sparse.pattern import SparsityPattern
 
 # Size of the fronts at the leaves of the elimination tree: large enough for efficient matrix products, and small enough
@@ -30,7 +30,7 @@ _LEAF_SIZE = 24
 # fast for one matrix, and faster only for batches.
 _MAX_SINGLE_FRONT = 64
 # Number of floating-point operations that take as long as the overhead of launching a stage.
-_OPERATIONS_WORTH_A_STAGE = 1e6
+_OPERATIONS_PER_STAGE_LAUNCH = 1e6
 
 
 class EliminationTree:
@@ -96,18 +96,18 @@ class EliminationTree:
         """Find the border of each front: the later rows of the front's entries, and the borders of its children without
         its own pivots."""
         first_fronts, second_fronts = self.front[self.earlier_rows], self.front[self.later_rows]
-        pending = np.unique(
+        pending_entries = np.unique(
             first_fronts[first_fronts != second_fronts] * self.size + self.later_rows[first_fronts != second_fronts]
         )
         self.borders = []
         for stage in range(self.num_stages):
-            is_in_stage = self.stage[pending // self.size] == stage
-            border = pending[is_in_stage]
+            is_border_of_stage = self.stage[pending_entries // self.size] == stage
+            border = pending_entries[is_border_of_stage]
             self.borders.append(border)
             child, row = np.divmod(border, self.size)
             parent_front = self.parent[child]
-            inherited = (parent_front * self.size + row)[self.front[row] != parent_front]
-            pending = np.unique(np.concatenate([pending[~is_in_stage], inherited]))
+            inherited_entries = (parent_front * self.size + row)[self.front[row] != parent_front]
+            pending_entries = np.unique(np.concatenate([pending_entries[~is_border_of_stage], inherited_entries]))
 
     def position(self, fronts: np.ndarray, rows: np.ndarray, stage: int) -> np.ndarray:
         """Local indices of matrix rows within fronts of one stage, in which the pivots come first and then the
@@ -137,7 +137,10 @@ def _merged_levels(largest_separators: np.ndarray) -> list[int]:
             batch, next_separator = 2 ** (level - 1), int(largest_separators[level - 1])
             border = 3 * next_separator
             separate_operations = operations(2 * batch, pivots, border) + operations(batch, next_separator, border)
-            if operations(batch, 2 * pivots + next_separator, border) - separate_operations > _OPERATIONS_WORTH_A_STAGE:
+            if (
+                operations(batch, 2 * pivots + next_separator, border) - separate_operations
+                > _OPERATIONS_PER_STAGE_LAUNCH
+            ):
                 break
             height, pivots, level = height + 1, 2 * pivots + next_separator, level - 1
         heights.append(height)
@@ -158,7 +161,7 @@ def graph_of(rows: np.ndarray, columns: np.ndarray, size: int) -> csr_array:
     return csr_array((np.ones(2 * rows.size, dtype=np.int8), coordinates), shape=(size, size))
 
 
-class Link(NamedTuple):
+class StageLink(NamedTuple):
     """Transfer of contributions from the fronts of an earlier stage, `source`, to the fronts of a later stage.
     **Fields**: `panel`, `corner`: sums of the entries of the flattened Schur complements of `source`; `rows`: sums of
     the flattened right-hand-side updates of `source`."""
@@ -182,10 +185,10 @@ class Stage(NamedTuple):
     pivots: int
     border: int
     entries: PaddedSum
-    links: tuple[Link, ...]
-    right_hand_side: Slot
+    links: tuple[StageLink, ...]
+    right_hand_side: IndexSlot
     parent: int
-    above: Slot
+    above: IndexSlot
 
 
 class FactorisationPlan(Module):
@@ -214,7 +217,7 @@ class FactorisationPlan(Module):
         return self.layout.content[0]
 
     @property
-    def solution(self) -> Slot:
+    def solution(self) -> IndexSlot:
         """Index of each matrix row among the pivots of all stages, concatenated in the order of the stages."""
         return self.layout.content[1]
 
@@ -315,12 +318,12 @@ def _build_stage(store: IndexStore, pattern: SparsityPattern, tree: EliminationT
     child, row = np.divmod(tree.borders[stage], tree.size)
     parent_front = tree.parent[child]
     parent = int(tree.stage[parent_front[0]]) if child.size else -1
-    above = np.zeros((batch, border), dtype=np.int64)
+    border_rows = np.zeros((batch, border), dtype=np.int64)
     if child.size:
         parent_height = tree.pivots[parent] + tree.border[parent]
-        above[:] = tree.batch[parent] * parent_height
+        border_rows[:] = tree.batch[parent] * parent_height
         position = tree.slot[parent_front] * parent_height + tree.position(parent_front, row, parent)
-        above[tree.slot[child], rank_within(child)] = position
+        border_rows[tree.slot[child], rank_within(child)] = position
 
     sources = np.unique(tree.stage[(tree.parent >= 0) & (tree.stage[tree.parent] == stage)])
     return Stage(
@@ -331,7 +334,7 @@ def _build_stage(store: IndexStore, pattern: SparsityPattern, tree: EliminationT
         tuple(_plan_link(store, tree, int(source), stage) for source in sources if tree.border[source]),
         store.add(right_hand_side),
         parent,
-        store.add(above),
+        store.add(border_rows),
     )
 
 
@@ -342,9 +345,9 @@ def _plan_matrix_entries(
     pivots."""
     batch, pivots = int(tree.batch[stage]), tree.pivots[stage]
     entries = np.flatnonzero(tree.stage[tree.front[tree.earlier_rows]] == stage)
-    early, late = tree.earlier_rows[entries], tree.later_rows[entries]
-    front = tree.front[early]
-    column, row = tree.place[early], tree.position(front, late, stage)
+    earlier_rows, later_rows = tree.earlier_rows[entries], tree.later_rows[entries]
+    front = tree.front[earlier_rows]
+    column, row = tree.place[earlier_rows], tree.position(front, later_rows, stage)
     # Pivot blocks of the fronts are filled on both sides of the diagonal.
     is_mirrored = (row < pivots) & (row != column)
     first_positions = tree.slot[front] * height
@@ -358,7 +361,7 @@ def _plan_matrix_entries(
     )
 
 
-def _plan_link(store: IndexStore, tree: EliminationTree, source: int, stage: int) -> Link:
+def _plan_link(store: IndexStore, tree: EliminationTree, source: int, stage: int) -> StageLink:
     batch, pivots, border = int(tree.batch[stage]), tree.pivots[stage], tree.border[stage]
     height, count, width = pivots + border, int(tree.batch[source]), tree.border[source]
     child, row = np.divmod(tree.borders[source], tree.size)
@@ -372,15 +375,15 @@ def _plan_link(store: IndexStore, tree: EliminationTree, source: int, stage: int
     first, second, base = np.broadcast_arrays(
         parent_rows[:, :, None], parent_rows[:, None, :], parent_slot[:, None, None]
     )
-    valid = (first >= 0) & (second >= 0)
-    panel, corner = valid & (second < pivots), valid & (first >= pivots) & (second >= pivots)
-    panel_targets = ((base * height + first) * pivots + second)[panel]
+    is_valid = (first >= 0) & (second >= 0)
+    panel, corner = is_valid & (second < pivots), is_valid & (first >= pivots) & (second >= pivots)
+    panel_target_indices = ((base * height + first) * pivots + second)[panel]
     corner_targets = ((base * border + first - pivots) * border + second - pivots)[corner]
     row_targets = parent_slot[:, None] * height + parent_rows
     is_used = parent_rows >= 0
-    return Link(
+    return StageLink(
         source,
-        PaddedSum.create(store, panel_targets, flat_indices[panel], batch * height * pivots, flat_indices.size),
+        PaddedSum.create(store, panel_target_indices, flat_indices[panel], batch * height * pivots, flat_indices.size),
         PaddedSum.create(store, corner_targets, flat_indices[corner], batch * border * border, flat_indices.size),
         PaddedSum.create(store, row_targets[is_used], np.flatnonzero(is_used), batch * height, count * width),
     )

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Inexact, Int
 
 from jeit_solvers.cores import on_cores, parts_for_cores
 from jeit_solvers.dense import inverse_cholesky
-from jeit_solvers.engines import differentiable_batches, gather_or_zero, has_values, in_turn, namespace, one_by_one
+from jeit_solvers.engines import differentiable_batches, gather_or_zero, has_values, in_turn, map_one_by_one, namespace
 from jeit_solvers.module import Module
 from jeit_solvers.sparse.index_store import IndexLayout
 from jeit_solvers.sparse.padded_fronts import FactorisationPlan, Stage
@@ -26,7 +26,7 @@ from jeit_solvers.sparse.padded_fronts import FactorisationPlan, Stage
 # Minimum number of entries in the fronts of a stage for which threads are used.
 _MIN_PARALLEL_ENTRIES = 200_000
 # Number of entries in the fronts that are updated together.
-_UPDATED_ENTRIES = 100_000
+_NUM_ENTRIES_UPDATED_AT_ONCE = 100_000
 
 
 class Factor(Module):
@@ -93,18 +93,18 @@ def factorise(plan: FactorisationPlan, values: Inexact[Array, " nnz"]) -> Factor
         )
     if isinstance(values, np.ndarray):
         return _factorise_in_numpy(plan.layout, plan.indices, values)
-    numeric = in_turn(partial(_factorise, plan.layout))
-    return numeric(plan.indices, values)
+    compute_factor = in_turn(partial(_factorise, plan.layout))
+    return compute_factor(plan.indices, values)
 
 
 def _factorise_stages(layout: IndexLayout, indices: Int[Array, " total"], values: Inexact[Array, " nnz"]) -> Factor:
     stages, _ = layout.content
     dtype = values.dtype
-    extended = jnp.concatenate([values, jnp.ones(1, dtype)])
+    extended_values = jnp.concatenate([values, jnp.ones(1, dtype)])
     inverses, lowers, schur_complements = [], [], []
     for stage in stages:
         pivots, border = stage.pivots, stage.border
-        panel = stage.entries.apply(indices, extended)
+        panel = stage.entries.apply(indices, extended_values)
         corner = jnp.zeros(stage.batch * border * border, dtype)
         for link in stage.links:
             schur = schur_complements[link.source].reshape(-1)
@@ -131,7 +131,7 @@ def _factorise_in_numpy(
     """Factorise as `_factorise_stages`, but in NumPy and in place, with the fronts of a stage distributed over the
     cores."""
     stages, _ = layout.content
-    extended = np.concatenate([values, np.ones(1, values.dtype)])
+    extended_values = np.concatenate([values, np.ones(1, values.dtype)])
     inverses, lowers, schur_complements = [], [], []
     for stage in stages:
         batch, pivots, border = stage.batch, stage.pivots, stage.border
@@ -139,7 +139,7 @@ def _factorise_in_numpy(
         corner = np.zeros((batch, border, border), values.dtype)
         inverse, lower_blocks = np.empty_like(panel, shape=(batch, pivots, pivots)), np.empty_like(panel[:, pivots:])
         eliminate_slice = partial(
-            _eliminate_fronts, stage, indices, extended, schur_complements, panel, corner, inverse, lower_blocks
+            _eliminate_fronts, stage, indices, extended_values, schur_complements, panel, corner, inverse, lower_blocks
         )
         is_large = batch * (pivots + border) ** 2 > _MIN_PARALLEL_ENTRIES
         on_cores(eliminate_slice, parts_for_cores(batch) if is_large else [slice(0, batch)])
@@ -150,7 +150,7 @@ def _factorise_in_numpy(
 
 
 def _eliminate_fronts(
-    stage: Stage, indices, extended, schur_complements, panel, corner, inverse, lower_blocks, front_slice: slice
+    stage: Stage, indices, extended_values, schur_complements, panel, corner, inverse, lower_blocks, front_slice: slice
 ) -> None:
     """Assemble and eliminate the fronts `front_slice` of a stage, in place. `schur_complements`: Schur complements of
     all earlier stages."""
@@ -161,14 +161,14 @@ def _eliminate_fronts(
             indices, contributions, target.reshape(-1), front_slice.start * size, front_slice.stop * size
         )
 
-    add_contributions(stage.entries, extended, panel)
+    add_contributions(stage.entries, extended_values, panel)
     for link in stage.links:
         schur = schur_complements[link.source].reshape(-1)
         add_contributions(link.panel, schur, panel)
         add_contributions(link.corner, schur, corner)
     inverse[front_slice] = inverse_cholesky(panel[front_slice, : stage.pivots])
     np.matmul(panel[front_slice, stage.pivots :], _transposed(inverse[front_slice]), out=lower_blocks[front_slice])
-    num_fronts_at_once = max(1, _UPDATED_ENTRIES // max(stage.border**2, 1))
+    num_fronts_at_once = max(1, _NUM_ENTRIES_UPDATED_AT_ONCE // max(stage.border**2, 1))
     for first_front in range(front_slice.start, front_slice.stop, num_fronts_at_once):
         update_slice = slice(first_front, min(first_front + num_fronts_at_once, front_slice.stop))
         corner[update_slice] -= lower_blocks[update_slice] @ _transposed(lower_blocks[update_slice])
@@ -194,8 +194,8 @@ def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Arr
     vectors = _check_columns(plan, right_hand_sides, "solve")
     if isinstance(vectors, np.ndarray):
         return _solve_stages(plan.layout, plan.indices, factor, vectors).reshape(right_hand_sides.shape)
-    numeric = differentiable_batches(partial(_solve, plan.layout), _solve_batch)
-    return numeric(plan.indices, factor, vectors).reshape(right_hand_sides.shape)
+    compute_solution = differentiable_batches(partial(_solve, plan.layout), _solve_batch)
+    return compute_solution(plan.indices, factor, vectors).reshape(right_hand_sides.shape)
 
 
 def _solve_stages(
@@ -213,7 +213,7 @@ def _solve_batch(batchable, unbatched, axis_size, batched, indices, factor, vect
     """Batching rule of `solve`: a batch of right-hand sides for one factor is solved as additional columns, and a batch
     of factors one by one."""
     if any(jax.tree.leaves(batched[:2])):
-        return one_by_one(batchable, unbatched, axis_size, batched, indices, factor, vectors)
+        return map_one_by_one(batchable, unbatched, axis_size, batched, indices, factor, vectors)
     size, count = vectors.shape[1:]
     columns = jnp.moveaxis(vectors, 0, 1).reshape(size, axis_size * count)
     return jnp.moveaxis(batchable(indices, factor, columns).reshape(size, axis_size, count), 1, 0)
@@ -351,11 +351,13 @@ def _border_block(above: Inexact[Array, "parents height height"], rows: Int[Arra
     """Entries of the inverse between the border rows of child fronts, read from the parents' fronts; zero for
     padding."""
     height = above.shape[-1]
-    slot, local_index = rows // height, rows % height
+    front_slot, local_index = rows // height, rows % height
     # Padding gets the index after the last entry.
-    flat_indices = (slot[:, :, None] * height + local_index[:, :, None]) * height + local_index[:, None, :]
-    is_row = rows < above.shape[0] * height
-    flat_indices = namespace(above).where(is_row[:, :, None] & is_row[:, None, :], flat_indices, above.size)
+    flat_indices = (front_slot[:, :, None] * height + local_index[:, :, None]) * height + local_index[:, None, :]
+    is_border_row = rows < above.shape[0] * height
+    flat_indices = namespace(above).where(
+        is_border_row[:, :, None] & is_border_row[:, None, :], flat_indices, above.size
+    )
     return gather_or_zero(above.reshape(-1), flat_indices)
 
 

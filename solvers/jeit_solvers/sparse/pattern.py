@@ -14,7 +14,7 @@ from scipy.sparse import coo_array, csr_array, issparse
 
 from jeit_solvers.engines import namespace
 from jeit_solvers.module import Module
-from jeit_solvers.sparse.index_store import IndexLayout, IndexStore, PaddedSum, Slot
+from jeit_solvers.sparse.index_store import IndexLayout, IndexSlot, IndexStore, PaddedSum
 
 
 class SparsityPattern(Module):
@@ -63,7 +63,7 @@ class SparsityPattern(Module):
         return len(self._assembly)
 
     @property
-    def _slots(self) -> Slot:
+    def _slots(self) -> IndexSlot:
         return self.layout.content[0]
 
     @property
@@ -139,19 +139,19 @@ class SparsityPattern(Module):
             matrix = np.asarray(matrix)
         if len(matrix.shape) != 2 or matrix.shape[0] != matrix.shape[1]:
             raise ValueError(f"from_matrix: `matrix` must be square; got shape {matrix.shape}.")
-        full = csr_array(matrix)
-        full.sum_duplicates()
-        if not np.isfinite(full.data).all():
+        full_matrix = csr_array(matrix)
+        full_matrix.sum_duplicates()
+        if not np.isfinite(full_matrix.data).all():
             raise ValueError("from_matrix: `matrix` has entries that are NaN or infinite; remove them first.")
-        skew = abs(full - full.T)
-        max_magnitude = abs(full).max() if full.nnz else 0.0
-        if skew.nnz and skew.max() > 1e-12 * max_magnitude:
+        asymmetry = abs(full_matrix - full_matrix.T)
+        max_magnitude = abs(full_matrix).max() if full_matrix.nnz else 0.0
+        if asymmetry.nnz and asymmetry.max() > 1e-12 * max_magnitude:
             raise ValueError(
-                f"from_matrix: `matrix` is not symmetric: |A - A^T| is up to {skew.max():.3g}, "
+                f"from_matrix: `matrix` is not symmetric: |A - A^T| is up to {asymmetry.max():.3g}, "
                 f"and its largest entry is {max_magnitude:.3g}. Give both triangles, or (matrix + matrix.T) / 2 if the "
                 "difference is noise."
             )
-        entries = coo_array(full)
+        entries = coo_array(full_matrix)
         rows, columns = entries.coords
         is_lower = rows >= columns
         pattern = cls.from_entries(rows[is_lower], columns[is_lower], matrix.shape[0])
@@ -163,9 +163,9 @@ class SparsityPattern(Module):
         contribution."""
         keys = []
         for rows, columns in zip(row_lists, column_lists, strict=True):
-            above, below = np.maximum(rows, columns), np.minimum(rows, columns)
+            larger_indices, below = np.maximum(rows, columns), np.minimum(rows, columns)
             # Entries on the diagonal get negative keys, so that these entries come first, in the order of rows.
-            keys.append(np.where(above == below, above - size, above * size + below))
+            keys.append(np.where(larger_indices == below, larger_indices - size, larger_indices * size + below))
         unique, entry_of_value = np.unique(np.concatenate(keys), return_inverse=True)
         has_diagonal_entry = np.zeros(size, dtype=bool)
         has_diagonal_entry[unique[unique < 0] + size] = True
@@ -179,12 +179,12 @@ class SparsityPattern(Module):
         below = unique[size:]
         rows = np.concatenate([np.arange(size), below // size])
         columns = np.concatenate([np.arange(size), below % size])
-        group_ends = np.cumsum([key.size for key in keys])
+        ends_of_groups = np.cumsum([key.size for key in keys])
         store = IndexStore()
         entries = store.add(np.stack([rows, columns]))
         maps = tuple(
             AssemblyMap.create(store, entries_of_group, size, unique.size, shape)
-            for entries_of_group, shape in zip(np.split(entry_of_value, group_ends[:-1]), shapes, strict=True)
+            for entries_of_group, shape in zip(np.split(entry_of_value, ends_of_groups[:-1]), shapes, strict=True)
         )
         return cls(store.pack(), IndexLayout(entries, maps), size)
 
@@ -223,11 +223,11 @@ class SparsityPattern(Module):
     def multiply(self, values: Inexact[Array, " nnz"], vectors: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
         """The product A x for one vector (n,) or several (n, k)."""
         expand = (...,) + (None,) * (vectors.ndim - 1)
-        below = values[self.size :][expand]
+        lower_values = values[self.size :][expand]
         rows, columns = self.rows[self.size :], self.columns[self.size :]
         result = values[: self.size][expand] * vectors
-        result = result.at[rows].add(below * vectors[columns])
-        return result.at[columns].add(below * vectors[rows])
+        result = result.at[rows].add(lower_values * vectors[columns])
+        return result.at[columns].add(lower_values * vectors[rows])
 
     def to_dense(self, values: Inexact[Array, " nnz"]) -> Inexact[Array, "n n"]:
         """The matrix as a dense array (n, n)."""
@@ -242,8 +242,8 @@ class SparsityPattern(Module):
         row_ends = np.searchsorted(np.asarray(self.rows)[below], np.arange(self.size + 1))  # rows are in order
         columns = np.asarray(self.columns)[below]
         below_diagonal = csr_array((values[below], columns, row_ends), shape=(self.size, self.size))
-        half_product = vectors.T @ (below_diagonal @ vectors + values[: self.size, None] / 2 * vectors)
-        return half_product + half_product.T
+        product_with_lower_triangle = vectors.T @ (below_diagonal @ vectors + values[: self.size, None] / 2 * vectors)
+        return product_with_lower_triangle + product_with_lower_triangle.T
 
     def to_scipy(self, values: Any) -> csr_array:
         """The matrix as a SciPy sparse array (n, n), both triangles."""

@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from jeit.touch.learnt.channels import _DIAGONALS, Channels, _leave_one_out_errors, _variances, choose_channels
+from jeit.touch.learnt.channels import (
+    _CANDIDATE_DIAGONAL_TERMS,
+    Channels,
+    _leave_one_out_errors,
+    _variances,
+    choose_channels,
+)
 
 
 def changes(number, seed, *, noise=0.01):
@@ -81,7 +87,7 @@ def test_healthy_channels_are_not_reported_as_dead_beside_four_dead_ones():
 def test_residuals_are_those_of_prediction_by_the_other_channels():
     learnt, other = changes(60, 0, noise=0.3)[:, :6], changes(40, 1, noise=0.3)[:, :6]
     variance, directions = _variances(learnt)
-    covariance = (directions * variance) @ directions.T + _DIAGONALS[8] * np.eye(6)
+    covariance = (directions * variance) @ directions.T + _CANDIDATE_DIAGONAL_TERMS[8] * np.eye(6)
     left = []
     for one in range(6):
         rest = np.arange(6) != one
@@ -91,7 +97,7 @@ def test_residuals_are_those_of_prediction_by_the_other_channels():
     np.testing.assert_allclose(missed, np.mean(np.square(left), axis=1), rtol=1e-9)
     # The second, divided by the channel's diagonal entry of the precision matrix, is the first.
     np.testing.assert_allclose(
-        unpredicted * np.diag(np.linalg.inv(covariance)) ** -1 / _DIAGONALS[8], missed, rtol=1e-9
+        unpredicted * np.diag(np.linalg.inv(covariance)) ** -1 / _CANDIDATE_DIAGONAL_TERMS[8], missed, rtol=1e-9
     )
 
 

@@ -25,7 +25,7 @@ ASKED = RNG.normal(size=(50, 6)) * np.linspace(2, 0.5, 6)
 @pytest.mark.parametrize("name", sorted(REGRESSORS))
 def test_numbers_are_learnt(name, monkeypatch):
     monkeypatch.setattr(
-        "jeit.touch.learnt.methods._MAX_PRESENTATIONS", 8
+        "jeit.touch.learnt.methods._MAX_PRESENTATIONS_PER_PRESS", 8
     )  # a map with few presses, each presented this often
     predicted = np.asarray(REGRESSORS[name](FEATURES, TARGETS).predict(ASKED))
     right = np.stack([np.tanh(ASKED[:, 0]), np.sin(ASKED[:, 1])], axis=1)

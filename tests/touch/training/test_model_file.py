@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from jeit.touch.training import check_same, read_head, read_model, write_model
+from jeit.touch.training import check_same, read_file_header, read_model, write_model
 
 KIND = "a jeit test network"
 
@@ -35,7 +35,7 @@ def written(tmp_path):
 def test_a_saved_network_is_read(written):
     path, network = written
     head, again = read_model(path, KIND, 1, make)
-    assert head["inputs"] == read_head(path, KIND, 1)["inputs"] == 3
+    assert head["inputs"] == read_file_header(path, KIND, 1)["inputs"] == 3
     assert eqx.tree_equal(network, again)
     assert eqx.filter_jit(again)(np.ones(3, np.float32)).shape == (2,)
 

@@ -1,6 +1,6 @@
 // The connection to the session: messages are converted to objects, and a lost connection is opened again.
 
-const NO_PIXEL = -32768;
+const OUTSIDE_PIXEL_VALUE = -32768;
 const LONGEST_WAIT = 5000;
 
 // Decode a picture from its bytes; the server's wire.py describes their layout.
@@ -11,7 +11,7 @@ export function readPicture(bytes) {
   const picture = { ...header, values, pixels: null };
   if (header.shape) {
     const whole = new Int16Array(bytes, 4 + length + 4 * header.channels, header.shape[0] * header.shape[1]);
-    picture.pixels = Float32Array.from(whole, (value) => (value === NO_PIXEL ? NaN : value * header.scale));
+    picture.pixels = Float32Array.from(whole, (value) => (value === OUTSIDE_PIXEL_VALUE ? NaN : value * header.scale));
   }
   return picture;
 }

@@ -20,12 +20,12 @@ _FINE_LATTICE = 11
 # Number of samples below which the finer lattice is used.
 _MIN_NUM_SAMPLES = 6
 # Width that the finer lattice resolves, as a share of the radius of a cell.
-_RESOLVED_FRACTION = 1 / 6
+_RESOLVED_CELL_RADIUS_FRACTION = 1 / 6
 # Number of presses computed at once, so that the arrays fit in the cache.
 _PRESSES_AT_ONCE = 16
 # Factor by which the reach of a contact grows if about half its area is off the skin; 2^(1/4) for a ball on a Winkler
 # foundation.
-_REACH_MARGIN = 1.25
+_REACH_GROWTH_FACTOR = 1.25
 # Minimum fraction of skin in the area within reach of a press; below this fraction, the pressure may extend farther.
 _MIN_SKIN_FRACTION = 0.6
 
@@ -79,13 +79,13 @@ def _pressed_cells(
     max_reaches = samples.max_chord_ratio * np.array([press.indenter.reach for press in presses])
     # The extent of the pressure on a flat skin is no upper bound for that on a concave skin.
     reach_bounds = max_reaches if samples.curved is not None else _reach_bounds(support, presses, indenter_numbers)
-    extents = np.minimum(reach_bounds, max_reaches) + samples.radius
+    contact_radii = np.minimum(reach_bounds, max_reaches) + samples.radius
     tree = KDTree(samples.points.mean(axis=1))
-    candidate_cells = tree.query_ball_point(positions, extents, return_sorted=True)
+    candidate_cells = tree.query_ball_point(positions, contact_radii, return_sorted=True)
     skin_areas = samples.points.shape[1] * np.array([samples.area[cells].sum() for cells in candidate_cells])
-    wide_presses = np.flatnonzero(skin_areas < _MIN_SKIN_FRACTION * np.pi * extents**2)
-    candidate_cells[wide_presses] = tree.query_ball_point(
-        positions[wide_presses], max_reaches[wide_presses] + samples.radius, return_sorted=True
+    presses_beyond_skin = np.flatnonzero(skin_areas < _MIN_SKIN_FRACTION * np.pi * contact_radii**2)
+    candidate_cells[presses_beyond_skin] = tree.query_ball_point(
+        positions[presses_beyond_skin], max_reaches[presses_beyond_skin] + samples.radius, return_sorted=True
     )
     candidate_cells = samples.facing_cells(presses, candidate_cells)
     num_cells = np.array([len(cells) for cells in candidate_cells])
@@ -102,9 +102,9 @@ def _pressed_cells(
         press_indices = np.flatnonzero(indenter_numbers == indenter_number)
         press_indices = press_indices[np.argsort(num_cells[press_indices], kind="stable")]
         for chunk in np.split(press_indices, range(_PRESSES_AT_ONCE, len(press_indices), _PRESSES_AT_ONCE)):
-            cells, is_cell = pad_rows([np.asarray(candidate_cells[press_index], int) for press_index in chunk])
+            cells, is_not_padding = pad_rows([np.asarray(candidate_cells[press_index], int) for press_index in chunk])
             pressure = _pressures_of_equal_indenters(
-                samples, support, [presses[press_index] for press_index in chunk], cells, is_cell
+                samples, support, [presses[press_index] for press_index in chunk], cells, is_not_padding
             )
             for press_index, touch_cells, touch_pressure in zip(chunk, cells, pressure, strict=True):
                 is_pressed = touch_pressure.any(axis=-1)
@@ -130,15 +130,17 @@ def _indenter_numbers(presses: Sequence[Press]) -> Int[np.ndarray, " n"]:
 def _reach_bounds(support: AbstractSupport, presses: Sequence[Press], indenter_numbers) -> Float[np.ndarray, " n"]:
     """Compute an upper bound (n,) of the distance from the origin at which each press exerts pressure, metres.
 
-    The bound is the reach of the pressure under the load rounded up to a power of two newtons, times `_REACH_MARGIN`,
-    which allows for presses at the edge of the skin.
+    The bound is the reach of the pressure under the load rounded up to a power of two newtons, times
+    `_REACH_GROWTH_FACTOR`, which allows for presses at the edge of the skin.
     """
     known_reaches: dict[tuple[int, int], float] = {}
     log2_loads = np.ceil(np.log2([press.load for press in presses]))
     for press, *indenter_and_doublings in zip(presses, indenter_numbers, log2_loads, strict=True):
         if tuple(indenter_and_doublings) not in known_reaches:
             try:
-                max_reach = _REACH_MARGIN * support.pressure(press.indenter, 2.0 ** indenter_and_doublings[1]).reach
+                max_reach = (
+                    _REACH_GROWTH_FACTOR * support.pressure(press.indenter, 2.0 ** indenter_and_doublings[1]).reach
+                )
             except ValueError:  # the rounded load exceeds the limit of the support; the load of the press may not
                 max_reach = press.indenter.reach
             known_reaches[tuple(indenter_and_doublings)] = min(max_reach, press.indenter.reach)
@@ -196,7 +198,8 @@ def _pressures_on_finer_lattice(samples: Samples, support: AbstractSupport, pres
     distances = np.linalg.norm(local_points.reshape(-1, num_fine_samples, 2), axis=-1).min(axis=1)
     nearest_cell = np.where(is_cell, distances, np.inf).argmin()
     if not (
-        distances[nearest_cell] < _RESOLVED_FRACTION * samples.radius and np.isfinite(press.indenter.gap(np.zeros(2)))
+        distances[nearest_cell] < _RESOLVED_CELL_RADIUS_FRACTION * samples.radius
+        and np.isfinite(press.indenter.gap(np.zeros(2)))
     ):
         raise ValueError(
             f"position: the press at {millimetre_text(press.position)} mm touches no skin, or does with less than a "

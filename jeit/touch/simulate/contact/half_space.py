@@ -103,14 +103,14 @@ class HalfSpace(AbstractSupport):
                 for unbounded_pressure, press_points in zip(unbounded_pressures, points, strict=True)
             ]
         )
-        carried_loads = np.sum(pressures * areas, axis=1)
+        supported_loads = np.sum(pressures * areas, axis=1)
         for press_index in np.flatnonzero(
-            (carried_loads > 0) & (carried_loads < _CHECKED_LOAD_FRACTION * np.asarray(loads))
+            (supported_loads > 0) & (supported_loads < _CHECKED_LOAD_FRACTION * np.asarray(loads))
         ):
             _check_on_skin(unbounded_pressures[press_index], points[press_index], areas[press_index])
         return (
             pressures
-            * np.where(carried_loads > 0, loads / np.where(carried_loads > 0, carried_loads, 1.0), 0.0)[:, None]
+            * np.where(supported_loads > 0, loads / np.where(supported_loads > 0, supported_loads, 1.0), 0.0)[:, None]
         )
 
     def _solve_pressure(self, indenter: AbstractIndenter, load: float, window, num_pixels: int):
@@ -150,12 +150,12 @@ def displacement_function(num_pixels: int, pixel, plane_modulus: float):
     def corner_displacement(x, y):
         return x * np.arcsinh(y / np.abs(x)) + y * np.arcsinh(x / np.abs(y))
 
-    influence = sum(
-        x_sign * y_sign * corner_displacement(x + x_sign * half_pixel[0], y + y_sign * half_pixel[1])
-        for x_sign in (1, -1)
-        for y_sign in (1, -1)
+    influence_function = sum(
+        sign_of_x * sign_of_y * corner_displacement(x + sign_of_x * half_pixel[0], y + sign_of_y * half_pixel[1])
+        for sign_of_x in (1, -1)
+        for sign_of_y in (1, -1)
     ) / (np.pi * plane_modulus)
-    spectrum = np.fft.rfft2(np.fft.ifftshift(influence))
+    spectrum = np.fft.rfft2(np.fft.ifftshift(influence_function))
 
     def displacements(pressure):
         pressure_spectrum = np.fft.rfft2(pressure, s=(2 * num_pixels, 2 * num_pixels))
@@ -171,17 +171,19 @@ def rigid_contact(gap: np.ndarray, displacements, total_pressure: float) -> tupl
     `displacements`: function that computes displacements from pressures. The gap is infinite at pixels that cannot be
     in contact. Raises `RuntimeError` if the iteration does not converge.
     """
-    can_touch = np.isfinite(gap)
-    gap = np.where(can_touch, gap, 0.0)
-    pressure = can_touch * (total_pressure / can_touch.sum())
-    direction, previous_square, is_conjugate = np.zeros_like(gap), 1.0, False
+    is_below_indenter = np.isfinite(gap)
+    gap = np.where(is_below_indenter, gap, 0.0)
+    pressure = is_below_indenter * (total_pressure / is_below_indenter.sum())
+    direction, previous_square, has_previous_direction = np.zeros_like(gap), 1.0, False
     for _ in range(_MAX_STEPS):
         is_touching = pressure > 0
         residual = displacements(pressure) + gap
         residual -= residual[is_touching].mean()
         squared_residual = np.sum(residual[is_touching] ** 2)
         direction = np.where(
-            is_touching, residual + (squared_residual / previous_square if is_conjugate else 0.0) * direction, 0.0
+            is_touching,
+            residual + (squared_residual / previous_square if has_previous_direction else 0.0) * direction,
+            0.0,
         )
         previous_square = squared_residual
         direction_displacements = displacements(direction)
@@ -194,11 +196,11 @@ def rigid_contact(gap: np.ndarray, displacements, total_pressure: float) -> tupl
             pressure,
             np.where(is_touching, np.maximum(pressure - step_length * direction, 0.0), 0.0),
         )
-        is_overlapping = can_touch & (pressure == 0) & (residual < 0)
-        is_conjugate = not is_overlapping.any()
+        is_overlapping = is_below_indenter & (pressure == 0) & (residual < 0)
+        has_previous_direction = not is_overlapping.any()
         pressure[is_overlapping] -= step_length * residual[is_overlapping]
         pressure *= total_pressure / pressure.sum()
-        if is_conjugate and np.abs(pressure - previous_pressure).sum() < _TOLERANCE * total_pressure:
+        if has_previous_direction and np.abs(pressure - previous_pressure).sum() < _TOLERANCE * total_pressure:
             break
     else:
         raise RuntimeError(f"the contact was not found in {_MAX_STEPS} steps; give the support fewer pixels.")

@@ -138,10 +138,10 @@ def _shared_resting_skin(skin_and_depth: _SkinAndDepth) -> RestingSkin | None:
 def _digest(arrays: Any, text: str) -> str:
     """Compute the SHA-256 hash of a tree of arrays and a text."""
     leaves, structure = jax.tree.flatten(arrays)
-    hasher = hashlib.sha256(f"{text} {structure}".encode())
+    sha256 = hashlib.sha256(f"{text} {structure}".encode())
     for leaf in leaves:
-        hasher.update(np.asarray(leaf).tobytes())
-    return hasher.hexdigest()
+        sha256.update(np.asarray(leaf).tobytes())
+    return sha256.hexdigest()
 
 
 def image_places(skin: Skin, columns: int, rows: int) -> np.ndarray:

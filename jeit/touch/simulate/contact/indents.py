@@ -25,7 +25,7 @@ from jeit_solvers.engines import as_array
 from jeit_solvers.module import Module
 
 # Number of random places drawn at once for each press; places off the skin are left out.
-_TRIES_PER_PLACE = 20
+_NUM_CANDIDATES_PER_PLACE = 20
 
 
 class PressDraws(Module):
@@ -99,7 +99,7 @@ class PressDraws(Module):
         angles = generator.uniform(-np.pi, np.pi, num_presses)
         places = np.zeros((0, 2))
         while len(places) < num_presses:
-            candidate_places = self._random_places(generator, _TRIES_PER_PLACE * int(num_presses))
+            candidate_places = self._random_places(generator, _NUM_CANDIDATES_PER_PLACE * int(num_presses))
             places = np.concatenate([places, candidate_places[self._is_inside(candidate_places)]])
         presses = [
             Press(self.indenters[indenter_index], float(load), position, float(angle))

@@ -114,10 +114,10 @@ class Foundation(AbstractSupport):
         that presses through the layer.
         """
         gaps = indenter.gap(points) if fall is None else indenter.gap(points) + fall
-        approaches = solve_contact_displacement(gaps, areas, loads / self.stiffness)
-        deepest_press = approaches.argmax()
-        self._check_approach(approaches[deepest_press], loads[deepest_press])
-        return self.stiffness * np.maximum(approaches[:, None] - gaps, 0.0)
+        indentation_depths = solve_contact_displacement(gaps, areas, loads / self.stiffness)
+        deepest_press_index = indentation_depths.argmax()
+        self._check_approach(indentation_depths[deepest_press_index], loads[deepest_press_index])
+        return self.stiffness * np.maximum(indentation_depths[:, None] - gaps, 0.0)
 
     def _check_approach(self, approach: float, load: float) -> None:
         if approach >= self.thickness:
@@ -347,9 +347,9 @@ def advance_state(
     if seconds > 0:
         relative_times = seconds / times
         decay_factors = np.exp(-relative_times)
-        ramp_weights = 1 + np.expm1(-relative_times) / relative_times
+        ramp_response = 1 + np.expm1(-relative_times) / relative_times
         branch_states = decay_factors * branch_states + (1 - decay_factors) * state.hysteresis_output
-        branch_states += ramp_weights * (output - state.hysteresis_output)
+        branch_states += ramp_response * (output - state.hysteresis_output)
     return MaterialState(output, branch_states), (1 - creep_fractions.sum()) * output + np.sum(
         creep_fractions * branch_states, axis=0
     )

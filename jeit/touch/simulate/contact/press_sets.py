@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from jeit.arguments import check_kind, describe
-from jeit.arguments.extras import need_extra
+from jeit.arguments.extras import require_extra
 from jeit.design.study.contents import Contents
 from jeit.design.study.run import Progress, ProgressReporter, solve_on_cluster
 from jeit.design.study.store import Store, writing
@@ -99,10 +99,10 @@ class PressSet:
         model, settings = self.skin.model, (_VERSION, self.number, self.seed, self.held, self.elapsed, self.chunk)
         arrays = model.mesh, model.electrodes, model.protocol, self.skin.material, self.skin.conductivity
         leaves, structure = jax.tree.flatten((arrays, self.skin.gain, self.draws))
-        hasher = hashlib.sha256(f"{settings} {structure}".encode())
+        sha256 = hashlib.sha256(f"{settings} {structure}".encode())
         for leaf in leaves:
-            hasher.update(np.asarray(leaf).tobytes())
-        return hasher.hexdigest()
+            sha256.update(np.asarray(leaf).tobytes())
+        return sha256.hexdigest()
 
     def solve(self, chunk: int) -> dict[str, np.ndarray]:
         """Simulate a chunk of k touches; return arrays (k, …) of voltages and of the parameters of presses, by their
@@ -188,7 +188,7 @@ def simulate_presses(
     data = simulate_presses(PressSet(skin, draws, number=8), "presses.zarr")  # with zarr
     ```
     """
-    need_extra("cluster", "a set of touches")
+    require_extra("cluster", "a set of touches")
     check_kind("presses", presses, (PressSet, IndentSet), "a PressSet(skin, draws, number), or an IndentSet")
     with writing(presses.contents(), path) as store:
         finished_chunks = set(store.intact_chunks())
@@ -221,7 +221,7 @@ def open_presses(presses: PressSet | IndentSet, path: str | Path):
     data = open_presses(presses, "presses.zarr")
     ```
     """
-    need_extra("cluster", "a set of touches")
+    require_extra("cluster", "a set of touches")
     store = Store(presses.contents(), path, create=False)
     is_finished = np.zeros(presses.number, bool)
     for number in store.intact_chunks():

@@ -49,13 +49,13 @@ def split_keys(key: Array, number: int) -> list[Array]:
 
 
 def random_walk(
-    key: Array, seconds: Float[np.ndarray, " T"], trend: float, deviation: float, count: int
+    key: Array, seconds: Float[np.ndarray, " T"], common_trend: float, deviation: float, count: int
 ) -> Float[np.ndarray, "T k"]:
-    """Draw logarithms (T, k) of k = `count` drifting quantities, 0 at time 0: a common `trend` per second plus
+    """Draw logarithms (T, k) of k = `count` drifting quantities, 0 at time 0: a common `common_trend` per second plus
     independent random walks of standard `deviation` per √s. `seconds`: times (T,), in ascending order."""
     time_steps = np.diff(seconds, prepend=0.0)
     normal_draws = standard_normal(key, (len(time_steps), count))
-    return trend * np.asarray(seconds)[:, None] + deviation * np.cumsum(
+    return common_trend * np.asarray(seconds)[:, None] + deviation * np.cumsum(
         np.sqrt(time_steps)[:, None] * normal_draws, axis=0
     )
 
@@ -75,7 +75,7 @@ _TOUCHES_AT_ONCE = 1024
 # Maximum size of the inverse of a system matrix between all nodes.
 _MAX_INVERSE_BYTES = 160 * 2**20
 # Limits between groups of touches, in numbers of cells.
-_GROUP_NUM_CELLS = (128, 512, 2048)
+_GROUP_CELL_LIMITS = (128, 512, 2048)
 # Ratio of the extent of a touch to the square root of its area above which the touch is assumed to consist of
 # separate contacts.
 _MIN_SEPARATION = 3.0
@@ -362,10 +362,10 @@ class PressedSkin(Module):
 def _collect_changes(places, cells, changes, num_cells: int) -> TouchedCells:
     """Collect the changes of cells that are not negligible as `TouchedCells`, whose rows are padded with zeros."""
     is_significant = np.abs(changes) > _MIN_RELATIVE_CHANGE * np.abs(changes).max(axis=1, keepdims=True)
-    rows, is_entry = pad_rows([row[is_kept] for row, is_kept in zip(cells, is_significant, strict=True)])
+    rows, is_not_padding = pad_rows([row[is_kept] for row, is_kept in zip(cells, is_significant, strict=True)])
     num_padding = _round_up(rows.shape[1]) - rows.shape[1]
     significant_changes = np.zeros(rows.shape)
-    significant_changes[is_entry] = changes[is_significant]
+    significant_changes[is_not_padding] = changes[is_significant]
     rows, significant_changes = (np.pad(array, ((0, 0), (0, num_padding))) for array in (rows, significant_changes))
     return TouchedCells(as_array(places), as_array(rows), as_array(significant_changes), num_cells)
 
@@ -400,8 +400,10 @@ def _groups_of_similar_cost(
         for reduce_times, padding in ((np.min, 1), (np.max, -1))
     )
     areas = np.sum(np.where(is_changed, np.asarray(measures(mesh))[cells], 0.0), axis=1)
-    is_separate = np.linalg.norm(upper_corners - lower_corners, axis=1) > _MIN_SEPARATION * np.sqrt(areas)
-    group_numbers = np.where(num_changed > 0, 1 + 2 * np.searchsorted(_GROUP_NUM_CELLS, num_changed) + is_separate, 0)
+    is_far_apart = np.linalg.norm(upper_corners - lower_corners, axis=1) > _MIN_SEPARATION * np.sqrt(areas)
+    group_numbers = np.where(
+        num_changed > 0, 1 + 2 * np.searchsorted(_GROUP_CELL_LIMITS, num_changed) + is_far_apart, 0
+    )
     return [
         np.flatnonzero(group_numbers == group_number) for group_number in np.unique(group_numbers[group_numbers > 0])
     ]

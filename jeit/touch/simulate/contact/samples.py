@@ -162,7 +162,9 @@ def lattice(corners: Float[np.ndarray, "m k d"], fineness: int) -> Float[np.ndar
 
 def _barycentric_weights(num_corners: int, fineness: int) -> Float[np.ndarray, "s k"]:
     lattice_integers = [
-        integers for integers in itertools.product(range(fineness + 1), repeat=num_corners) if sum(integers) == fineness
+        index_tuple
+        for index_tuple in itertools.product(range(fineness + 1), repeat=num_corners)
+        if sum(index_tuple) == fineness
     ]
     return (np.array(lattice_integers) + 1 / num_corners) / (fineness + 1)
 

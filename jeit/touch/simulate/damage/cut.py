@@ -17,7 +17,7 @@ from jeit.touch.simulate.contact import Material
 from jeit_solvers.module import Module
 
 # Maximum number of random cuts that are tried; minimum and maximum angle of the bend in a cut, in radians.
-_MAX_TRIES, _MIN_BEND, _MAX_BEND = 400, 0.35, 1.2
+_MAX_TRIED_CUTS, _MIN_BEND_ANGLE, _MAX_BEND_ANGLE = 400, 0.35, 1.2
 
 
 class Cut(Module):
@@ -168,11 +168,11 @@ def draw_cut(
     generator = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     low_x, high_x, low_y, high_y = map(float, outline.extent)
     cut_length, is_bent = generator.uniform(*length_range), generator.random() < bent
-    for _ in range(_MAX_TRIES):
+    for _ in range(_MAX_TRIED_CUTS):
         start, angle = generator.uniform((low_x, low_y), (high_x, high_y)), generator.uniform(-np.pi, np.pi)
         length_fraction, bend_angle = (
             generator.uniform(0.3, 0.7),
-            generator.choice((-1, 1)) * generator.uniform(_MIN_BEND, _MAX_BEND),
+            generator.choice((-1, 1)) * generator.uniform(_MIN_BEND_ANGLE, _MAX_BEND_ANGLE),
         )
         segments = [(length_fraction, angle), (1 - length_fraction, angle + bend_angle)] if is_bent else [(1.0, angle)]
         segment_vectors = [

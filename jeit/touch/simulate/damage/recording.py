@@ -32,7 +32,7 @@ _FLUCTUATION_TIME = 0.5
 # Number of levels of a loose contact's factor for which voltages are solved.
 _NUM_LEVELS = 7
 # Voltage picked up by a disconnected wire, relative to the root mean square of all voltages.
-_STRAY_FRACTION = 0.02
+_STRAY_VOLTAGE_FRACTION = 0.02
 
 
 class ElectrodeFault(Module):
@@ -86,7 +86,7 @@ class ElectrodeFault(Module):
         if self.kind == "loose":
             return self._loose_contact_voltages(fluctuation_key, model, conductivity, seconds) - rest_voltages
         stray_voltages = (
-            _STRAY_FRACTION
+            _STRAY_VOLTAGE_FRACTION
             * np.sqrt(np.mean(rest_voltages**2))
             * np.asarray(jax.random.normal(stray_key, (len(seconds), rest_voltages.size)))
         )
@@ -129,9 +129,9 @@ class ElectrodeFault(Module):
     def _loose_contact_voltages(self, key: Array, model: ForwardModel, conductivity, seconds: np.ndarray) -> np.ndarray:
         """Compute voltages (T, M) for a fluctuating contact impedance, interpolated between the voltages at a few
         levels of the impedance's logarithm."""
-        log_min, log_max = np.log(_LOOSE_CONTACT_FACTORS)
-        levels = np.linspace(log_min, log_max, _NUM_LEVELS)
-        level_voltages = [
+        min_log_factor, max_log_factor = np.log(_LOOSE_CONTACT_FACTORS)
+        levels = np.linspace(min_log_factor, max_log_factor, _NUM_LEVELS)
+        voltages_of_levels = [
             np.asarray(self._with_contact_factor(model, float(np.exp(log_factor))).voltages(conductivity))
             for log_factor in levels
         ]
@@ -145,10 +145,10 @@ class ElectrodeFault(Module):
         # The normal distribution function, applied to the fluctuation, makes the factor's logarithm uniformly
         # distributed.
         level_positions = ndtr(fluctuation) * (_NUM_LEVELS - 1)
-        lower_levels = np.minimum(level_positions.astype(int), _NUM_LEVELS - 2)
-        upper_weights = (level_positions - lower_levels)[:, None]
-        table = np.array(level_voltages)
-        return (1 - upper_weights) * table[lower_levels] + upper_weights * table[lower_levels + 1]
+        lower_level_indices = np.minimum(level_positions.astype(int), _NUM_LEVELS - 2)
+        upper_weights = (level_positions - lower_level_indices)[:, None]
+        table = np.array(voltages_of_levels)
+        return (1 - upper_weights) * table[lower_level_indices] + upper_weights * table[lower_level_indices + 1]
 
 
 def check_fault(name: str, value) -> None:
@@ -232,17 +232,17 @@ def record_damage(
     voltages, current_skin = np.zeros((len(seconds), skin.gain.size)), skin
     for event_index, (stage, end) in enumerate(zip(stages, end_times, strict=True)):
         current_skin = current_skin if stage.skin is None else stage.skin
-        is_stage_frame = (seconds >= stage.time if event_index else seconds >= 0) & (seconds < end)
-        if not is_stage_frame.any():
+        is_frame_of_stage = (seconds >= stage.time if event_index else seconds >= 0) & (seconds < end)
+        if not is_frame_of_stage.any():
             continue
-        exact_voltages = exact_record(current_skin, motions, seconds, is_stage_frame)
+        exact_voltages = exact_record(current_skin, motions, seconds, is_frame_of_stage)
         for fault_index, fault in enumerate(stage.faults):
             stage_fault_key = jax.random.fold_in(jax.random.fold_in(key, event_index), fault_index)
-            exact_voltages[is_stage_frame] += fault.changes(
-                stage_fault_key, current_skin.model, current_skin.conductivity, seconds[is_stage_frame]
+            exact_voltages[is_frame_of_stage] += fault.changes(
+                stage_fault_key, current_skin.model, current_skin.conductivity, seconds[is_frame_of_stage]
             )
         # The same key for all stages, so that drift and noise continue through the recording.
-        voltages[is_stage_frame] = current_skin.read(key, exact_voltages, seconds)[is_stage_frame]
+        voltages[is_frame_of_stage] = current_skin.read(key, exact_voltages, seconds)[is_frame_of_stage]
     return voltages
 
 

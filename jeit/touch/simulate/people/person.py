@@ -30,13 +30,13 @@ touches, speed, m/s, and length of one sweep of the path, m."""
 
 # Median of a parameter, and standard deviation of its logarithm among people, for each word of Table I. Units: m, N and
 # s.
-_AREA = {"small": (7e-3, 0.2), "sm-large": (12e-3, 0.45), "med-large": (20e-3, 0.3)}
-_INTENSITY = {"low": (1.0, 0.3), "low-med": (2.0, 0.4), "med-high": (5.0, 0.4), "high": (10.0, 0.3)}
-_DURATION = {"short": (0.15, 0.3), "med-long": (1.2, 0.4)}
+_SIZE_BY_WORD = {"small": (7e-3, 0.2), "sm-large": (12e-3, 0.45), "med-large": (20e-3, 0.3)}
+_FORCE_BY_WORD = {"low": (1.0, 0.3), "low-med": (2.0, 0.4), "med-high": (5.0, 0.4), "high": (10.0, 0.3)}
+_DURATION_BY_WORD = {"short": (0.15, 0.3), "med-long": (1.2, 0.4)}
 # Standard deviation of the logarithm of speed and path among people.
-_PATH_SPREAD = 0.35
+_PATH_LOG_DEVIATION = 0.35
 # Standard deviation of the logarithm of each parameter among touches of one person.
-_TOUCH_SPREAD = 0.25
+_TOUCH_LOG_DEVIATION = 0.25
 
 
 @dataclass(frozen=True)
@@ -61,12 +61,14 @@ class Manner:
     @property
     def spread(self) -> Float[np.ndarray, " 5"]:
         """Standard deviations (5,) of the logarithms of the parameters `TRAITS` among people."""
-        return np.array([*(parameters[1] for parameters in self._word_parameters), _PATH_SPREAD, _PATH_SPREAD])
+        return np.array(
+            [*(parameters[1] for parameters in self._word_parameters), _PATH_LOG_DEVIATION, _PATH_LOG_DEVIATION]
+        )
 
     @property
     def touch_spread(self) -> float:
         """Standard deviation of the logarithm of each of the parameters `TRAITS` among touches of one person."""
-        return _TOUCH_SPREAD
+        return _TOUCH_LOG_DEVIATION
 
     @property
     def moves(self) -> bool:
@@ -75,7 +77,7 @@ class Manner:
 
     @property
     def _word_parameters(self) -> tuple[tuple[float, float], ...]:
-        return _INTENSITY[self.intensity], _AREA[self.area], _DURATION[self.duration]
+        return _FORCE_BY_WORD[self.intensity], _SIZE_BY_WORD[self.area], _DURATION_BY_WORD[self.duration]
 
 
 MANNERS: dict[str, Manner] = {
@@ -100,7 +102,7 @@ _MAX_PRESSURE = 120e3
 # Minimum distance of the hand's path from the edge of the skin, m.
 _EDGE_MARGIN = 15e-3
 # Maximum path of a hand that does not move along the skin but rolls, m.
-_MAX_ROLL = 2e-3
+_MAX_ROLLING_PATH_LENGTH = 2e-3
 # Share of a long touch in which the load rises, and in which it falls.
 _RAMP_FRACTION = 0.15
 # Relative amplitude of fluctuations of the load.
@@ -110,9 +112,9 @@ _NUM_FINGERTIPS = 3
 # Distance between the fingertips that scratch, divided by their radius.
 _FINGERTIP_SPACING = 2.6
 # Relative reduction of the load at the turning points of a scratch.
-_LOAD_REDUCTION = 0.4
+_LOAD_REDUCTION_AT_TURNS = 0.4
 # Number of random places tried for a path on the skin.
-_MAX_TRIES = 20
+_NUM_TRIED_PLACES = 20
 # Factor by which a path is shortened if it fits at none of the tried places.
 _SHORTENING_FACTOR = 0.8
 
@@ -126,7 +128,7 @@ def gesture_motion(
     before the gesture, and end 0.5 s or more after it, since the skin recovers slowly.
     """
     force, radius, duration, speed, path = traits
-    manner = MANNERS[gesture]
+    gesture_manner = MANNERS[gesture]
     force = min(force, _MAX_PRESSURE * np.pi * radius**2)
     num_frames = int(np.ceil((_TIME_BEFORE + duration + _TIME_AFTER) * rate))
     seconds = np.arange(_FRAME_MULTIPLE * -(-num_frames // _FRAME_MULTIPLE)) / rate
@@ -134,9 +136,9 @@ def gesture_motion(
     progress = (seconds - _TIME_BEFORE - rng.uniform(0, 1) / rate) / duration
     is_touching = (progress > 0) & (progress < 1)
     progress = np.clip(progress, 0, 1)
-    num_sweeps = max(1, round(speed * duration / path)) if manner.moves else 1
+    num_sweeps = max(1, round(speed * duration / path)) if gesture_manner.moves else 1
     loads = force * np.where(is_touching, _relative_loads(rng, progress, gesture, num_sweeps), 0.0)
-    length = path if manner.moves else _MAX_ROLL * rng.uniform(0, 1)
+    length = path if gesture_manner.moves else _MAX_ROLLING_PATH_LENGTH * rng.uniform(0, 1)
     path_centre, angle, length = _random_path(rng, outline, length)
     path_offsets = (1 - np.abs((num_sweeps * progress) % 2 - 1) - 0.5) * length
     positions = path_centre + path_offsets[:, None] * np.array([np.cos(angle), np.sin(angle)])
@@ -160,7 +162,9 @@ def _relative_loads(rng: np.random.Generator, progress: np.ndarray, gesture: str
     cycles, phase = rng.uniform(0.5, 4, 3), rng.uniform(0, 2 * np.pi, 3)
     loads = loads * (1 + _FLUCTUATION_AMPLITUDE * np.sin(2 * np.pi * progress[:, None] * cycles + phase).sum(axis=1))
     if gesture == "scratch":
-        loads = loads * (1 - _LOAD_REDUCTION + _LOAD_REDUCTION * np.abs(np.sin(np.pi * num_sweeps * progress)))
+        loads = loads * (
+            1 - _LOAD_REDUCTION_AT_TURNS + _LOAD_REDUCTION_AT_TURNS * np.abs(np.sin(np.pi * num_sweeps * progress))
+        )
     return loads
 
 
@@ -168,11 +172,11 @@ def _random_path(rng: np.random.Generator, outline: Domain, length: float) -> tu
     """Draw the centre, angle and length of a straight path on the skin, shorter than `length` if no place is found."""
     low_x, high_x, low_y, high_y = map(float, outline.extent)
     while True:
-        for _ in range(_MAX_TRIES):
+        for _ in range(_NUM_TRIED_PLACES):
             centre = rng.uniform((low_x, low_y), (high_x, high_y))
             angle = rng.uniform(0, 2 * np.pi)
-            half_vector = length / 2 * np.array([np.cos(angle), np.sin(angle)])
-            path_points = np.stack([centre - half_vector, centre, centre + half_vector])
+            half_path_vector = length / 2 * np.array([np.cos(angle), np.sin(angle)])
+            path_points = np.stack([centre - half_path_vector, centre, centre + half_path_vector])
             if (np.asarray(outline.signed_distance(path_points)) >= _EDGE_MARGIN).all():
                 return centre, float(angle), length
         length *= _SHORTENING_FACTOR
@@ -213,7 +217,9 @@ class Person(Module):
         check_key(key)
         normal_draws = np.asarray(jax.random.normal(key, (len(GESTURES), len(TRAITS))))
         manners = MANNERS.values()
-        medians, spreads = (np.stack([getattr(manner, name) for manner in manners]) for name in ("medians", "spread"))
+        medians, spreads = (
+            np.stack([getattr(gesture_manner, name) for gesture_manner in manners]) for name in ("medians", "spread")
+        )
         return cls(medians * np.exp(spreads * normal_draws))
 
     def touch(
@@ -234,6 +240,6 @@ class Person(Module):
         if min(high_x - low_x, high_y - low_y) < _MIN_SKIN_SIDE:
             raise ValueError(f"outline must be {1e3 * _MIN_SKIN_SIDE:g} mm wide and high at least, for a hand.")
         rng = np.random.default_rng(np.asarray(jax.random.bits(key, (4,))).tolist())
-        log_deviations = MANNERS[gesture].touch_spread * rng.normal(size=len(TRAITS))
-        traits = self.medians[GESTURES.index(gesture)] * np.exp(log_deviations)
+        trait_log_deviations = MANNERS[gesture].touch_spread * rng.normal(size=len(TRAITS))
+        traits = self.medians[GESTURES.index(gesture)] * np.exp(trait_log_deviations)
         return gesture_motion(rng, gesture, traits, outline, float(rate))
