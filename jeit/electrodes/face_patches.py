@@ -12,7 +12,6 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.arguments import MILLIMETRE_HINT
-from jeit.electrodes.discs import facet_normals, is_undistorted_from_above, tangent_frames
 from jeit.electrodes.electrodes import (
     AbstractElectrodes,
     AbstractMovableElectrodes,
@@ -22,7 +21,7 @@ from jeit.electrodes.electrodes import (
     as_positions,
     check_dimension,
 )
-from jeit.electrodes.facets import covered_moments
+from jeit.electrodes.facets import covered_moments, facet_normals, is_undistorted_from_above, tangent_frames
 from jeit.mesh import Body, Mesh, OwnMesh, Rectangle, Refine, Solid
 from jeit.mesh.checks import size_checked
 from jeit.mesh.mesh import facet_measures

@@ -1,4 +1,5 @@
-"""Electrodes that consist of boundary facets, and integrals over the part of a triangle that a rectangle covers.
+"""Electrodes that consist of boundary facets, directions of the facets, and integrals over the part of a triangle that
+a rectangle covers.
 
 The integrals of P1 functions over the intersection of a triangle and a rectangle are exact, and differentiable in the
 coordinates of triangle and rectangle.
@@ -16,8 +17,9 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
 
 from jeit.electrodes.electrodes import (
     AbstractCompleteElectrodes,
@@ -33,6 +35,66 @@ from jeit_solvers.engines import has_values, namespace, sum_into, undifferentiat
 # Covered fraction of a triangle below which the fraction counts as zero: such a fraction has few correct digits, and
 # its errors would be amplified by small contact impedances.
 _MIN_COVERED_FRACTION = 1e-12
+
+
+def facet_normals(mesh: Mesh) -> Float[Array, "b 3"]:
+    """Outward unit normals of the boundary triangles of a 3-D mesh."""
+    corners = mesh.points[mesh.facets]
+    xp = namespace(corners)
+    normal = xp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normal / xp.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def is_undistorted_from_above(mesh: Mesh, position: Float[Array, "L d"]) -> Bool[np.ndarray, " L"]:
+    """Whether the surface at each position appears undistorted from above: in a sheet, and on horizontal faces."""
+    if mesh.dimension == 2:
+        return np.ones(len(position), bool)
+    centres, normals = np.asarray(mesh.points)[np.asarray(mesh.facets)].mean(axis=1), np.asarray(facet_normals(mesh))
+    return np.abs(normals[KDTree(centres).query(np.asarray(position))[1], 2]) > 0.9
+
+
+def same_face(mesh: Mesh, position: Float[Array, "L 3"], radius: Float[Array, " L"]) -> Float[Array, "b L"]:
+    """Matrix (b, L): 1 if boundary triangle b may lie on the same flat or curved face as electrode L, also if that face
+    continues around an edge of the body, otherwise 0.
+
+    The matrix prevents an electrode on a thin layer from reaching through to the opposite face. On a face with radius
+    of curvature R, the plane of a triangle at the rim of a disc of radius r passes r² / 2R from the disc's centre and
+    is rotated by 2 arcsin(r / 2R); for r = R the distance is r / 2 and the angle 60°. The matrix has no derivatives.
+    """
+    normal, corner = facet_normals(mesh), mesh.points[mesh.facets[:, 0]]
+    height = abs(normal @ position.T - (normal * corner).sum(axis=1)[:, None])
+    # Near an edge of the body the nearest triangle may lie on the adjacent face; its plane, however, is far from the
+    # position.
+    facet_below_electrode = nearest_facets(mesh, position, 100 * height.T**2)
+    normal_cosine = normal @ normal[facet_below_electrode].T
+    is_on_curved_face = (height < 0.55 * radius) & (normal_cosine > 0.45)
+    return undifferentiated((height < 0.2 * radius) & (normal_cosine > -0.5) | is_on_curved_face).astype(position.dtype)
+
+
+def nearest_facets(
+    mesh: Mesh, position: Float[Array, "L 3"], added_distance: Float[Array, "L b"] | float = 0.0
+) -> Int[Array, " L"]:
+    """Index of the boundary triangle whose centroid is nearest to each position; the first of equally near triangles.
+
+    `added_distance` (L, b): m², added to the squared distances to disfavour some triangles.
+    """
+    xp = namespace(mesh, position)
+    centres = mesh.points[mesh.facets].mean(axis=1)
+    squared_distances = xp.sum((position[:, None] - centres) ** 2, axis=-1) + added_distance
+    # A tolerance for ties, so that the result does not depend on rounding in the unit of length.
+    return xp.argmax(squared_distances <= (1 + 1e-9) * squared_distances.min(axis=1, keepdims=True), axis=1)
+
+
+def tangent_frames(mesh: Mesh, position):
+    """Unit vectors (L, 3) at each electrode: normal of the nearest facet, horizontal and upward direction. The vectors
+    have no derivatives."""
+    xp = namespace(mesh, position)
+    normal = facet_normals(mesh)[nearest_facets(mesh, position)]
+    is_horizontal = abs(normal[:, 2:]) > 0.9
+    upward = xp.where(is_horizontal, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])).astype(normal.dtype)
+    tangent = xp.cross(upward, normal)
+    tangent = tangent / xp.linalg.norm(tangent, axis=1, keepdims=True)
+    return tuple(map(undifferentiated, (normal, tangent, xp.cross(normal, tangent))))
 
 
 def covered_moments(
