@@ -90,19 +90,19 @@ def _field_energies(mesh: Mesh, fields, cells, conductivity_slope) -> Float[np.n
     """
     nodes = np.asarray(mesh.cells)[cells]
     gradient, measure = (np.asarray(values)[cells] for values in cached_geometry(mesh))
-    weighted_gradient = np.ascontiguousarray(gradient.transpose(0, 2, 1)) * np.sqrt(measure)[:, None, None]
+    scaled_basis_gradients = np.ascontiguousarray(gradient.transpose(0, 2, 1)) * np.sqrt(measure)[:, None, None]
     num_fields, is_nonzero = fields.shape[1], conductivity_slope != 0
     num_nonzero = is_nonzero.sum(axis=1)
     energy = np.zeros((conductivity_slope.shape[1], num_fields**2), np.result_type(fields, conductivity_slope))
     for chunk_of_indices in _split_indices(np.flatnonzero(num_nonzero > 1)):
-        local_fields = weighted_gradient[chunk_of_indices] @ fields[nodes[chunk_of_indices]]
+        local_fields = scaled_basis_gradients[chunk_of_indices] @ fields[nodes[chunk_of_indices]]
         energy += conductivity_slope[chunk_of_indices].T @ (local_fields.transpose(0, 2, 1) @ local_fields).reshape(
             len(chunk_of_indices), -1
         )
     energy = energy.reshape(-1, num_fields, num_fields)
     for coefficient, is_only_nonzero in enumerate((is_nonzero & (num_nonzero == 1)[:, None]).T):
         for chunk_of_indices in _split_indices(np.flatnonzero(is_only_nonzero)):
-            local_fields = weighted_gradient[chunk_of_indices] @ fields[nodes[chunk_of_indices]]
+            local_fields = scaled_basis_gradients[chunk_of_indices] @ fields[nodes[chunk_of_indices]]
             weighted = conductivity_slope[chunk_of_indices, coefficient, None, None] * local_fields
             energy[coefficient] += local_fields.reshape(-1, num_fields).T @ weighted.reshape(-1, num_fields)
     return energy

@@ -227,7 +227,7 @@ def _noisy_frames(
     noise = np.asarray(relative_noise(expected_voltages, as_array(is_used)))
     check = FrameCheck(is_used, expected_voltages, touching, (pairs.reshape(-1, 2), ratios), noise)
     noise_judgements = (
-        check.check_reciprocal_noise(np.where(is_used, change, 0), is_used)
+        check.check_noise_by_reciprocity(np.where(is_used, change, 0), is_used)
         for change, is_used in zip(changes, usable, strict=True)
     )
     faulty_statuses = FrameStatus.REFUSED, FrameStatus.PARTIAL

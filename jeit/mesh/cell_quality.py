@@ -105,8 +105,8 @@ def _tetrahedron_measures(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     # The inscribed sphere has the radius 3 V / ΣA, with the volume V and the areas A of the faces. The centre of the
     # circumscribed sphere relative to node 0 is Σ |x_i|² n_i / (2 · 6 V), with the edges x_i from node 0 and the
     # normals n_i.
-    squares = np.stack([(a**2).sum(1), (b**2).sum(1), (c**2).sum(1)], axis=1)
-    circumradius = np.linalg.norm((squares[..., None] * normals[:, :3]).sum(axis=1), axis=1) / (2 * volume)
+    squared_edge_lengths = np.stack([(a**2).sum(1), (b**2).sum(1), (c**2).sum(1)], axis=1)
+    circumradius = np.linalg.norm((squared_edge_lengths[..., None] * normals[:, :3]).sum(axis=1), axis=1) / (2 * volume)
     return angle, 3 * (volume / area.sum(axis=1)) / circumradius
 
 

@@ -383,5 +383,5 @@ def differentiable_minima(objective, unknowns, side, skin_size):
     hessian_trace = xp.maximum(xp.einsum("kkf->f", projected_hessian), 1e-300)
     hessian = projected_hessian + (xp.eye(len(minimum))[:, :, None] - projector) * hessian_trace
     step = solve_small(hessian, gradient)
-    usable = xp.all(xp.isfinite(step), axis=0) & (xp.max(xp.abs(step[:2]), axis=0) < 1e-3 * skin_size)
-    return minimum - xp.where(usable, step, 0.0)
+    is_small_step = xp.all(xp.isfinite(step), axis=0) & (xp.max(xp.abs(step[:2]), axis=0) < 1e-3 * skin_size)
+    return minimum - xp.where(is_small_step, step, 0.0)

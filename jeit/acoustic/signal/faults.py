@@ -161,11 +161,11 @@ def _stuck_samples(samples: np.ndarray, rate: float, sample_range: float) -> Boo
     # Silence can be constant too: with a coarse converter, or in a simulation without noise. The sound then fades into
     # silence, so that some other blocks are almost constant. In a stuck channel with noise, no other block is almost
     # constant.
-    is_moving_block = ~is_stuck[: blocks.size].reshape(blocks.shape).any(axis=1) & np.isfinite(block_ranges)
+    is_varying_block = ~is_stuck[: blocks.size].reshape(blocks.shape).any(axis=1) & np.isfinite(block_ranges)
     max_resting_range = max(
         _MAX_SILENCE_CONVERTER_STEPS * _converter_step(samples), _MAX_RELATIVE_SILENCE_RANGE * sample_range
     )
-    return None if is_moving_block.any() and block_ranges[is_moving_block].min() <= max_resting_range else is_stuck
+    return None if is_varying_block.any() and block_ranges[is_varying_block].min() <= max_resting_range else is_stuck
 
 
 def _clipped_samples(samples: np.ndarray, full_scale: float | None) -> Bool[np.ndarray, " S"] | None:

@@ -359,7 +359,7 @@ def _check_no_key(path: Path, key: str | None) -> None:
 def _measurement_with_description(
     path: Path, description: str | Path | None, like: Measurement | None
 ) -> Measurement | None:
-    """The measurement whose description is used for a file: `like` if no description is specified and none lies beside
+    """The measurement `like`, whose description is used for a file if no description is specified and none lies beside
     the file, otherwise None."""
     return like if description is None and find_description(path) is None else None
 

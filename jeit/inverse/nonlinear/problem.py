@@ -313,7 +313,8 @@ class Inversion(Module):
         return coefficients[: self.basis.num_coefficients], tuple(values)
 
     def _model_and_image(self, shapes, values) -> tuple[ForwardModel, Float[Array, " m"]]:
-        """Forward model changed by the values of the unknowns, and the image x on the link's scale."""
+        """Forward model with the estimated electrodes, contacts and scale; and the image x, such as log σ, from which
+        the `link` computes conductivities."""
         model, estimate = self.model, self.reference + self.basis.expand(shapes)
         for unknown, value in zip(self.unknowns, values, strict=True):
             model, estimate = unknown.apply(model, estimate, value)

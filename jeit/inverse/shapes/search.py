@@ -251,19 +251,19 @@ class _FitSetting(NamedTuple):
 
 
 def _add_bodies(
-    setting: _FitSetting, bodies: Bodies, coefficients, num_certain: int = 0
+    setting: _FitSetting, bodies: Bodies, coefficients, num_certain_bodies: int = 0
 ) -> tuple[float, ShapeFit, list[int]]:
     """Add bodies one by one to other changes, and retain each body that the data support in addition to earlier ones.
 
-    Returns the level of the other changes, the fit, and the indices of the retained bodies. The first `num_certain`
-    bodies are beyond doubt and are fitted together, because one of two bodies, fitted alone, would move to a place
-    between the two.
+    Returns the level of the other changes, the fit, and the indices of the retained bodies. The first
+    `num_certain_bodies` are beyond doubt and are fitted together, because one of two bodies, fitted alone, would move
+    to a place between the two.
     """
     rows = bodies.rows(coefficients)
-    supported_indices, num_refused = list(range(num_certain)), 0
-    start = np.append(coefficients[0], rows[:num_certain])
+    supported_indices, num_refused = list(range(num_certain_bodies)), 0
+    start = np.append(coefficients[0], rows[:num_certain_bodies])
     level, fit, min_surprise = setting.fit_level(bodies.subset(supported_indices), start, 1.0, _NUM_FIRST_STEPS)
-    for k in range(num_certain, len(rows)):
+    for k in range(num_certain_bodies, len(rows)):
         start = np.append(fit.coefficients, rows[k])
         new_level, new_fit, surprise = setting.fit_level(
             bodies.subset([*supported_indices, k]), start, level, _NUM_FIRST_STEPS
@@ -334,8 +334,8 @@ def _refine_meshes(
         else:
             order = np.argsort(-costs)
             start = np.append(coefficients[0], bodies.rows(coefficients)[order])
-            num_certain = int((costs > CERTAIN_OBJECTIVE_RATIO * last_fit.cost).sum())
-            level, fit, supported_indices = _add_bodies(setting, bodies.subset(order), start, num_certain)
+            num_certain_bodies = int((costs > CERTAIN_OBJECTIVE_RATIO * last_fit.cost).sum())
+            level, fit, supported_indices = _add_bodies(setting, bodies.subset(order), start, num_certain_bodies)
             unsupported_indices = np.setdiff1d(np.arange(len(order)), supported_indices)
             doubtful = (
                 *doubtful,

@@ -94,10 +94,10 @@ class FrameCheck:
         change = np.where(usable, values - self.expected_voltages, 0)
         if np.linalg.norm(change) <= _EQUALITY_TOLERANCE * self.expected_norm:
             return values, usable, FrameStatus.UNCHANGED, f"{reason} It equals an undisturbed frame.".lstrip()
-        usable, noise_status, noise = self.check_reciprocal_noise(change, usable)
+        usable, noise_status, noise = self.check_noise_by_reciprocity(change, usable)
         return values, usable, noise_status or status, f"{reason} {noise}".strip()
 
-    def check_reciprocal_noise(self, change, usable) -> tuple[Bool[np.ndarray, " M"], FrameStatus | None, str]:
+    def check_noise_by_reciprocity(self, change, usable) -> tuple[Bool[np.ndarray, " M"], FrameStatus | None, str]:
         """Compare the changes of reciprocal channels, which noise alone makes unequal. Returns the usable channels, and
         a status and a sentence if a noisy electrode is left out, if noise hides every change, or if there is none."""
         is_usable_pair = usable[self.first] & usable[self.second]

@@ -82,10 +82,10 @@ def _halve_cells(points: np.ndarray, cells: np.ndarray, parent_cells: np.ndarray
     pair_numbers = node_pairs[..., 0] * len(points) + node_pairs[..., 1]  # numbers are sorted faster than rows
     edges, edge_numbers = np.unique(pair_numbers, return_inverse=True)
     edges, edge_numbers = np.column_stack(np.divmod(edges, len(points))), edge_numbers.reshape(-1, 3)
-    lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+    edge_lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
     # If two edges of a cell are equally long, all cells must choose the same edge as the longest.
-    lengths = lengths * (1 + 1e-9 * np.arange(len(lengths)) / len(lengths))
-    longest_edges = edge_numbers[np.arange(len(cells)), lengths[edge_numbers].argmax(axis=1)]
+    edge_lengths = edge_lengths * (1 + 1e-9 * np.arange(len(edge_lengths)) / len(edge_lengths))
+    longest_edges = edge_numbers[np.arange(len(cells)), edge_lengths[edge_numbers].argmax(axis=1)]
     is_split = np.zeros(len(edges), bool)
     is_split[longest_edges[is_large]] = True
     while True:
@@ -97,7 +97,7 @@ def _halve_cells(points: np.ndarray, cells: np.ndarray, parent_cells: np.ndarray
     midpoint_nodes[is_split] = len(points) + np.arange(is_split.sum())
     points = np.concatenate([points, points[edges[is_split]].mean(axis=1)])
     # Turn each cell so that its longest edge comes first, then halve it.
-    longest_positions = lengths[edge_numbers].argmax(axis=1)
+    longest_positions = edge_lengths[edge_numbers].argmax(axis=1)
     rows = np.arange(len(cells))[:, None]
     rotated_cells, rotated_edges = (
         cells[rows, (longest_positions[:, None] + np.arange(3)) % 3],
