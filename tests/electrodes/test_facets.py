@@ -1,11 +1,12 @@
-"""Electrodes made of whole boundary facets: which facets they cover, by index, tag and node, and faults are refused."""
+"""Electrodes made of whole boundary facets: which facets they cover, by index, tag and node, and faults are refused.
+Of electrodes on faces, which appear undistorted from above."""
 
 import jax
 import numpy as np
 import pytest
 
-from jeit.electrodes import FacetElectrodes, electrodes_from_nodes, plates
-from jeit.mesh import Rectangle
+from jeit.electrodes import FaceDiscs, FacePatches, FacetElectrodes, SheetDiscs, electrodes_from_nodes, plates
+from jeit.mesh import Rectangle, box
 
 SHEET = Rectangle(0.02, 0.01).mesh(cell_size=0.004)
 
@@ -16,6 +17,15 @@ class Pen:
 
     def lines(self, lines, middle):
         self.drawn.append((np.array(lines), middle))
+
+    def disc(self, position, radius):
+        self.drawn.append("disc")
+
+    def rectangle(self, position, width, height):
+        self.drawn.append("rectangle")
+
+    def dot(self, position):
+        self.drawn.append("dot")
 
 
 def test_tags_nodes_and_indices_give_the_same_electrodes():
@@ -32,6 +42,19 @@ def test_tags_nodes_and_indices_give_the_same_electrodes():
     (left, left_middle), (right, right_middle) = pen.drawn
     assert np.ptp(left[..., 0]) == np.ptp(right[..., 0]) == 0
     np.testing.assert_allclose(right_middle - left_middle, [0.02, 0], atol=1e-12)
+
+
+def test_electrodes_on_walls_are_drawn_as_dots():
+    """Seen from above, only those in a sheet and on horizontal faces have their shape."""
+    solid, places = box(0.1, 0.1, 0.05, num_points=60), [[0.0, 0.0, 0.05], [0.0, 0.0, 0.0], [0.05, 0.0, 0.025]]
+    for electrodes, mesh, drawn in (
+        (SheetDiscs([[0.0, 0.0]], 2e-3, 0.01), SHEET, ["disc"]),
+        (FaceDiscs(places, 0.01, 0.01), solid, ["disc", "disc", "dot"]),
+        (FacePatches(np.array(places), 0.01, 0.02, 0.01), solid, ["rectangle", "rectangle", "dot"]),
+    ):
+        pen = Pen()
+        electrodes.draw(mesh, pen)  # pyright: ignore[reportArgumentType]
+        assert pen.drawn == drawn
 
 
 @pytest.mark.parametrize(
