@@ -163,7 +163,7 @@ def first_frames(
 
 @contextmanager
 def _report_connection(source: AbstractSource, task_name: str, report: Callable[[str], None]) -> Iterator[None]:
-    """Context that reports the name of a `task_name`, and each change of the state of the source's connection."""
+    """Context that reports the task `task_name`, and each change of the state of the source's connection."""
     end_event = threading.Event()
 
     def report_changes() -> None:

@@ -34,7 +34,7 @@ class TooFewNodesError(ValueError):
 
 @contextmanager
 def nodes_of_solid(num_requested: int | None, count_base_nodes: Callable[[int], int]) -> Iterator[None]:
-    """Convert a `TooFewNodesError` error raised inside this context into a `ValueError` about the number of nodes of a
+    """Convert a `TooFewNodesError` raised inside this context into a `ValueError` about the number of nodes of a
     solid.
 
     `num_requested`: number of nodes requested for the solid; `count_base_nodes`: function that returns how many of a
