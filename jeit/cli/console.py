@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
@@ -144,6 +145,16 @@ def format_with_unit(value: float | None, unit: str) -> str:
         if abs(value) >= 10.0**exponent:
             return f"{value / 10.0**exponent:.3g} {si_prefix}{unit}"
     return f"{value:.3g} {unit}"
+
+
+def detectable_text(report: dict[str, Any]) -> str:
+    """Text on the smallest insulating bodies that are detected, from their entry in a report."""
+    diameters = report["diameter_almost_everywhere"], report["diameter_in_half_of_the_domain"]
+    almost_everywhere, median = (diameter if diameter and math.isfinite(diameter) else None for diameter in diameters)
+    if median is None:
+        return "none: the noise exceeds the voltages of an insulating body in half of the domain"
+    everywhere = "none" if almost_everywhere is None else f"{1e3 * almost_everywhere:.2g} mm"
+    return f"insulating, {1e3 * median:.2g} mm across in half of the domain, {everywhere} almost everywhere"
 
 
 def format_in_one_unit(values: list[float], unit: str) -> tuple[str, list[str]]:

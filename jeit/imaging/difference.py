@@ -6,6 +6,7 @@ The command `jeit reconstruct` runs `image_difference`. Its steps are public fun
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -31,7 +32,7 @@ from jeit.inverse.calibration import Calibration
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes import KINDS, Ellipsoid, ShapeReconstruction, Star
-from jeit.inverse.uncertainty import image_noise
+from jeit.inverse.uncertainty import DetectableDiameters, detectable_diameters, detectable_strength, image_noise
 from jeit.mesh import Mesh
 from jeit_solvers import Status, one_thread_of_blas
 from jeit_solvers.engines import as_array
@@ -70,6 +71,8 @@ class ImagedDifference:
     - `frame`: number of the imaged frame in its file, from 0; `num_frames`: number of frames in the file.
     - `electrode_change`: the change of the electrodes since the reference, if it explains much of the difference; the
       image shows the rest.
+    - `noise` (M,): expected deviation of the measured voltage difference from the modelled one, volts, see
+      `PreparedDifference.modelled_noise`; None if not known.
 
     **Example:**
 
@@ -98,6 +101,7 @@ class ImagedDifference:
     frame: int = 0
     num_frames: int = 1
     electrode_change: ElectrodeChange | None = None
+    noise: Float[Array, " M"] | None = None
 
     def __repr__(self) -> str:
         return object_text(
@@ -191,6 +195,21 @@ class ImagedDifference:
                     "these electrodes do not determine which. If you know, bodies (--bodies) says so."
                 )
         return tuple(doubt_texts)
+
+    @functools.cached_property
+    def detectable_strength(self) -> Float[np.ndarray, " m"] | None:
+        """Smallest strength with which a body in each cell (m,) of the calibrated model's mesh is detected, m² (3-D:
+        m³), see `jeit.inverse.detectable_strength`; None for complex images, and if the noise is not known."""
+        if self.noise is None or self.is_complex or np.iscomplexobj(self.calibration.conductivity):
+            return None
+        usable = np.asarray(self.measurement.mask)[0] & np.asarray(self.reference.mask)[0]
+        return detectable_strength(self.calibration.model, self.calibration.conductivity, self.noise, usable)
+
+    @property
+    def detectable_diameters(self) -> DetectableDiameters | None:
+        """Diameters of the smallest insulating bodies that are detected, metres; None if not known."""
+        strength = self.detectable_strength
+        return None if strength is None else detectable_diameters(self.calibration.model.mesh, strength)
 
     @property
     def level(self) -> float:
@@ -307,6 +326,7 @@ def image_difference(
             frame=prepared.frame,
             num_frames=prepared.num_frames,
             electrode_change=prepared.electrode_change,
+            noise=prepared.modelled_noise,
         )
         inclusions, labels = _inclusions(imaged, grid, prepared)
     return replace(imaged, inclusions=tuple(inclusions), labels=labels)

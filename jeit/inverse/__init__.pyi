@@ -41,7 +41,14 @@ from .shapes import (
 )
 from .streaming.imager import Imager
 from .streaming.stream import FrameImage, FrameStatus, StreamState, stream
-from .uncertainty import Posterior, image_noise, posterior
+from .uncertainty import (
+    DetectableDiameters,
+    Posterior,
+    detectable_diameters,
+    detectable_strength,
+    image_noise,
+    posterior,
+)
 
 __all__ = [
     "LBFGSB",
@@ -54,6 +61,7 @@ __all__ = [
     "Choice",
     "ContactImpedance",
     "DenseBasis",
+    "DetectableDiameters",
     "ElectrodePosition",
     "Ellipsoid",
     "EllipsoidPrior",
@@ -90,6 +98,8 @@ __all__ = [
     "calibrate",
     "choose_hyperparameter",
     "compare_rules",
+    "detectable_diameters",
+    "detectable_strength",
     "discrepancy",
     "generalised_cross_validation",
     "greit",

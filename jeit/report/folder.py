@@ -17,6 +17,7 @@ import numpy as np
 from jeit.data import Measurement
 from jeit.electrodes import AbstractElectrodes
 from jeit.files import atomically_written_files
+from jeit.inverse import DetectableDiameters
 from jeit.mesh import Body
 
 # Handling of characters that cannot be encoded, such as invalid bytes in the names of files.
@@ -88,6 +89,18 @@ def describe_electrodes(electrodes: AbstractElectrodes | None) -> dict[str, Any]
     if electrodes is None:
         return {"kind": "at places not known"}
     return to_plain_values(electrodes.describe())
+
+
+def describe_detectable(diameters: DetectableDiameters | None) -> dict[str, Any] | None:
+    """Describe the smallest insulating bodies that are detected by their diameters in metres, None for one that exceeds
+    the domain; None if they are not known."""
+    if diameters is None:
+        return None
+    return {
+        "diameter_in_half_of_the_domain": diameters.median,
+        "diameter_almost_everywhere": diameters.almost_everywhere,
+        "unit": "m",
+    }
 
 
 def package_version(package: str) -> str | None:

@@ -16,8 +16,10 @@ from jeit.forward import ForwardModel
 from jeit.imaging import imaging_mesh
 from jeit.imaging.hyperparameter_rules import ComparedRules, RuleOutcome
 from jeit.imaging.wiring import MAX_WIRING_MISFIT, find_wiring
+from jeit.inverse import detectable_diameters, detectable_strength, relative_noise
 from jeit.mesh import Mesh
 from jeit.report.folder import (
+    describe_detectable,
     describe_domain,
     describe_electrodes,
     describe_measurement,
@@ -44,7 +46,8 @@ def report_measurement(measurement: Measurement) -> dict[str, Any]:
     report_measurement(pressed)
     ```
     """
-    protocol, signs = measurement.protocol, impossible_signs(measurement)
+    protocol, signs, model = measurement.protocol, impossible_signs(measurement), _described_model(measurement)
+    noise = _report_noise(measurement)
     content = {
         **describe_measurement(measurement),
         "frames": measurement.num_frames,
@@ -58,9 +61,10 @@ def report_measurement(measurement: Measurement) -> dict[str, Any]:
         "body": describe_domain(measurement.domain),
         "electrodes": {**describe_electrodes(measurement.electrodes), "number": protocol.num_electrodes},
         "reciprocity_error": reciprocity_error(measurement),
-        "noise": _report_noise(measurement),
+        "noise": noise,
+        "smallest_detectable_body": model and noise and _report_detectable(model, measurement, noise),
         "impossible_signs": None if signs is None else float(signs.max()),
-        "wiring": _describe_wiring(measurement),
+        "wiring": model and _describe_wiring(model, measurement),
     }
     return to_plain_values(content)
 
@@ -76,16 +80,41 @@ def _report_noise(measurement: Measurement) -> dict[str, Any] | None:
     return None if noise is None else {"standard_deviation": noise.standard_deviation, "method": noise.method}
 
 
-def _describe_wiring(measurement: Measurement) -> str | None:
-    """Describe in words the wiring estimated from the frame named "reference", or else from the first frame; None if
-    the body or the places of the electrodes are not known."""
+def _described_model(measurement: Measurement) -> ForwardModel | None:
+    """Model of the described body; None if the body or the places of the electrodes are not known."""
     domain, electrodes = measurement.domain, measurement.electrodes
     if domain is None or electrodes is None:
         return None
-    _, reference = measurement.split_reference() if "reference" in measurement.frame_names else (None, measurement)
-    model = ForwardModel(
-        imaging_mesh(domain, electrodes, None, usual=_MAX_MESH_NODES), electrodes, measurement.protocol
-    )
+    mesh = imaging_mesh(domain, electrodes, None, usual=_MAX_MESH_NODES)
+    return ForwardModel(mesh, electrodes, measurement.protocol)
+
+
+def _reference_frame(measurement: Measurement) -> Measurement:
+    """The frame named "reference", or else all frames."""
+    return measurement.split_reference()[1] if "reference" in measurement.frame_names else measurement
+
+
+def _report_detectable(model: ForwardModel, measurement: Measurement, noise: dict[str, Any]) -> dict[str, Any] | None:
+    """Smallest insulating bodies that a difference of two frames of the file shows, with the `noise` of its voltages,
+    which is assumed to be larger for larger voltages, see `relative_noise`. None for complex voltages, and if no
+    voltage of the reference is usable."""
+    reference = _reference_frame(measurement)
+    voltages, is_used = np.asarray(reference.voltages)[0], np.asarray(reference.mask)[0]
+    if np.iscomplexobj(voltages) or not is_used.any() or not noise["standard_deviation"]:
+        return None
+    channel_noise = np.asarray(relative_noise(voltages, is_used))
+    channel_noise = np.sqrt(2) * noise["standard_deviation"] * channel_noise / np.median(channel_noise[is_used])
+    # The median is of channels without contact voltages, which the description does not determine.
+    resistivity = np.median(np.abs(voltages / np.asarray(model.voltages(1.0)))[is_used])
+    if not (np.isfinite(resistivity) and resistivity > 0):
+        return None
+    strength = detectable_strength(model, 1 / resistivity, channel_noise, is_used)
+    return describe_detectable(detectable_diameters(model.mesh, strength))
+
+
+def _describe_wiring(model: ForwardModel, measurement: Measurement) -> str:
+    """Describe in words the wiring estimated from the frame named "reference", or else from the first frame."""
+    reference = _reference_frame(measurement)
     wiring, error = find_wiring(model, reference), reciprocity_error(reference)
     if error is not None and error > MAX_RECIPROCITY_ERROR and not wiring.explanation:
         return (

@@ -11,7 +11,14 @@ from rich.console import Console
 from jeit.arguments import percent
 from jeit.cli import console as console_room
 from jeit.cli.commands.reconstruct import bodies_text
-from jeit.cli.console import Steps, format_in_one_unit, format_with_unit, inclusion_table, quantity_table
+from jeit.cli.console import (
+    Steps,
+    detectable_text,
+    format_in_one_unit,
+    format_with_unit,
+    inclusion_table,
+    quantity_table,
+)
 from jeit.image import Inclusion, SolidForm
 
 SAID = {
@@ -135,6 +142,17 @@ def test_values_have_the_prefix_that_suits_them():
         ([], "S", []),
     ):
         assert format_in_one_unit(values, "S") == (unit, texts)
+
+
+def test_smallest_bodies_that_are_not_detected_have_no_size():
+    def text(median, almost_everywhere):
+        names = "diameter_in_half_of_the_domain", "diameter_almost_everywhere"
+        return detectable_text(dict(zip(names, (median, almost_everywhere), strict=True)))
+
+    assert text(0.0123, 0.02) == "insulating, 12 mm across in half of the domain, 20 mm almost everywhere"
+    assert text(0.0123, None) == text(0.0123, float("inf"))
+    assert text(0.0123, None) == "insulating, 12 mm across in half of the domain, none almost everywhere"
+    assert text(float("inf"), None).startswith("none: the noise exceeds")
 
 
 def test_the_time_left_is_estimated_where_parts_are_known(monkeypatch):

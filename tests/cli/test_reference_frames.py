@@ -1,6 +1,7 @@
 """Recordings that begin with the undisturbed body: the reference from their own frames."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -26,6 +27,27 @@ def test_reference_is_the_mean_of_frames_of_the_data_or_of_the_given_file(tank, 
     _, base = read_pair(tank.folder / "touched.csv", recording, None, None, None)
     assert base is not None
     assert base.num_frames == 3
+
+
+def test_the_smallest_detectable_body_is_printed_and_reported(tank, run, tmp_path):
+    noise = np.random.default_rng(0).normal(size=(2, tank.rest.size))
+    for name, voltages, draw in (("rest", tank.rest, noise[0]), ("touched", tank.touched, noise[1])):
+        tank.write(name, voltages + 1e-3 * np.abs(voltages) * draw)
+    status, printed, _ = run("info", tank.folder / "touched.csv")
+    assert status == 0
+    (words,) = re.findall(r"smallest body +insulating, ([0-9.]+) mm across in half", " ".join(printed.split()))
+    status, printed, error = run(
+        "reconstruct", tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv",
+        "--output", tmp_path / "out", "--method", "one-step", "--hyperparameter", 1,
+        "--num-points", 250, "--contact", "fixed",
+    )  # fmt: skip
+    assert (status, error) == (0, "")
+    report = json.loads((tmp_path / "out" / "report.json").read_text("utf-8"))["smallest_detectable_body"]
+    median, almost_everywhere = report["diameter_in_half_of_the_domain"], report["diameter_almost_everywhere"]
+    assert 0 < median < almost_everywhere
+    assert f"insulating, {1e3 * median:.2g} mm across" in " ".join(printed.split())
+    # Both are those of noise, which is estimated from each file alone or from the difference.
+    assert 1e-3 * float(words) == pytest.approx(median, rel=0.5)
 
 
 @pytest.mark.parametrize("frames", ["1-0", "0-3", "3", "-1", "0:2", "a", ""])

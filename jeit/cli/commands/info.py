@@ -25,13 +25,13 @@ def info(
 ) -> None:
     """Print what DATA contains: frames, electrodes, protocol, noise, assumptions, and masked voltages."""
     from jeit.arguments import counted, percent
-    from jeit.cli.console import format_with_unit, name_value_table, plain_console
+    from jeit.cli.console import detectable_text, format_with_unit, name_value_table, plain_console
     from jeit.data.frame_checks import MAX_IMPOSSIBLE_SIGN_SHARE
     from jeit.report import report_measurement
 
     measurement = read_file("DATA", data, format, description, key=key)
     report = report_measurement(measurement)
-    body, noise = report["body"], report["noise"]
+    body, noise, smallest_body = report["body"], report["noise"], report["smallest_detectable_body"]
     names = f" ({', '.join(report['frame_names'])})" if report["frame_names"] else ""
     rate = f", {report['frame_rate']:.4g} a second" if report["frame_rate"] else ""
     noise_text = noise and f"{format_with_unit(noise['standard_deviation'], 'V')}, from {noise['method']}"
@@ -46,6 +46,7 @@ def info(
         ("electrodes", f"{report['electrodes']['number']}, {report['electrodes']['kind']}"),
         ("reciprocity error", percent(report["reciprocity_error"])),
         ("noise", noise_text or "not known"),
+        ("smallest body", "not known" if smallest_body is None else detectable_text(smallest_body)),
         ("impossible signs", percent(report["impossible_signs"])),
     ]
     if (report["impossible_signs"] or 0) > MAX_IMPOSSIBLE_SIGN_SHARE:

@@ -174,8 +174,15 @@ def print_imaging_result(console, result: "ImagedDifference", *, frame_given: bo
     import numpy as np
 
     from jeit.arguments import counted, percent
-    from jeit.cli.console import format_with_unit, inclusion_table, name_value_table, quantity_table
+    from jeit.cli.console import (
+        detectable_text,
+        format_with_unit,
+        inclusion_table,
+        name_value_table,
+        quantity_table,
+    )
     from jeit.inverse.nonlinear.reconstruct import Reconstruction
+    from jeit.report.folder import describe_detectable
     from jeit_solvers import Status
 
     calibration, reconstruction = result.calibration, result.reconstruction
@@ -198,6 +205,8 @@ def print_imaging_result(console, result: "ImagedDifference", *, frame_given: bo
         ("method", f"{result.settings.method}, hyperparameter {choice_text}"),
         ("mesh", f"{counted(result.mesh.num_points, 'node')}, {counted(result.mesh.num_cells, 'cell')}"),
     ]
+    if (diameters := describe_detectable(result.detectable_diameters)) is not None:
+        rows.insert(3, ("smallest body", detectable_text(diameters)))
     if result.quality.rounding > _MIN_REPORTED_ROUNDING_ERROR:
         rows.insert(3, ("rounding", f"{percent(result.quality.rounding)} of the difference: voltages have few digits"))
     if calibration.note:
