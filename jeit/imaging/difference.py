@@ -6,9 +6,9 @@ The command `jeit reconstruct` runs `image_difference`. Its steps are public fun
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Float, Inexact, UInt8
@@ -196,20 +196,23 @@ class ImagedDifference:
                 )
         return tuple(doubt_texts)
 
-    @functools.cached_property
+    @property
     def detectable_strength(self) -> Float[np.ndarray, " m"] | None:
         """Smallest strength with which a body in each cell (m,) of the calibrated model's mesh is detected, m² (3-D:
         m³), see `jeit.inverse.detectable_strength`; None for complex images, and if the noise is not known."""
-        if self.noise is None or self.is_complex or np.iscomplexobj(self.calibration.conductivity):
-            return None
-        usable = np.asarray(self.measurement.mask)[0] & np.asarray(self.reference.mask)[0]
-        return detectable_strength(self.calibration.model, self.calibration.conductivity, self.noise, usable)
+        return self._detectable(detectable_strength)
 
     @property
     def detectable_diameters(self) -> DetectableDiameters | None:
-        """Diameters of the smallest insulating bodies that are detected, metres; None if not known."""
-        strength = self.detectable_strength
-        return None if strength is None else detectable_diameters(self.calibration.model.mesh, strength)
+        """Diameters of the smallest insulating bodies that are detected, see `jeit.inverse.detectable_diameters`; None
+        for complex images, and if the noise is not known."""
+        return self._detectable(detectable_diameters)
+
+    def _detectable(self, compute: Callable[..., Any]) -> Any:
+        if self.noise is None or self.is_complex or np.iscomplexobj(self.calibration.conductivity):
+            return None
+        usable = np.asarray(self.measurement.mask)[0] & np.asarray(self.reference.mask)[0]
+        return compute(self.calibration.model, self.calibration.conductivity, self.noise, usable)
 
     @property
     def level(self) -> float:

@@ -32,7 +32,7 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jeit.arguments import check_has_values, check_key, check_kind
 from jeit.forward import ForwardModel
@@ -42,7 +42,7 @@ from jeit.inverse.nonlinear.problem import Inversion, check_background
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.prior.bases import expand_rows
 from jeit.inverse.prior.penalties import AbstractNormal
-from jeit.mesh import Mesh, measures
+from jeit.mesh import measures
 from jeit_solvers import Status
 from jeit_solvers.engines import as_array, has_values, namespace, numpy_or_compiled, on_host
 from jeit_solvers.module import Module
@@ -52,6 +52,8 @@ _ROWS_AT_ONCE = 32
 # Norm of a body's voltages, in standard deviations of the noise, from which the body is detected. In simulated tanks,
 # 114 of 115 bodies above it were detected, and one of 3 below it.
 _DETECTABLE_NORM = 8.0
+# Maximum number of cells of which the detectable strength is computed for `detectable_diameters`.
+_MAX_EXAMINED_CELLS = 4000
 # Share of the area or volume in which a body of the larger `DetectableDiameters` is detected.
 _ALMOST_ALL = 0.95
 
@@ -298,7 +300,7 @@ class DetectableDiameters(NamedTuple):
     **Example:**
 
     ```python
-    median, almost_everywhere = detectable_diameters(model.mesh, detectable_strength(model, 1.0, noise=1e-6))
+    median, almost_everywhere = detectable_diameters(model, 1.0, noise=1e-6)
     ```
     """
 
@@ -311,8 +313,9 @@ def detectable_strength(
     background: ArrayLike,
     noise: Float[Array, " M"] | float,
     mask: Bool[Array, " M"] | None = None,
-) -> Float[np.ndarray, " m"]:
-    """Smallest strength (m,), in m² (3-D: m³), with which a small body in each cell is detected.
+    cells: Int[np.ndarray, " k"] | None = None,
+) -> Float[np.ndarray, " k"]:
+    """Smallest strength (k,), in m² (3-D: m³), with which a small body in each cell is detected.
 
     The strength of a body of area A (3-D: volume) with ρ times the conductivity of the background is A |ρ - 1| / (ρ +
     1) in a sheet, and A |ρ - 1| / (ρ + 2) in a solid. A body is detected by the default imaging method if the norm of
@@ -325,6 +328,7 @@ def detectable_strength(
     - `background`: conductivity without bodies, one number or (m,), S/m (2-D: S).
     - `noise`: standard deviation of a voltage difference, one number or (M,), volts.
     - `mask` (M,): True for usable channels.
+    - `cells` (k,): indices of the cells; default: all.
 
     Raises `ValueError` for invalid or traced arguments.
 
@@ -339,32 +343,50 @@ def detectable_strength(
     channels, root_weight = used_channels(model, noise, mask)
     fields = evaluate(model, fields_and_impedance_of, conductivity)[0]
     mesh, protocol, fields = on_host((model.mesh, model.protocol.subset(channels), fields))
+    if cells is not None:
+        mesh, conductivity = eqx.tree_at(lambda mesh: mesh.cells, mesh, mesh.cells[cells]), conductivity[cells]
     squared_norm = np.empty(mesh.num_cells)
-    for cells, jacobian in jacobian_blocks(mesh, protocol, fields):
-        squared_norm[cells] = np.square(root_weight) @ np.square(jacobian)
+    for block, jacobian in jacobian_blocks(mesh, protocol, fields):
+        squared_norm[block] = np.square(root_weight) @ np.square(jacobian)
     return _DETECTABLE_NORM * np.asarray(measures(mesh)) / (mesh.dimension * conductivity * np.sqrt(squared_norm))
 
 
-def detectable_diameters(mesh: Mesh, strength: Float[np.ndarray, " m"]) -> DetectableDiameters:
-    """Diameters of the smallest insulating bodies that can be detected, from the detectable `strength` (m,) in each
-    cell of a mesh, m² (3-D: m³).
+def detectable_diameters(
+    model: ForwardModel,
+    background: ArrayLike,
+    noise: Float[Array, " M"] | float,
+    mask: Bool[Array, " M"] | None = None,
+) -> DetectableDiameters:
+    """Diameters of the smallest round insulating bodies that are detected, see `detectable_strength`. Of a large mesh,
+    a random selection of cells is examined.
 
     **Arguments:**
 
-    - `mesh`: mesh of the model.
-    - `strength` (m,): result of `detectable_strength`.
+    - `model`, `background`, `noise`, `mask`: as in `detectable_strength`.
+
+    Raises `ValueError` for invalid or traced arguments.
 
     **Example:**
 
     ```python
-    diameters = detectable_diameters(model.mesh, detectable_strength(model, 1.0, noise=1e-6))
+    diameters = detectable_diameters(model, 1.0, noise=1e-6)
     ```
     """
-    cell_measures = np.asarray(measures(mesh))
+    num_cells, cells = model.mesh.num_cells, None
+    if num_cells > _MAX_EXAMINED_CELLS:
+        cells = np.sort(np.random.default_rng(0).choice(num_cells, _MAX_EXAMINED_CELLS, replace=False))
+    strength = detectable_strength(model, background, noise, mask, cells)
+    cell_measures = np.asarray(measures(on_host(model.mesh)))
+    largest, weights = float(cell_measures.sum()), cell_measures if cells is None else cell_measures[cells]
+    return _diameters(strength, weights, largest, model.mesh.dimension)
+
+
+def _diameters(strength, weights, largest: float, dimension: int) -> DetectableDiameters:
+    """Diameters of insulating bodies of the detectable `strength` in cells with `weights`; infinite for areas or
+    volumes above the `largest`."""
     order = np.argsort(strength)
-    shares = np.cumsum(cell_measures[order]) / cell_measures.sum()
-    indices = order[np.searchsorted(shares, (0.5, _ALMOST_ALL))]
+    shares = np.cumsum(weights[order]) / weights.sum()
     # An insulating disk has its area as strength, an insulating ball half its volume.
-    sizes = np.asarray(strength)[indices] * (1 if mesh.dimension == 2 else 2)
-    diameters = 2 * np.sqrt(sizes / np.pi) if mesh.dimension == 2 else np.cbrt(6 * sizes / np.pi)
-    return DetectableDiameters(*np.where(sizes < cell_measures.sum(), diameters, np.inf).tolist())
+    sizes = strength[order[np.searchsorted(shares, (0.5, _ALMOST_ALL))]] * (1 if dimension == 2 else 2)
+    diameters = 2 * np.sqrt(sizes / np.pi) if dimension == 2 else np.cbrt(6 * sizes / np.pi)
+    return DetectableDiameters(*np.where(sizes < largest, diameters, np.inf).tolist())

@@ -16,7 +16,7 @@ from jeit.forward import ForwardModel
 from jeit.imaging import imaging_mesh
 from jeit.imaging.hyperparameter_rules import ComparedRules, RuleOutcome
 from jeit.imaging.wiring import MAX_WIRING_MISFIT, find_wiring
-from jeit.inverse import detectable_diameters, detectable_strength, relative_noise
+from jeit.inverse import detectable_diameters, relative_noise
 from jeit.mesh import Mesh
 from jeit.report.folder import (
     describe_detectable,
@@ -108,8 +108,7 @@ def _report_detectable(model: ForwardModel, measurement: Measurement, noise: dic
     resistivity = np.median(np.abs(voltages / np.asarray(model.voltages(1.0)))[is_used])
     if not (np.isfinite(resistivity) and resistivity > 0):
         return None
-    strength = detectable_strength(model, 1 / resistivity, channel_noise, is_used)
-    return describe_detectable(detectable_diameters(model.mesh, strength))
+    return describe_detectable(detectable_diameters(model, 1 / resistivity, channel_noise, is_used))
 
 
 def _describe_wiring(model: ForwardModel, measurement: Measurement) -> str:

@@ -6,12 +6,14 @@ import pytest
 from jeit.electrodes import BoundaryElectrodes, FacePatches
 from jeit.forward import ForwardModel
 from jeit.inverse import detectable_diameters, detectable_strength
+from jeit.inverse.uncertainty import _MAX_EXAMINED_CELLS, _diameters
 from jeit.layout import ring
 from jeit.mesh import Disk, Solid, centroids, measures
 from jeit.protocol import adjacent
 
 NOISE, BACKGROUND = 1e-6, 0.3
 LIMIT = 8.0  # standard deviations
+DISK = np.pi * 0.1**2
 
 
 @pytest.fixture(scope="module")
@@ -52,29 +54,34 @@ def test_channels_without_use_do_not_count_and_noise_scales(disk):
 
 def test_diameters_are_those_of_insulating_bodies(disk):
     mesh = disk[0].mesh
-    area = np.asarray(measures(mesh))
+    area, centres = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
     everywhere = np.full(mesh.num_cells, np.pi * 0.01**2)
-    assert detectable_diameters(mesh, everywhere) == pytest.approx((0.02, 0.02))
-    centres = np.asarray(centroids(mesh))
-    half = detectable_diameters(mesh, np.where(centres[:, 0] < -0.01, 1.0, 4.0) * np.pi * 0.01**2)
-    assert half == pytest.approx((0.04, 0.04))
-    rim = np.linalg.norm(centres, axis=1) > np.sqrt(0.97) * 0.1
-    assert area[rim].sum() < 0.05 * area.sum()
-    median, almost_everywhere = detectable_diameters(mesh, np.where(rim, np.inf, np.pi * 0.01**2))
-    assert (median, almost_everywhere) == pytest.approx((0.02, 0.02))
-    assert detectable_diameters(mesh, 1e3 * everywhere) == (np.inf, np.inf)
+    assert _diameters(everywhere, area, DISK, 2) == pytest.approx((0.02, 0.02))
+    half = np.where(centres[:, 0] < -0.01, 1.0, 4.0) * everywhere
+    assert _diameters(half, area, DISK, 2) == pytest.approx((0.04, 0.04))
+    hidden = np.arange(len(area)) % 25 == 0  # 4 % of the cells
+    assert 0 < area[hidden].sum() < 0.05 * area.sum()
+    assert _diameters(np.where(hidden, np.inf, everywhere), area, DISK, 2) == pytest.approx((0.02, 0.02))
+    assert _diameters(1e3 * everywhere, area, DISK, 2) == (np.inf, np.inf)
+    # An insulating ball has half its volume as strength.
+    assert _diameters(np.full(5, 0.5 * np.pi * 0.02**3 / 6), np.ones(5), DISK, 3) == pytest.approx((0.02, 0.02))
 
 
-def test_an_insulating_ball_has_half_its_volume_as_strength():
+def test_a_large_mesh_is_sampled(disk):
+    model = disk[1]
+    assert model.mesh.num_cells > 2 * _MAX_EXAMINED_CELLS
+    every = _diameters(detectable_strength(model, BACKGROUND, NOISE), np.asarray(measures(model.mesh)), DISK, 2)
+    assert detectable_diameters(model, BACKGROUND, NOISE) == pytest.approx(every, rel=0.03)
+
+
+def test_a_small_body_in_a_solid():
     mesh = Solid(Disk(0.1), 0.1).mesh(num_points=400)
-    ball = np.full(mesh.num_cells, 0.5 * np.pi * 0.02**3 / 6)
-    assert detectable_diameters(mesh, ball) == pytest.approx((0.02, 0.02))
     model = ForwardModel(mesh, FacePatches(ring(0.1, 8, height=0.05), 0.04, 0.05, 1e-3), adjacent(8))
-    strength = detectable_strength(model, BACKGROUND, NOISE)
+    strength = detectable_strength(model, BACKGROUND, NOISE, cells=np.array([7, 500]))[1]
     change = 1e-3 * BACKGROUND * (np.arange(mesh.num_cells) == 500)
     voltages = np.asarray(model.voltages(BACKGROUND + change)) - np.asarray(model.voltages(BACKGROUND))
     cell_strength = float(measures(mesh)[500]) * 1e-3 / 3
-    assert np.linalg.norm(voltages) / NOISE * strength[500] / cell_strength == pytest.approx(LIMIT, rel=2e-3)
+    assert np.linalg.norm(voltages) / NOISE * strength / cell_strength == pytest.approx(LIMIT, rel=2e-3)
 
 
 @pytest.mark.parametrize(
