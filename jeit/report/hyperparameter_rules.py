@@ -10,7 +10,7 @@ import numpy as np
 
 from jeit.arguments import counted, percent
 from jeit.data import Measurement, estimate_noise, impossible_signs, reciprocity_error
-from jeit.data.frame_checks import MAX_RECIPROCITY_ERROR
+from jeit.data.frame_checks import MAX_IMPOSSIBLE_SIGN_SHARE, MAX_RECIPROCITY_ERROR
 from jeit.data.quality import rounding_deviation
 from jeit.forward import ForwardModel
 from jeit.imaging import imaging_mesh
@@ -62,7 +62,9 @@ def report_measurement(measurement: Measurement) -> dict[str, Any]:
         "electrodes": {**describe_electrodes(measurement.electrodes), "number": protocol.num_electrodes},
         "reciprocity_error": reciprocity_error(measurement),
         "noise": noise,
-        "smallest_detectable_body": model and noise and _report_detectable(model, measurement, noise),
+        "smallest_detectable_body": _report_detectable(model, measurement, noise)
+        if model and noise and (signs is None or signs.max() <= MAX_IMPOSSIBLE_SIGN_SHARE)
+        else None,
         "impossible_signs": None if signs is None else float(signs.max()),
         "wiring": model and _describe_wiring(model, measurement),
     }
