@@ -333,6 +333,10 @@ FAULTS = {
     "swisstom, another version": (changed(swiss, 0, b"\0\0\0\3"), "not known; format 4 is"),
     "swisstom, header beyond the end": (changed(swiss, 4, b"\xff\xff\xff\x7f"), "beyond its end"),
     "swisstom, a frame of negative length": (changed(swiss, 64 + 12, b"\xff\xff\xff\xff"), "damaged"),
+    "swisstom, a frame too short for its voltages": (
+        changed(swiss, 64 + 12, b"\x10\0\0\0"),
+        "length of 16; it is dama",
+    ),
     "carefusion, no header": (
         lambda path: path.write_bytes(b"\xff\xfe" + '<?xml version="1.0" ?><EIT_File>'.encode("utf-16-le")),
         "does not say where",

@@ -258,3 +258,24 @@ def test_overlapping_discs_are_named(number):
     """Even if so many share an area that one seems to lie off the mesh."""
     with pytest.raises(ValueError, match=r"Electrodes 1 and 2 overlap by 0\.006 m"):
         SheetDiscs(np.zeros((number, 2)), 3e-3, 1e-3).check(rectangle(0.06, 0.06, cell_size=2e-3))
+
+
+@pytest.mark.parametrize(
+    ("positions", "message"),
+    [
+        ([[0, 0], [0.09, 0], [0.2, 0]], r"electrode 3 at \[0.2, 0.0\] m lies outside the mesh"),
+        ([[0, 0], [0.01, 0.02], [0, 0.03], [0.01, 0.02]], "Electrodes 2 and 4 are at the same position"),
+    ],
+)
+def test_misplaced_point_electrodes_are_named(positions, message):
+    with pytest.raises(ValueError, match=message):
+        PointElectrodes(positions).check(disk(0.1, num_points=200))
+
+
+def test_a_point_electrode_off_a_surface_is_named():
+    sheet = rectangle(0.06, 0.06, cell_size=5e-3)
+    points = np.asarray(sheet.points)
+    bent = Mesh.create(np.column_stack([points, 0.1 * points[:, 0] ** 2]), sheet.cells)
+    PointElectrodes([[0, 0, 0], [0.01, 0, 1e-5]]).check(bent)
+    with pytest.raises(ValueError, match=r"electrode 2 at \[0.01, 0.0, 0.02\] m lies off the surface"):
+        PointElectrodes([[0, 0, 0], [0.01, 0, 0.02]]).check(bent)

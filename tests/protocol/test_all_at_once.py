@@ -141,6 +141,8 @@ def test_measurements_of_potentials(measurement):
         (lambda one, two: protocol.optimal(-one, two, power=1e-3), "dissipate no power"),
         (lambda one, two: protocol.optimal(0 * one, two, power=1e-3), "dissipate no power"),
         (lambda one, two: protocol.optimal(one, two, power=-1.0), "positive number of watts"),
+        (lambda one, two: protocol.optimal(one, two, power="1"), "positive number of watts; it is '1'"),
+        (lambda one, two: protocol.optimal(one, two, power=True), "positive number of watts; it is True"),
         (lambda one, two: protocol.optimal(one, two, power=1e9), "above what"),
         (lambda one, two: protocol.optimal(one, two, number=0), "at least 1"),
     ],

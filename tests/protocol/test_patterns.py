@@ -153,6 +153,8 @@ def test_skip_any(count, skipped, driven):
 
 BAD = {
     "too few electrodes": (lambda: protocol.adjacent(3), "at least 4"),
+    "too few electrodes to skip": (lambda: protocol.skip(3, 1), "^skip: .* at least 4; got 3"),
+    "too few electrodes to skip none": (lambda: protocol.skip(3, 0), "^adjacent: .* at least 4; got 3"),
     "not an integer": (lambda: protocol.adjacent(16.0), "integer"),
     "odd opposite": (lambda: protocol.opposite(15), r"opposite pairs.*skip\(\.\.\., 6\)"),
     "milliamperes": (lambda: protocol.adjacent(16, current=1.4), "1.4 mA, write 1.4e-3 .microamperes: 1.4e-6"),
