@@ -136,12 +136,13 @@ def test_arrays_that_do_not_match(published, tmp_path, change, replaced, message
     [
         ('kind = "optimal"\ntransfer = [[1, -1], [-1, 1]]', "give one of them"),
         ('kind = "optimal"\ntransfer = [[1, -1], [-1, 1]]\npower = 1e-6', "power needs other"),
-        ('kind = "measured"', "takes the currents from"),
+        ('kind = "measured"', "from a .mat or .npz file; 'p.csv' is none"),
         ('kind = "haar"\nnumber = 8', "current"),
     ],
 )
 def test_impossible_protocols(tmp_path, options, message):
     (tmp_path / "p.toml").write_text(f"[protocol]\n{options}\n", "utf-8")
+    (tmp_path / "p.csv").write_text("1,2\n", "utf-8")
     with pytest.raises(ValueError, match=re.escape(message)):
         data.load_description(tmp_path / "p.toml").protocol(tmp_path / "p.csv")
 

@@ -194,11 +194,12 @@ def test_spreadsheet_exports(frames, tmp_path):
     np.testing.assert_allclose(read(tmp_path / "a.txt").voltages, values, rtol=1e-8)
 
 
-def test_times_in_the_unit_of_their_heading(frames, tmp_path):
+@pytest.mark.parametrize(("heading", "unit"), [("t_ms", 1e-3), ("time_us", 1e-6), ("t / µs", 1e-6), ("t", 1.0)])
+def test_times_in_the_unit_of_their_heading(heading, unit, frames, tmp_path):
     values, _ = voltages_of(frames, False, "rotating", "all")
     path = written(tmp_path / "a.csv", values, heading=True, times=[1000, 1050, 1100])
-    path.write_text(path.read_text("utf-8").replace("channel 0", "t_ms", 1), "utf-8")
-    np.testing.assert_allclose(read(path).times, [1, 1.05, 1.1])
+    path.write_text(path.read_text("utf-8").replace("channel 0", heading, 1), "utf-8")
+    np.testing.assert_allclose(read(path).times, unit * np.array([1000, 1050, 1100]))
 
 
 def test_a_rising_first_channel_is_not_taken_for_times():

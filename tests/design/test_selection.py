@@ -47,7 +47,7 @@ each_criterion = pytest.mark.parametrize("criterion", ["D", "A"])
 
 
 @pytest.mark.parametrize(
-    ("shapes", "criterion"), [(3, "D"), *(pytest.param(20, each, marks=pytest.mark.slow) for each in "AD")]
+    ("shapes", "criterion"), [(3, "D"), (3, "A"), *(pytest.param(20, each, marks=pytest.mark.slow) for each in "AD")]
 )
 def test_information_equals_that_of_dense_matrices(shapes, criterion):
     case = Case(11, shapes)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from jeit.image import ImageSeries, amplitude_spectrum, ball_region, box_region, half_region, oscillation
+from jeit.image.image_series import _window_weights
 from jeit.mesh import Disk, centroids, measures
 
 TIMES = np.arange(400) / 20.0
@@ -21,6 +22,11 @@ def test_a_single_oscillation_is_estimated_exactly(window, frequency):
     assert found.amplitude == pytest.approx(2, rel=1e-9)
     assert found.phase == pytest.approx(0.7, abs=1e-9)
     assert found.resolution == pytest.approx({"hann": 2, "none": 1}[window] / 19.95)
+
+
+def test_the_window_is_that_of_hann_shifted_by_half_a_step():
+    phases = np.pi * (np.arange(9) + 0.5) / 9
+    np.testing.assert_allclose(_window_weights(2 + 0.1 * np.arange(9), "hann"), np.sin(phases) ** 2, rtol=1e-12)
 
 
 def test_uneven_times_and_missing_frames():

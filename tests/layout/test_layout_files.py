@@ -374,6 +374,7 @@ def test_invalid_paths(tmp_path):
         ((CENTRES, 6e-3), {"outline": Disk(0.085)}, r"electrode 3 \('3'\).*beyond the outline"),
         (([[0.06, 0.004]], 2e-3), {"outline": OUTLINE}, "beyond the outline"),
         ((1e3 * np.array(CENTRES), 6e-3), {"outline": OUTLINE}, "Are they in millimetres"),
+        ((np.vstack([CENTRES, [900.0, 0]]), 6e-3), {"outline": OUTLINE}, r"across at \(900000, 0\) mm, [^?]*$"),
         (([[0, 0]], 6.0), {"outline": OUTLINE}, "Is its diameter in metres"),
         ((1e3 * np.array(CENTRES), 6), {}, "factor of 1000"),
         ((CENTRES, 6e-3), {"labels": ["a", "b"]}, "there are 2; give one for each of the 3"),

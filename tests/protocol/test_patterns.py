@@ -160,6 +160,11 @@ BAD = {
     "milliamperes": (lambda: protocol.adjacent(16, current=1.4), "1.4 mA, write 1.4e-3 .microamperes: 1.4e-6"),
     "milliamperes in matrices": (lambda: protocol.from_matrices([[1.41, -1.41]], [[1, -1]]), "amperes"),
     "no current": (lambda: protocol.adjacent(16, current=0.0), "positive"),
+    "several currents": (
+        lambda: protocol.adjacent(16, current=np.full(1, 1e-3)),
+        "must be one positive, finite number",
+    ),
+    "current in words": (lambda: protocol.adjacent(16, current="1e-3"), "must be one positive, finite number"),
     "NaN current": (lambda: protocol.adjacent(16, current=float("nan")), "finite"),
     "skip back to itself": (lambda: protocol.skip(8, 7), "from 0 to 6"),
     "unknown order": (lambda: protocol.adjacent(16, order="clockwise"), "'rotating'"),
