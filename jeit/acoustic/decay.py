@@ -71,8 +71,10 @@ class InverseSquare(AbstractDecay):
 
     def log_response(self, squared_distance):
         """Logarithm of the response: log a − log(r² + b)."""
-        log = namespace(self, squared_distance).log
-        return column(log(self.a), squared_distance) - log(squared_distance + column(self.b, squared_distance))
+        logarithm = namespace(self, squared_distance).log
+        return column(logarithm(self.a), squared_distance) - logarithm(
+            squared_distance + column(self.b, squared_distance)
+        )
 
     def response(self, squared_distance):
         """Response a / (r² + b)."""
@@ -197,8 +199,8 @@ class AttenuatedInverseSquare(AbstractDecay):
     @classmethod
     def bounds(cls, extent):
         """Bounds of the logarithms of a, b and l: for a and b as in `InverseSquare`, for l as in `Exponential`."""
-        low, high = InverseSquare.bounds(extent), Exponential.bounds(extent)
-        return (*low[0], high[0][1]), (*low[1], high[1][1])
+        lower_bounds, upper_bounds = InverseSquare.bounds(extent), Exponential.bounds(extent)
+        return (*lower_bounds[0], upper_bounds[0][1]), (*lower_bounds[1], upper_bounds[1][1])
 
 
 def column(values: Float[Array, " M"], other_array: Array) -> Array:

@@ -60,23 +60,33 @@ class IntensityNoise(Module):
         """Create the noise parameters from the subtracted noise `floor` and the degrees of freedom ν of a window
         (`freedom`), or from the standard deviation s of the intensity without a source (`deviation`). `relative`:
         relative error τ. All parameters are numbers or arrays (M,)."""
-        arrays = [np.broadcast_to(np.asarray(value, float), (num_microphones,)) for value in (floor, freedom, relative)]
-        floors, degrees, errors = arrays
-        deviations = floors * np.sqrt(2 / degrees)
+        noise_arrays = [
+            np.broadcast_to(np.asarray(noise_value, float), (num_microphones,))
+            for noise_value in (floor, freedom, relative)
+        ]
+        noise_floors, degrees_of_freedom, relative_errors = noise_arrays
+        noise_deviations = noise_floors * np.sqrt(2 / degrees_of_freedom)
         if deviation is not None:
-            deviations = np.maximum(deviations, np.broadcast_to(np.asarray(deviation, float), (num_microphones,)))
+            noise_deviations = np.maximum(
+                noise_deviations, np.broadcast_to(np.asarray(deviation, float), (num_microphones,))
+            )
         floor, bounded_errors = (
-            np.maximum(floors, _MIN_NOISE_FLOOR_DEVIATIONS * deviations),
-            np.maximum(errors, MIN_RELATIVE_ERROR),
+            np.maximum(noise_floors, _MIN_NOISE_FLOOR_DEVIATIONS * noise_deviations),
+            np.maximum(relative_errors, MIN_RELATIVE_ERROR),
         )
-        return cls(*(as_array(values) for values in (floor, deviations, 4 * floors / degrees, bounded_errors)))
+        return cls(
+            *(
+                as_array(parameter_values)
+                for parameter_values in (floor, noise_deviations, 4 * noise_floors / degrees_of_freedom, bounded_errors)
+            )
+        )
 
     def variance(self, received_power: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
         """Variance (M, …) of the power minus the noise floor, for the expected power `received_power` (M, …)."""
-        relative, cross_coefficients, deviation = (
+        relative_error, cross_coefficients, additive_deviation = (
             column(x, received_power) for x in (self.relative, self.cross, self.deviation)
         )
-        return (relative**2 * received_power + cross_coefficients) * received_power + deviation**2
+        return (relative_error**2 * received_power + cross_coefficients) * received_power + additive_deviation**2
 
     def level(self, power: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
         """Level y = log(power + floor) for the `power` (M, …) minus the noise floor. The sum is bounded below by 0.05
@@ -118,22 +128,25 @@ class MicrophoneArray(Module):
 
     def response(self, chart: Float[Array, "2 ..."]) -> Float[Array, "M ..."]:
         """Responses f_i (M, …) of the microphones to sources at chart coordinates (2, …), metres."""
-        position = self.surface.place(chart)
-        microphones = self.microphones.reshape(self.microphones.shape + (1,) * (position.ndim - 1))
-        squares = [(position[k] - microphones[:, k]) ** 2 for k in range(position.shape[0])]
-        return self.decay.response(sum(squares[1:], squares[0]))
+        source_position = self.surface.place(chart)
+        microphones = self.microphones.reshape(self.microphones.shape + (1,) * (source_position.ndim - 1))
+        squared_differences = [(source_position[k] - microphones[:, k]) ** 2 for k in range(source_position.shape[0])]
+        return self.decay.response(sum(squared_differences[1:], squared_differences[0]))
 
     def expected(self, unknowns: Float[Array, "n F"]) -> tuple[Float[Array, "M F"], Float[Array, "M F"]]:
         """Expected levels m (M, F) of M microphones in F frames, and their variances v (M, F). `unknowns` (n, F): chart
         coordinates and logarithm of the strength of one or more sources."""
-        sources = [unknowns[k : k + 3] for k in range(0, len(unknowns), 3)]
+        unknowns_of_sources = [unknowns[k : k + 3] for k in range(0, len(unknowns), 3)]
         xp = namespace(self, unknowns)
-        powers = [xp.exp(source[2]) * self.response(source[:2]) for source in sources]
-        received_power = functools.reduce(operator.add, powers)
+        source_powers = [
+            xp.exp(unknowns_of_source[2]) * self.response(unknowns_of_source[:2])
+            for unknowns_of_source in unknowns_of_sources
+        ]
+        received_power = functools.reduce(operator.add, source_powers)
         return xp.log(received_power + self.noise.floor[:, None]), self.noise.level_variance(received_power)
 
 
 def check_array(microphone_array: MicrophoneArray) -> None:
     """Raises `ValueError` if `microphone_array` is not a `MicrophoneArray`."""
-    description = "a MicrophoneArray, such as calibration.microphone_array"
-    check_kind("microphone_array", microphone_array, MicrophoneArray, description)
+    array_description = "a MicrophoneArray, such as calibration.microphone_array"
+    check_kind("microphone_array", microphone_array, MicrophoneArray, array_description)

@@ -35,10 +35,10 @@ def write_calibration(fit: CalibrationFit, path: str | Path) -> None:
     calibration = Calibration.load("skin.json")
     ```
     """
-    path, picture = calibration_files(path)
-    with results(path.parent, (path.name, picture.name)) as output_folder:
+    path, picture_path = calibration_files(path)
+    with results(path.parent, (path.name, picture_path.name)) as output_folder:
         fit.calibration.save(output_folder / path.name)
-        draw_calibration(fit).savefig(output_folder / picture.name, dpi=130)
+        draw_calibration(fit).savefig(output_folder / picture_path.name, dpi=130)
 
 
 def calibration_files(path: str | Path) -> tuple[Path, Path]:
@@ -47,10 +47,10 @@ def calibration_files(path: str | Path) -> tuple[Path, Path]:
     path = Path(path)
     if path.is_dir():
         raise ValueError(f"path {path} is a folder; give a file, such as {path / 'calibration.json'}.")
-    picture = path.with_suffix(".png")
-    if picture == path:
+    picture_path = path.with_suffix(".png")
+    if picture_path == path:
         raise ValueError(f"path {path}: the calibration is JSON; give another name, such as {path.stem}.json.")
-    return path, picture
+    return path, picture_path
 
 
 def draw_calibration(fit: CalibrationFit):
@@ -64,9 +64,9 @@ def draw_calibration(fit: CalibrationFit):
     return figure
 
 
-_PACKAGES = ("jeit", "jax", "numpy", "scipy")
+_REPORTED_PACKAGES = ("jeit", "jax", "numpy", "scipy")
 # Number of pixels along each side of a map of the skin, and number of frames whose maps are computed at once.
-_NUM_PIXELS, _NUM_CHUNK_FRAMES = 100, 256
+_NUM_MAP_PIXELS, _NUM_CHUNK_FRAMES = 100, 256
 
 
 def write_track(found: LocatedTouches, folder: str | Path) -> None:
@@ -93,8 +93,8 @@ def write_track(found: LocatedTouches, folder: str | Path) -> None:
     ```
     """
     with results(folder, ("track.csv", "report.json", "track.png")) as output_folder:
-        columns = _column_names(found.locations.position.shape[1])
-        write_rows(output_folder / "track.csv", columns, _track_rows(found.locations, found.track))
+        column_names = _column_names(found.locations.position.shape[1])
+        write_rows(output_folder / "track.csv", column_names, _track_rows(found.locations, found.track))
         write_json(report_track(found), output_folder / "report.json")
         draw_track(found).savefig(output_folder / "track.png", dpi=150)
 
@@ -102,27 +102,35 @@ def write_track(found: LocatedTouches, folder: str | Path) -> None:
 def report_track(located_touches: LocatedTouches) -> dict[str, Any]:
     """Summarise the result of `locate_touches` in a dictionary for a JSON report, with None for unknown values."""
     locations, track, calibration = located_touches.locations, located_touches.track, located_touches.calibration
-    touches = []
-    for number, touch in enumerate(track.touches, 1):
-        frames = slice(touch.first, touch.last + 1)
-        strength = locations.strength[frames]
-        statuses = [str(status) for status in locations.status[frames] if status != LocationStatus.NO_TOUCH]
-        touches.append(
+    touch_reports = []
+    for item_number, touch in enumerate(track.touches, 1):
+        frame_slice = slice(touch.first, touch.last + 1)
+        touch_strengths = locations.strength[frame_slice]
+        frame_statuses = [
+            str(frame_status)
+            for frame_status in locations.status[frame_slice]
+            if frame_status != LocationStatus.NO_TOUCH
+        ]
+        touch_reports.append(
             {
-                "touch": number,
+                "touch": item_number,
                 "onset_s": touch.onset,
                 "offset_s": touch.offset,
                 "path_length_m": touch.length,
-                "mean_position_m": np.nanmean(track.position[frames], axis=0),
-                "status": {status: statuses.count(status) for status in dict.fromkeys(statuses)},
-                "greatest_strength": np.nanmax(strength),
+                "mean_position_m": np.nanmean(track.position[frame_slice], axis=0),
+                "status": {
+                    frame_status: frame_statuses.count(frame_status) for frame_status in dict.fromkeys(frame_statuses)
+                },
+                "greatest_strength": np.nanmax(touch_strengths),
             }
         )
     frames_with_two_touches = np.flatnonzero(locations.status == LocationStatus.TWO_TOUCHES)
-    microphones = []
-    for number, (fault, is_used) in enumerate(zip(locations.faults, locations.used.T, strict=True)):
+    microphone_reports = []
+    for item_number, (microphone_fault, is_used) in enumerate(zip(locations.faults, locations.used.T, strict=True)):
         used_fraction = float(is_used.mean())
-        microphones.append({"microphone": number, "used_share": used_fraction, "fault": fault or None})
+        microphone_reports.append(
+            {"microphone": item_number, "used_share": used_fraction, "fault": microphone_fault or None}
+        )
     return to_plain_values(
         {
             "recording": locations.name,
@@ -132,25 +140,25 @@ def report_track(located_touches: LocatedTouches) -> dict[str, Any]:
             "frames": len(locations.times),
             "duration_s": locations.times[-1] - locations.times[0],
             "status": locations.counts(),
-            "touches": touches,
+            "touches": touch_reports,
             "rejected_frames": int(track.rejected.sum()),
             "median_standard_deviation_m": _median_deviation(locations),
             "two_touches": [
                 {
-                    "time_s": float(locations.times[frame]),
-                    "positions_m": [locations.position[frame], locations.second[frame]],
-                    "strengths": [locations.strength[frame], locations.second_strength[frame]],
+                    "time_s": float(locations.times[frame_index]),
+                    "positions_m": [locations.position[frame_index], locations.second[frame_index]],
+                    "strengths": [locations.strength[frame_index], locations.second_strength[frame_index]],
                 }
-                for frame in frames_with_two_touches
+                for frame_index in frames_with_two_touches
             ],
-            "microphones": microphones,
+            "microphones": microphone_reports,
             "notes": list(locations.notes),
             "units": {
                 "length": "m",
                 "time": "s",
                 "strength": "intensity of a typical microphone right under the source",
             },
-            "versions": {name: package_version(name) for name in _PACKAGES},
+            "versions": {package_name: package_version(package_name) for package_name in _REPORTED_PACKAGES},
         }
     )
 
@@ -162,47 +170,53 @@ def draw_track(located_touches: LocatedTouches):
     from jeit.acoustic.plots import plot_track
 
     figure = Figure(figsize=(6.6, 5.8), layout="constrained")
-    title = located_touches.locations.name
+    figure_title = located_touches.locations.name
     plot_track(
         located_touches.track,
         located_touches.locations,
         located_touches.calibration,
         overlay=_overlay_maps(located_touches),
-        title=title,
+        title=figure_title,
         ax=figure.subplots(),
     )
     return figure
 
 
-def _overlay_maps(touches: LocatedTouches) -> np.ndarray | None:
+def _overlay_maps(located_touches: LocatedTouches) -> np.ndarray | None:
     """Overlay (rows, columns) of the brightness maps of all frames with one located touch, in which older frames are
     fainter; None if there is no such frame."""
-    locations, intensities = touches.locations, touches.intensities
+    locations, intensities = located_touches.locations, located_touches.intensities
     located_frames = np.flatnonzero(locations.has_position & (locations.status != LocationStatus.TWO_TOUCHES))
     if not located_frames.size:
         return None
-    microphone_array, use, _ = microphones_in_use(intensities, touches.calibration)
+    microphone_array, is_used_reading, _ = microphones_in_use(intensities, located_touches.calibration)
     localiser = Localiser.create(
-        microphone_array, method=touches.method, map_shape=(_NUM_PIXELS, _NUM_PIXELS), compiled=False
+        microphone_array, method=located_touches.method, map_shape=(_NUM_MAP_PIXELS, _NUM_MAP_PIXELS), compiled=False
     )
-    times = locations.times[located_frames]
-    time_constant = max(0.3, 0.5 * float(times[-1] - times[0]))
-    image = np.zeros((_NUM_PIXELS, _NUM_PIXELS))
-    for start in range(0, located_frames.size, _NUM_CHUNK_FRAMES):
-        chunk = located_frames[start : start + _NUM_CHUNK_FRAMES]
-        brightness = map_brightness(localiser.maps(intensities.power[chunk], use[chunk]), method=touches.method)
-        image = np.maximum(
-            image, last_overlay_image(brightness, locations.times[chunk], time=times[-1], time_constant=time_constant)
+    located_times = locations.times[located_frames]
+    time_constant = max(0.3, 0.5 * float(located_times[-1] - located_times[0]))
+    overlay_image = np.zeros((_NUM_MAP_PIXELS, _NUM_MAP_PIXELS))
+    for first_position in range(0, located_frames.size, _NUM_CHUNK_FRAMES):
+        chunk_frames = located_frames[first_position : first_position + _NUM_CHUNK_FRAMES]
+        map_brightnesses = map_brightness(
+            localiser.maps(intensities.power[chunk_frames], is_used_reading[chunk_frames]),
+            method=located_touches.method,
         )
-    return image
+        overlay_image = np.maximum(
+            overlay_image,
+            last_overlay_image(
+                map_brightnesses, locations.times[chunk_frames], time=located_times[-1], time_constant=time_constant
+            ),
+        )
+    return overlay_image
 
 
 def _column_names(dimension: int) -> list[str]:
-    names = ["time_s", "x_m", "y_m", "std_x_m", "std_y_m", "covariance", "strength", "status"]
-    names += ["track_x_m", "track_y_m", "track_std_x_m", "track_std_y_m", "touch"]
+    column_names = ["time_s", "x_m", "y_m", "std_x_m", "std_y_m", "covariance", "strength", "status"]
+    column_names += ["track_x_m", "track_y_m", "track_std_x_m", "track_std_y_m", "touch"]
     if dimension == 3:
-        names += ["z_m", "std_z_m", "covariance_xz", "covariance_yz", "track_z_m", "track_std_z_m"]
-    return names
+        column_names += ["z_m", "std_z_m", "covariance_xz", "covariance_yz", "track_z_m", "track_std_z_m"]
+    return column_names
 
 
 def _track_rows(locations: Locations, track: Track):
@@ -211,32 +225,32 @@ def _track_rows(locations: Locations, track: Track):
     for touch_number, touch in enumerate(track.touches, 1):
         touch_numbers[touch.first : touch.last + 1] = touch_number
     frame_deviations, track_deviations = (
-        np.sqrt(np.diagonal(estimate.covariance, axis1=1, axis2=2)) for estimate in (locations, track)
+        np.sqrt(np.diagonal(position_estimate.covariance, axis1=1, axis2=2)) for position_estimate in (locations, track)
     )
-    for k, time in enumerate(locations.times):
-        position, covariance = locations.position[k], locations.covariance[k]
-        row = [
-            f"{time:.6f}",
-            *_format_numbers(position[:2]),
+    for k, frame_time in enumerate(locations.times):
+        frame_position, frame_covariance = locations.position[k], locations.covariance[k]
+        table_row = [
+            f"{frame_time:.6f}",
+            *_format_numbers(frame_position[:2]),
             *_format_numbers(frame_deviations[k, :2]),
-            _format_number(covariance[0, 1]),
+            _format_number(frame_covariance[0, 1]),
             _format_number(locations.strength[k]),
         ]
-        row += [
+        table_row += [
             locations.status[k],
             *_format_numbers(track.position[k, :2]),
             *_format_numbers(track_deviations[k, :2]),
             touch_numbers[k] or "",
         ]
         if dimension == 3:
-            row += [
-                _format_number(position[2]),
+            table_row += [
+                _format_number(frame_position[2]),
                 _format_number(frame_deviations[k, 2]),
-                _format_number(covariance[0, 2]),
-                _format_number(covariance[1, 2]),
+                _format_number(frame_covariance[0, 2]),
+                _format_number(frame_covariance[1, 2]),
             ]
-            row += [_format_number(track.position[k, 2]), _format_number(track_deviations[k, 2])]
-        yield row
+            table_row += [_format_number(track.position[k, 2]), _format_number(track_deviations[k, 2])]
+        yield table_row
 
 
 def _median_deviation(locations: Locations) -> float:
@@ -246,9 +260,9 @@ def _median_deviation(locations: Locations) -> float:
     return float(np.median(np.sqrt(np.linalg.eigvalsh(locations.covariance[locations.has_position])[:, -1])))
 
 
-def _format_number(value) -> str:
-    return f"{value:.9g}" if np.isfinite(value) else ""
+def _format_number(number) -> str:
+    return f"{number:.9g}" if np.isfinite(number) else ""
 
 
-def _format_numbers(values) -> list[str]:
-    return [_format_number(value) for value in values]
+def _format_numbers(numbers) -> list[str]:
+    return [_format_number(number) for number in numbers]

@@ -96,13 +96,13 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
     num_frames, dimension = locations.position.shape
     times, has_position = locations.times, locations.has_position
     position, velocity = np.full((num_frames, dimension), np.nan), np.full((num_frames, dimension), np.nan)
-    covariance, is_rejected = np.full((num_frames, dimension, dimension), np.nan), np.zeros(num_frames, bool)
-    intervals = _touch_intervals(times, has_position, gap)
+    covariance, is_rejected_position = np.full((num_frames, dimension, dimension), np.nan), np.zeros(num_frames, bool)
+    touch_intervals = _touch_intervals(times, has_position, gap)
     spectral_densities = _ACCELERATION_SPECTRAL_DENSITIES if acceleration is None else np.array([acceleration])
     touches = []
-    for first_frame, last_frame in intervals:
+    for first_frame, last_frame in touch_intervals:
         touch_frames = slice(first_frame, last_frame + 1)
-        measured = np.where(has_position[touch_frames, None], locations.position[touch_frames], 0.0)
+        measured_positions = np.where(has_position[touch_frames, None], locations.position[touch_frames], 0.0)
         measured_covariance = (
             np.where(has_position[touch_frames, None, None], locations.covariance[touch_frames], np.eye(dimension))
             * locations.overlap
@@ -111,129 +111,154 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
         # singular.
         measured_covariance = measured_covariance + 1e-14 * np.eye(dimension)
         time_steps = np.diff(times[touch_frames], prepend=times[first_frame])
-        states, errors, is_accepted = _smooth_touch(
-            time_steps, measured, measured_covariance, has_position[touch_frames], spectral_densities
+        smoothed_states, state_covariances, is_accepted_position = _smooth_touch(
+            time_steps, measured_positions, measured_covariance, has_position[touch_frames], spectral_densities
         )
-        position[touch_frames], velocity[touch_frames] = states[:, :dimension], states[:, dimension:]
-        covariance[touch_frames] = errors[:, :dimension, :dimension]
-        is_rejected[touch_frames] = has_position[touch_frames] & ~is_accepted
-        length = float(np.linalg.norm(np.diff(position[touch_frames], axis=0), axis=1).sum())
+        position[touch_frames], velocity[touch_frames] = smoothed_states[:, :dimension], smoothed_states[:, dimension:]
+        covariance[touch_frames] = state_covariances[:, :dimension, :dimension]
+        is_rejected_position[touch_frames] = has_position[touch_frames] & ~is_accepted_position
+        path_length = float(np.linalg.norm(np.diff(position[touch_frames], axis=0), axis=1).sum())
         touches.append(
-            Touch(float(times[first_frame]), float(times[last_frame]), int(first_frame), int(last_frame), length)
+            Touch(float(times[first_frame]), float(times[last_frame]), int(first_frame), int(last_frame), path_length)
         )
-    return Track(np.asarray(times), position, covariance, velocity, tuple(touches), is_rejected)
+    return Track(np.asarray(times), position, covariance, velocity, tuple(touches), is_rejected_position)
 
 
-def _touch_intervals(times, has_position, gap: float) -> list[tuple[int, int]]:
-    """Indices of the first and last frame with a position of each touch; touches are separated by more than `gap`
+def _touch_intervals(times, has_position, max_gap: float) -> list[tuple[int, int]]:
+    """Indices of the first and last frame with a position of each touch; touches are separated by more than `max_gap`
     seconds."""
     located_indices = np.flatnonzero(has_position)
     if not located_indices.size:
         return []
-    gap_indices = np.flatnonzero(np.diff(times[located_indices]) > gap)
+    gap_indices = np.flatnonzero(np.diff(times[located_indices]) > max_gap)
     start_indices, end_indices = (
         np.concatenate([[0], gap_indices + 1]),
         np.concatenate([gap_indices, [located_indices.size - 1]]),
     )
     return [
-        (int(located_indices[start]), int(located_indices[end]))
-        for start, end in zip(start_indices, end_indices, strict=True)
+        (int(located_indices[start_index]), int(located_indices[end_index]))
+        for start_index, end_index in zip(start_indices, end_indices, strict=True)
     ]
 
 
-def _smooth_touch(time_steps, measured, covariances, has_position, spectral_densities) -> tuple[np.ndarray, ...]:
+def _smooth_touch(
+    time_steps, measured_positions, measured_covariances, has_position, spectral_densities
+) -> tuple[np.ndarray, ...]:
     """Call `_smooth_positions` with NumPy for a touch with few frames. Otherwise compile the function, with the number
     of frames padded to a power of two."""
-    num_frames, dimension = measured.shape
+    num_frames, dimension = measured_positions.shape
     if num_frames <= MAX_NUMPY_FRAMES:
-        return evaluate_in_numpy(_smooth_positions, time_steps, measured, covariances, has_position, spectral_densities)
-    padding = (1 << (num_frames - 1).bit_length()) - num_frames
-    arrays = (
-        np.pad(time_steps, (0, padding)),
-        np.pad(measured, ((0, padding), (0, 0))),
-        np.concatenate([covariances, np.broadcast_to(np.eye(dimension), (padding, dimension, dimension))]),
-        np.pad(has_position, (0, padding)),
+        return evaluate_in_numpy(
+            _smooth_positions, time_steps, measured_positions, measured_covariances, has_position, spectral_densities
+        )
+    num_padding_frames = (1 << (num_frames - 1).bit_length()) - num_frames
+    padded_arrays = (
+        np.pad(time_steps, (0, num_padding_frames)),
+        np.pad(measured_positions, ((0, num_padding_frames), (0, 0))),
+        np.concatenate(
+            [measured_covariances, np.broadcast_to(np.eye(dimension), (num_padding_frames, dimension, dimension))]
+        ),
+        np.pad(has_position, (0, num_padding_frames)),
     )
-    return tuple(np.asarray(array)[:num_frames] for array in jax.jit(_smooth_positions)(*arrays, spectral_densities))
+    return tuple(
+        np.asarray(smoothed_array)[:num_frames]
+        for smoothed_array in jax.jit(_smooth_positions)(*padded_arrays, spectral_densities)
+    )
 
 
-def _smooth_positions(time_steps, measured, measured_covariance, has_position, spectral_densities):
+def _smooth_positions(time_steps, measured_positions, measured_covariance, has_position, spectral_densities):
     """Smooth the positions of one touch with n frames, for the most likely of the `spectral_densities` of acceleration.
 
     Returns the states (n, 2 d), position and velocity; the covariances of the states (n, 2 d, 2 d); and the mask (n,)
     of accepted positions.
     """
-    xp, dimension = namespace(measured), measured.shape[1]
-    log_likelihoods, filtered = _kalman_filter(
-        time_steps, measured, measured_covariance, has_position, spectral_densities
+    xp, dimension = namespace(measured_positions), measured_positions.shape[1]
+    log_likelihoods, filtered_arrays = _kalman_filter(
+        time_steps, measured_positions, measured_covariance, has_position, spectral_densities
     )
-    best_index = xp.argmax(log_likelihoods)
-    mean, covariance, predicted_mean, predicted_covariance, is_accepted = (array[:, best_index] for array in filtered)
+    best_density_index = xp.argmax(log_likelihoods)
+    state_mean, state_covariance, predicted_mean, predicted_covariance, is_accepted_position = (
+        filtered_array[:, best_density_index] for filtered_array in filtered_arrays
+    )
 
     def smooth_step(next_state, frame_data):
         smoothed_mean, smoothed_covariance = next_state
-        mean, covariance, next_mean, next_covariance, next_step = frame_data
-        transition = _transition_matrix(next_step, dimension)
-        gain = xp.linalg.solve(next_covariance, transition @ covariance).T
-        mean = mean + gain @ (smoothed_mean - next_mean)
-        covariance = covariance + gain @ (smoothed_covariance - next_covariance) @ gain.T
-        return (mean, covariance), (mean, covariance)
+        state_mean, state_covariance, next_mean, next_covariance, next_step = frame_data
+        transition_matrix = _transition_matrix(next_step, dimension)
+        smoother_gain = xp.linalg.solve(next_covariance, transition_matrix @ state_covariance).T
+        state_mean = state_mean + smoother_gain @ (smoothed_mean - next_mean)
+        state_covariance = state_covariance + smoother_gain @ (smoothed_covariance - next_covariance) @ smoother_gain.T
+        return (state_mean, state_covariance), (state_mean, state_covariance)
 
     # The smoother's recursion starts after the last frame with a state equal to its prediction, so that the state of
     # the last frame is unchanged.
     last_prediction = predicted_mean[-1], predicted_covariance[-1]
     next_arrays = (
-        xp.concatenate([array[1:], array[-1:]]) for array in (predicted_mean, predicted_covariance, time_steps)
+        xp.concatenate([filtered_array[1:], filtered_array[-1:]])
+        for filtered_array in (predicted_mean, predicted_covariance, time_steps)
     )
-    _, (means, covariances) = scan(smooth_step, last_prediction, (mean, covariance, *next_arrays), reverse=True)
-    return means, covariances, is_accepted
+    _, (smoothed_means, smoothed_covariances) = scan(
+        smooth_step, last_prediction, (state_mean, state_covariance, *next_arrays), reverse=True
+    )
+    return smoothed_means, smoothed_covariances, is_accepted_position
 
 
-def _kalman_filter(time_step, measured, measured_covariance, has_position, spectral_densities):
+def _kalman_filter(time_step, measured_positions, measured_covariance, has_position, spectral_densities):
     """Run the Kalman filter over the positions of one touch for Q spectral densities of acceleration at once.
 
     Returns the log-likelihood (Q,) of each density; and for every frame and density the filtered mean and covariance of
     the state (position and velocity), the predicted mean and covariance, and whether the position was accepted.
     """
-    xp, dimension = namespace(measured), measured.shape[1]
-    max_distance = float(chdtri(dimension, _FALSE_REJECTION_PROBABILITY))
+    xp, dimension = namespace(measured_positions), measured_positions.shape[1]
+    max_squared_distance = float(chdtri(dimension, _FALSE_REJECTION_PROBABILITY))
 
-    def filter_step(state, frame_data):
-        mean, covariance = state
-        time_step, position, measured_covariance, is_measured = frame_data
-        transition = _transition_matrix(time_step, dimension)
-        mean, covariance = (
-            mean @ transition.T,
-            transition @ covariance @ transition.T
+    def filter_step(filter_state, frame_data):
+        state_mean, state_covariance = filter_state
+        time_step, measured_position, measured_covariance, is_measured = frame_data
+        transition_matrix = _transition_matrix(time_step, dimension)
+        state_mean, state_covariance = (
+            state_mean @ transition_matrix.T,
+            transition_matrix @ state_covariance @ transition_matrix.T
             + spectral_densities[:, None, None] * _process_noise(time_step, dimension),
         )
         innovation, innovation_covariance = (
-            position - mean[:, :dimension],
-            covariance[:, :dimension, :dimension] + measured_covariance,
+            measured_position - state_mean[:, :dimension],
+            state_covariance[:, :dimension, :dimension] + measured_covariance,
         )
-        gain = xp.swapaxes(xp.linalg.solve(innovation_covariance, covariance[:, :dimension]), 1, 2)
+        kalman_gain = xp.swapaxes(xp.linalg.solve(innovation_covariance, state_covariance[:, :dimension]), 1, 2)
         squared_distance = xp.sum(
             innovation * xp.linalg.solve(innovation_covariance, innovation[:, :, None])[:, :, 0], axis=1
         )
-        is_accepted = is_measured & (squared_distance < max_distance)
+        is_accepted_position = is_measured & (squared_distance < max_squared_distance)
         log_determinant = xp.log(xp.linalg.det(innovation_covariance))
         # A rejected position lowers the likelihood of a density as much as a position at the limit of acceptance.
         log_likelihood = xp.where(
-            is_measured, -0.5 * (xp.minimum(squared_distance, max_distance) + log_determinant), 0.0
+            is_measured, -0.5 * (xp.minimum(squared_distance, max_squared_distance) + log_determinant), 0.0
         )
-        new_mean = xp.where(is_accepted[:, None], mean + xp.einsum("qij,qj->qi", gain, innovation), mean)
+        new_mean = xp.where(
+            is_accepted_position[:, None], state_mean + xp.einsum("qij,qj->qi", kalman_gain, innovation), state_mean
+        )
         # The Joseph form of the covariance update is accurate even for nearly exact positions, for which the difference
         # in the usual form is lost to rounding.
-        update_matrix = xp.eye(2 * dimension) - xp.concatenate([gain, xp.zeros_like(gain)], axis=2)
-        updated_covariance = update_matrix @ covariance @ xp.swapaxes(
+        update_matrix = xp.eye(2 * dimension) - xp.concatenate([kalman_gain, xp.zeros_like(kalman_gain)], axis=2)
+        updated_covariance = update_matrix @ state_covariance @ xp.swapaxes(
             update_matrix, 1, 2
-        ) + gain @ measured_covariance @ xp.swapaxes(gain, 1, 2)
+        ) + kalman_gain @ measured_covariance @ xp.swapaxes(kalman_gain, 1, 2)
         new_covariance = xp.where(
-            is_accepted[:, None, None], (updated_covariance + xp.swapaxes(updated_covariance, 1, 2)) / 2, covariance
+            is_accepted_position[:, None, None],
+            (updated_covariance + xp.swapaxes(updated_covariance, 1, 2)) / 2,
+            state_covariance,
         )
-        return (new_mean, new_covariance), (log_likelihood, new_mean, new_covariance, mean, covariance, is_accepted)
+        return (new_mean, new_covariance), (
+            log_likelihood,
+            new_mean,
+            new_covariance,
+            state_mean,
+            state_covariance,
+            is_accepted_position,
+        )
 
-    initial_mean = xp.concatenate([measured[0], xp.zeros(dimension)])
+    initial_mean = xp.concatenate([measured_positions[0], xp.zeros(dimension)])
     initial_variances = xp.concatenate(
         [1e4 * xp.trace(measured_covariance[0]) * xp.ones(dimension), xp.full(dimension, _INITIAL_SPEED_DEVIATION**2)]
     )
@@ -242,10 +267,10 @@ def _kalman_filter(time_step, measured, measured_covariance, has_position, spect
         xp.tile(initial_mean, (num_densities, 1)),
         xp.tile(xp.diag(initial_variances), (num_densities, 1, 1)),
     )
-    _, (log_likelihoods, *filtered) = scan(
-        filter_step, initial_state, (time_step, measured, measured_covariance, has_position)
+    _, (log_likelihoods, *filtered_arrays) = scan(
+        filter_step, initial_state, (time_step, measured_positions, measured_covariance, has_position)
     )
-    return xp.sum(log_likelihoods, axis=0), filtered
+    return xp.sum(log_likelihoods, axis=0), filtered_arrays
 
 
 def _transition_matrix(time_step, dimension: int) -> Float[Array, "s s"]:
@@ -254,11 +279,13 @@ def _transition_matrix(time_step, dimension: int) -> Float[Array, "s s"]:
     return xp.kron(xp.eye(2) + time_step * xp.eye(2, k=1), xp.eye(dimension))
 
 
-def _process_noise(step, dimension: int) -> Float[Array, "s s"]:
-    """Covariance (2 d, 2 d) of position and velocity after a time step of `step` seconds with white acceleration of
-    spectral density 1."""
-    xp = namespace(step)
-    return xp.kron(xp.stack([step**3 / 3, step**2 / 2, step**2 / 2, step]).reshape(2, 2), xp.eye(dimension))
+def _process_noise(time_step, dimension: int) -> Float[Array, "s s"]:
+    """Covariance (2 d, 2 d) of position and velocity after a time step of `time_step` seconds with white acceleration
+    of spectral density 1."""
+    xp = namespace(time_step)
+    return xp.kron(
+        xp.stack([time_step**3 / 3, time_step**2 / 2, time_step**2 / 2, time_step]).reshape(2, 2), xp.eye(dimension)
+    )
 
 
 class LocatedTouches(Module):
@@ -320,20 +347,20 @@ def locate_touches(
     write_track(located, "out")
     ```
     """
-    report_step = progress or (lambda step: None)
+    report_step = progress or (lambda step_name: None)
     if intensity is not None and isinstance(recording, Intensities):
         raise ValueError("intensity: band and window are for samples; this recording holds intensities.")
     if not (np.isfinite(gap) and gap > 0):
         raise ValueError(f"gap must be positive, in seconds; it is {gap}.")
     report_step("measure intensities")
-    result = calibrated_intensities(recording, calibration, intensity, silence=silence)
-    if len(result.times) > 1 and np.median(np.diff(result.times)) > gap:
+    recording_intensities = calibrated_intensities(recording, calibration, intensity, silence=silence)
+    if len(recording_intensities.times) > 1 and np.median(np.diff(recording_intensities.times)) > gap:
         raise ValueError(
-            f"gap: frames are {np.median(np.diff(result.times)):g} s apart, more than the {gap:g} s that end a touch: "
-            "give times in seconds, or a longer gap."
+            f"gap: frames are {np.median(np.diff(recording_intensities.times)):g} s apart, more than the {gap:g} s "
+            "that end a touch: give times in seconds, or a longer gap."
         )
     report_step("locate")
     map_shape = _MAP_SHAPE if method == "consistency" else None
-    locations = locate(result, calibration, method=method, map_shape=map_shape, gain_drift=gain_drift)
+    locations = locate(recording_intensities, calibration, method=method, map_shape=map_shape, gain_drift=gain_drift)
     report_step("track")
-    return LocatedTouches(result, locations, track(locations, gap=gap), calibration, method)
+    return LocatedTouches(recording_intensities, locations, track(locations, gap=gap), calibration, method)

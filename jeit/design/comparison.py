@@ -155,7 +155,7 @@ def compare_layouts(
     check_skin("first", first)
     check_skin("second", second)
     check_same_outline(first.layout, second.layout)
-    report = progress or (lambda step: None)
+    report_progress = progress or (lambda step_name: None)
     prepared_skins = []
     # Both skins are checked before any response is computed, so that errors are raised early.
     for skin in (first, second):
@@ -164,9 +164,9 @@ def compare_layouts(
         prepared_skins.append((skin, grid, skin.touched_cells(grid.places, contrast=contrast), checked_num_taxels))
     responses = []
     for skin, grid, touched, checked_num_taxels in prepared_skins:
-        report(f"touch {skin.layout.name}")
-        key = jax.random.key(seed)
-        responses.append(skin_response(skin, grid, key=key, touched=touched, num_taxels=checked_num_taxels))
+        report_progress(f"touch {skin.layout.name}")
+        random_key = jax.random.key(seed)
+        responses.append(skin_response(skin, grid, key=random_key, touched=touched, num_taxels=checked_num_taxels))
     return LayoutComparison((first, second), (responses[0], responses[1]), margin, places, contrast, seed)
 
 
@@ -174,24 +174,24 @@ def check_same_outline(first_layout: Layout | SurfaceLayout, second_layout: Layo
     """Raise `ValueError` unless both layouts are on skins of the same size. For flat skins, the areas of the outlines
     and the sides of their bounding boxes must agree; for curved skins, the areas of the surfaces."""
     if isinstance(first_layout, SurfaceLayout) or isinstance(second_layout, SurfaceLayout):
-        areas = [_layout_area(layout) for layout in (first_layout, second_layout)]
-        if type(first_layout) is not type(second_layout) or abs(areas[0] - areas[1]) > 1e-2 * areas[0]:
+        skin_areas = [_layout_area(layout) for layout in (first_layout, second_layout)]
+        if type(first_layout) is not type(second_layout) or abs(skin_areas[0] - skin_areas[1]) > 1e-2 * skin_areas[0]:
             raise ValueError(
-                f"the layouts are on different skins, '{first_layout.name}' of {1e4 * areas[0]:.4g} and "
-                f"'{second_layout.name}' of {1e4 * areas[1]:.4g} cm²; compare layouts on the same surface."
+                f"the layouts are on different skins, '{first_layout.name}' of {1e4 * skin_areas[0]:.4g} and "
+                f"'{second_layout.name}' of {1e4 * skin_areas[1]:.4g} cm²; compare layouts on the same surface."
             )
         return
-    sizes = []
+    sizes_and_areas = []
     for layout in (first_layout, second_layout):
         low_x, high_x, low_y, high_y = layout.known_outline.extent
-        sizes.append((high_x - low_x, high_y - low_y, float(layout.known_outline.area)))
+        sizes_and_areas.append((high_x - low_x, high_y - low_y, float(layout.known_outline.area)))
     if any(
-        abs(first_length - second_length) > 1e-3 * first_length
-        for first_length, second_length in zip(*sizes, strict=True)
+        abs(first_size - second_size) > 1e-3 * first_size
+        for first_size, second_size in zip(*sizes_and_areas, strict=True)
     ):
         size_text = " and ".join(
-            f"'{layout.name}' {1e3 * width:.4g} × {1e3 * height:.4g} mm"
-            for layout, (width, height, _) in zip((first_layout, second_layout), sizes, strict=True)
+            f"'{layout.name}' {1e3 * skin_width:.4g} × {1e3 * skin_height:.4g} mm"
+            for layout, (skin_width, skin_height, _) in zip((first_layout, second_layout), sizes_and_areas, strict=True)
         )
         raise ValueError(
             f"the layouts are on different skins, {size_text}; a file that does not say its skin is read with outline=."
@@ -215,24 +215,31 @@ def comparison_figures(first_response: SkinResponse, second_response: SkinRespon
       the taxels' areas, cm².
     - `taxel_overlap`: mean number of taxels that cover a position; `two_point_mm`: mean diameter of the taxels.
     """
-    return [_score_figures(*pair) for pair in ((first_response, second_response), (second_response, first_response))]
+    return [
+        _score_figures(*response_pair)
+        for response_pair in ((first_response, second_response), (second_response, first_response))
+    ]
 
 
-def _score_figures(response: SkinResponse, other_response: SkinResponse) -> dict:
-    sensitivity, taxels = response.sensitivity, response.taxels
-    areas = 1e4 * np.asarray(taxels.areas)
+def _score_figures(layout_response: SkinResponse, other_layout_response: SkinResponse) -> dict:
+    sensitivity, taxels = layout_response.sensitivity, layout_response.taxels
+    taxel_areas = 1e4 * np.asarray(taxels.areas)
     return {
-        "layout": response.layout.name,
-        "electrodes": response.layout.num_electrodes,
+        "layout": layout_response.layout.name,
+        "electrodes": layout_response.layout.num_electrodes,
         "measurements": sensitivity.changes.shape[1],
         "sensitivity_min_V": float(sensitivity.minimum),
         "sensitivity_mean_V": float(sensitivity.mean),
         "sensitivity_uniformity": float(sensitivity.uniformity),
         "blind_spot_fraction": float(
-            sensitivity.blind_spot((1 - _BLIND_SPOT_MARGIN) * other_response.sensitivity.minimum)
+            sensitivity.blind_spot((1 - _BLIND_SPOT_MARGIN) * other_layout_response.sensitivity.minimum)
         ),
-        "taxel_count": int((areas > 0).sum()),
-        "taxel_area_cm2": {"mean": float(areas.mean()), "std": float(areas.std()), "max": float(areas.max())},
+        "taxel_count": int((taxel_areas > 0).sum()),
+        "taxel_area_cm2": {
+            "mean": float(taxel_areas.mean()),
+            "std": float(taxel_areas.std()),
+            "max": float(taxel_areas.max()),
+        },
         "taxel_overlap": float(taxels.overlap),
         "two_point_mm": 1e3 * float(taxels.two_point_discrimination),
     }

@@ -94,30 +94,32 @@ def improve_layout(
     ```
     """
     check_layout("layout", layout)
-    report = progress or (lambda step: None)
+    report_progress = progress or (lambda step_name: None)
     space = DesignSpace(minimum_spacing=MINIMUM_SPACING) if space is None else space
-    report("mesh")
+    report_progress("mesh")
     coarse_skin, objective = _skin_and_objective(layout, num_points, _NUM_OPTIMISED_POSITIONS, noise, material)
-    report("optimise")
-    key = jax.random.key(seed)
+    report_progress("optimise")
+    random_key = jax.random.key(seed)
     optimisation = optimise_layout(
-        coarse_skin, objective, space, steps=steps, starts=starts, key=key, callback=callback
+        coarse_skin, objective, space, steps=steps, starts=starts, key=random_key, callback=callback
     )
     if optimisation.status == "infeasible":
         raise ValueError(f"no layout found: {optimisation.reason}")
-    report("confirm")
+    report_progress("confirm")
     num_fine_points = _REFINEMENT_RATIO * num_points
     skin_with_fine_mesh, objective = _skin_and_objective(
         layout, num_fine_points, _NUM_SCORED_POSITIONS, noise, material
     )
     optimised_skin = skin_with_fine_mesh.with_layout(optimisation.layout, material.get("contact_impedance"))
-    scores = objective.scores(skin_with_fine_mesh), objective.scores(optimised_skin)
-    return ImprovedLayout(layout, coarse_skin, optimisation, *scores, space, noise, seed, num_points)
+    scores_before_and_after = objective.scores(skin_with_fine_mesh), objective.scores(optimised_skin)
+    return ImprovedLayout(layout, coarse_skin, optimisation, *scores_before_and_after, space, noise, seed, num_points)
 
 
 def _skin_and_objective(
-    layout: Layout, num_points: int, num_positions: int, noise: float, options: dict
+    layout: Layout, num_mesh_points: int, num_touches_per_side: int, noise: float, skin_options: dict
 ) -> tuple[Skin, Objective]:
     protocol = two_terminal(layout.num_electrodes)
-    skin = Skin.create(layout, num_layers=0, num_points=num_points, protocol=protocol, **options)
-    return skin, Objective.create(skin, touch_grid(skin.outline, num_positions, num_positions).places, noise=noise)
+    skin = Skin.create(layout, num_layers=0, num_points=num_mesh_points, protocol=protocol, **skin_options)
+    return skin, Objective.create(
+        skin, touch_grid(skin.outline, num_touches_per_side, num_touches_per_side).places, noise=noise
+    )

@@ -81,16 +81,16 @@ class Candidates(Module):
 
 
 def _check_candidates(
-    jacobian, prior, noise, weights, axis_names: tuple[str, str]
+    jacobian, prior, noise, weights, prior_axis_names: tuple[str, str]
 ) -> tuple[Array, Array, Array, Array]:
-    """Check the arguments of `Candidates` and convert them to arrays of matching shapes. `axis_names`: names of the
-    axes of `prior`, for error messages."""
+    """Check the arguments of `Candidates` and convert them to arrays of matching shapes. `prior_axis_names`: names of
+    the axes of `prior`, for error messages."""
     jacobian, prior = jnp.asarray(jacobian, float), jnp.asarray(prior, float)
     noise = jnp.asarray(noise, float)
     if jacobian.ndim != 2 or prior.ndim != 2 or jacobian.shape[1] != prior.shape[0]:
         raise ValueError(
             f"jacobian has shape {jacobian.shape} and the prior's matrix {prior.shape}; give (measurements, cells) and "
-            f"({', '.join(axis_names)})."
+            f"({', '.join(prior_axis_names)})."
         )
     weights = jnp.ones(len(prior)) if weights is None else jnp.asarray(weights, float)
     if noise.shape not in ((), jacobian.shape[:1]):
@@ -111,19 +111,20 @@ def _check_candidates(
 
 
 @jax.jit
-def _candidates_from_product(jacobian, product, noise, weights) -> Candidates:
+def _candidates_from_product(jacobian, prior_product, noise, weights) -> Candidates:
     """Compute the candidates from ΓJᵀ, with the factor S = ΓJᵀ N^-½ U Λ^-½ of the prior, where N^-½ JΓJᵀ N^-½ = UΛUᵀ
     and N is the covariance of the noise.
 
     SSᵀ is the part of the prior covariance Γ that the measurements depend on; the remaining part does not affect them.
     """
-    weighted_product = jacobian @ product / (noise[:, None] * noise)
-    eigenvalues, eigenvectors = jnp.linalg.eigh((weighted_product + weighted_product.T) / 2)
+    whitened_product = jacobian @ prior_product / (noise[:, None] * noise)
+    eigenvalues, eigenvectors = jnp.linalg.eigh((whitened_product + whitened_product.T) / 2)
     is_significant = eigenvalues > len(eigenvalues) * jnp.finfo(eigenvalues.dtype).eps * eigenvalues[-1]
     root_eigenvalues = jnp.sqrt(jnp.where(is_significant, eigenvalues, 1))
-    factor = product @ (eigenvectors / noise[:, None] * jnp.where(is_significant, 1 / root_eigenvalues, 0))
+    prior_factor = prior_product @ (eigenvectors / noise[:, None] * jnp.where(is_significant, 1 / root_eigenvalues, 0))
     return Candidates(
-        eigenvectors * jnp.where(is_significant, root_eigenvalues, 0), factor.T @ (weights[:, None] * factor)
+        eigenvectors * jnp.where(is_significant, root_eigenvalues, 0),
+        prior_factor.T @ (weights[:, None] * prior_factor),
     )
 
 
@@ -192,10 +193,10 @@ def select_measurements(
     ```
     """
     _check_number(candidates, number, criterion)
-    swap_limit = 0 if not exchange else number if max_swaps is None else max_swaps
-    if not isinstance(swap_limit, int) or swap_limit < 0:
+    max_num_swaps = 0 if not exchange else number if max_swaps is None else max_swaps
+    if not isinstance(max_num_swaps, int) or max_num_swaps < 0:
         raise ValueError(f"max_swaps must be a whole number from 0; it is {max_swaps!r}.")
-    return _select_with_swaps(candidates, number, criterion, swap_limit)
+    return _select_with_swaps(candidates, number, criterion, max_num_swaps)
 
 
 def information(candidates: Candidates, chosen, *, criterion: Criterion = "D") -> Float[Array, "..."]:
@@ -253,10 +254,10 @@ def random_selections(key: Array, num_candidates: int, number: int, count: int) 
     if not 1 <= number <= num_candidates:
         raise ValueError(f"number must be from 1 to the {num_candidates} candidates; it is {number}.")
     check_key(key)
-    orders = jax.vmap(lambda permutation_key: jax.random.permutation(permutation_key, num_candidates))(
+    random_orders = jax.vmap(lambda permutation_key: jax.random.permutation(permutation_key, num_candidates))(
         jax.random.split(key, count)
     )
-    return orders[:, :number]
+    return random_orders[:, :number]
 
 
 def nearest_pairs(centres, number: int, *, lengths=None) -> Int[np.ndarray, " N"]:
@@ -305,30 +306,30 @@ def _check_number(candidates: Candidates, number: int, criterion: Criterion) -> 
 
 
 @partial(jax.jit, static_argnames=("number", "criterion"))
-def _select_with_swaps(candidates: Candidates, number: int, criterion: Criterion, swap_limit) -> Selection:
-    selected, gains = _greedy_selection(candidates, number, criterion)
+def _select_with_swaps(candidates: Candidates, number: int, criterion: Criterion, max_num_swaps) -> Selection:
+    chosen, gains = _greedy_selection(candidates, number, criterion)
     total, _ = _information_and_slope(candidates, jnp.ones(candidates.num_candidates), criterion)
 
-    def can_improve(state):
-        _, num_swaps, has_converged = state
-        return (num_swaps < swap_limit) & ~has_converged
+    def can_improve(search_state):
+        _, num_swaps, has_converged = search_state
+        return (num_swaps < max_num_swaps) & ~has_converged
 
-    def swap(state):
-        selected, num_swaps, _ = state
-        swap_gains = _swap_gains(candidates, selected, criterion)
+    def make_best_swap(search_state):
+        chosen, num_swaps, _ = search_state
+        swap_gains = _swap_gains(candidates, chosen, criterion)
         removed_position, added_candidate = jnp.unravel_index(jnp.argmax(swap_gains), swap_gains.shape)
         improves_information = swap_gains[removed_position, added_candidate] > _MIN_INFORMATION_GAIN * total
         return (
-            jnp.where(improves_information, selected.at[removed_position].set(added_candidate), selected),
+            jnp.where(improves_information, chosen.at[removed_position].set(added_candidate), chosen),
             num_swaps + improves_information,
             ~improves_information,
         )
 
-    selected, num_swaps, has_converged = jax.lax.while_loop(
-        can_improve, swap, (selected, jnp.array(0), jnp.array(False))
+    chosen, num_swaps, has_converged = jax.lax.while_loop(
+        can_improve, make_best_swap, (chosen, jnp.array(0), jnp.array(False))
     )
-    final_information = _information_of_sets(candidates, selected[None], criterion)[0]
-    return Selection(selected, gains, final_information, total, num_swaps, has_converged)
+    final_information = _information_of_sets(candidates, chosen[None], criterion)[0]
+    return Selection(chosen, gains, final_information, total, num_swaps, has_converged)
 
 
 def _greedy_selection(candidates: Candidates, number: int, criterion: Criterion):
@@ -336,40 +337,44 @@ def _greedy_selection(candidates: Candidates, number: int, criterion: Criterion)
     Cholesky factorisation of I + FFᵀ, where F has the rows f_i, with the best candidate as the next pivot.
 
     Choosing candidate p changes the posterior covariance from C to C - uuᵀ with u = C f_p / √(1 + f_pᵀC f_p). The rows
-    of `directions` are the vectors u of the previous steps.
+    of `chosen_directions` are the vectors u of the previous steps.
     """
     rows, weight = candidates.rows, candidates.weight
 
-    def covariance(directions, vector):
-        return vector - directions.T @ (directions @ vector)
+    def times_covariance(chosen_directions, vector):
+        return vector - chosen_directions.T @ (chosen_directions @ vector)
 
-    def step(state, step_index):
-        directions, variances, reductions, is_available = state
-        gains = jnp.log1p(variances) if criterion == "D" else reductions / (1 + variances)
-        best_candidate = jnp.argmax(jnp.where(is_available, gains, -jnp.inf))
-        direction = covariance(directions, rows[best_candidate]) / jnp.sqrt(1 + variances[best_candidate])
-        projections = rows @ direction
+    def choose_next(search_state, choice_index):
+        chosen_directions, row_variances, trace_reductions, is_unchosen = search_state
+        gains = jnp.log1p(row_variances) if criterion == "D" else trace_reductions / (1 + row_variances)
+        best_candidate = jnp.argmax(jnp.where(is_unchosen, gains, -jnp.inf))
+        new_direction = times_covariance(chosen_directions, rows[best_candidate]) / jnp.sqrt(
+            1 + row_variances[best_candidate]
+        )
+        row_projections = rows @ new_direction
         if criterion == "A":
-            # Update f_jᵀCVC f_j to the new covariance C, which changes C f_j by a multiple of `projections`.
-            weighted_direction = weight @ direction
-            weighted_projections = rows @ covariance(directions, weighted_direction)
-            reductions = jnp.maximum(
-                reductions - 2 * projections * weighted_projections + (direction @ weighted_direction) * projections**2,
+            # Update f_jᵀCVC f_j to the new covariance C, which changes C f_j by a multiple of `row_projections`.
+            weighted_direction = weight @ new_direction
+            weighted_projections = rows @ times_covariance(chosen_directions, weighted_direction)
+            trace_reductions = jnp.maximum(
+                trace_reductions
+                - 2 * row_projections * weighted_projections
+                + (new_direction @ weighted_direction) * row_projections**2,
                 0,
             )
-        state = (
-            directions.at[step_index].set(direction),
-            jnp.maximum(variances - projections**2, 0),
-            reductions,
-            is_available.at[best_candidate].set(False),
+        search_state = (
+            chosen_directions.at[choice_index].set(new_direction),
+            jnp.maximum(row_variances - row_projections**2, 0),
+            trace_reductions,
+            is_unchosen.at[best_candidate].set(False),
         )
-        return state, (best_candidate, gains[best_candidate])
+        return search_state, (best_candidate, gains[best_candidate])
 
-    variances = jnp.sum(rows**2, axis=1)  # f_jᵀC f_j: remaining variance of measurement j
-    reductions = jnp.sum((rows @ weight) * rows, axis=1)  # f_jᵀCVC f_j
-    directions = jnp.zeros((number, rows.shape[1]))
-    initial_state = (directions, variances, reductions, jnp.ones(len(rows), bool))
-    return jax.lax.scan(step, initial_state, jnp.arange(number))[1]
+    row_variances = jnp.sum(rows**2, axis=1)  # f_jᵀC f_j: remaining variance of measurement j
+    trace_reductions = jnp.sum((rows @ weight) * rows, axis=1)  # f_jᵀCVC f_j
+    chosen_directions = jnp.zeros((number, rows.shape[1]))
+    initial_state = (chosen_directions, row_variances, trace_reductions, jnp.ones(len(rows), bool))
+    return jax.lax.scan(choose_next, initial_state, jnp.arange(number))[1]
 
 
 def _swap_gains(candidates: Candidates, chosen, criterion: Criterion) -> Float[Array, "N M"]:
@@ -380,23 +385,23 @@ def _swap_gains(candidates: Candidates, chosen, criterion: Criterion) -> Float[A
     ((1 - c_ii) b_jj + 2 c_ij b_ij - (1 + c_jj) b_ii) / q.
     """
     rows, weight = candidates.rows, candidates.weight
-    selected_rows = rows[chosen]
-    row_products = selected_rows @ rows.T
+    chosen_rows = rows[chosen]
+    row_products = chosen_rows @ rows.T
     # F_T are the rows of the chosen set. C F_Tᵀ = F_Tᵀ (I + F_T F_Tᵀ)⁻¹ gives c_ij and 1 - c_ii without differences of
     # large numbers.
-    inverse_root = _inverse_root(row_products[:, chosen])
-    products_with_inverse_root = inverse_root @ row_products
-    c_j = jnp.maximum(jnp.sum(rows**2, axis=1) - jnp.sum(products_with_inverse_root**2, axis=0), 0)
-    c_ij = inverse_root.T @ products_with_inverse_root
-    one_minus_c_ii = jnp.sum(inverse_root**2, axis=0)[:, None]  # 1 - c_ii
+    inverse_factor = _inverse_factor(row_products[:, chosen])
+    whitened_products = inverse_factor @ row_products
+    c_j = jnp.maximum(jnp.sum(rows**2, axis=1) - jnp.sum(whitened_products**2, axis=0), 0)
+    c_ij = inverse_factor.T @ whitened_products
+    one_minus_c_ii = jnp.sum(inverse_factor**2, axis=0)[:, None]  # 1 - c_ii
     determinant_ratio = (1 + c_j) * one_minus_c_ii + c_ij**2
     if criterion == "D":
         gains = jnp.log(determinant_ratio)
     else:
-        filtered_rows = rows - c_ij.T @ selected_rows  # rows f_jᵀC
-        weighted_selected = inverse_root.T @ (inverse_root @ selected_rows) @ weight  # rows f_iᵀCV
-        b_ij = weighted_selected @ filtered_rows.T
-        b_j = jnp.sum((filtered_rows @ weight) * filtered_rows, axis=1)
+        residual_rows = rows - c_ij.T @ chosen_rows  # rows f_jᵀC
+        weighted_chosen_rows = inverse_factor.T @ (inverse_factor @ chosen_rows) @ weight  # rows f_iᵀCV
+        b_ij = weighted_chosen_rows @ residual_rows.T
+        b_j = jnp.sum((residual_rows @ weight) * residual_rows, axis=1)
         gains = (one_minus_c_ii * b_j + 2 * c_ij * b_ij - (1 + c_j) * b_j[chosen][:, None]) / determinant_ratio
     return gains.at[:, chosen].set(-jnp.inf)
 
@@ -404,53 +409,53 @@ def _swap_gains(candidates: Candidates, chosen, criterion: Criterion) -> Float[A
 def _information_of_set(candidates: Candidates, weighted_rows: Float[Array, "M r"], chosen, criterion: Criterion):
     """Information of one set of N candidates, from the N × N matrix I + F_T F_Tᵀ, where F_T are the rows of the set.
     `weighted_rows`: the rows of all candidates times V."""
-    selected_rows = candidates.rows[chosen]
-    inverse_root = _inverse_root(selected_rows @ selected_rows.T)
+    chosen_rows = candidates.rows[chosen]
+    inverse_factor = _inverse_factor(chosen_rows @ chosen_rows.T)
     if criterion == "D":
-        return -2 * jnp.sum(jnp.log(jnp.diag(inverse_root)))
-    return jnp.sum((inverse_root @ weighted_rows[chosen]) * (inverse_root @ selected_rows))
+        return -2 * jnp.sum(jnp.log(jnp.diag(inverse_factor)))
+    return jnp.sum((inverse_factor @ weighted_rows[chosen]) * (inverse_factor @ chosen_rows))
 
 
 @partial(jax.jit, static_argnames="criterion")
-def _information_of_sets(candidates: Candidates, index_sets, criterion: Criterion):
+def _information_of_sets(candidates: Candidates, candidate_sets, criterion: Criterion):
     weighted_rows = candidates.rows @ candidates.weight
     return jax.lax.map(
-        lambda chosen: _information_of_set(candidates, weighted_rows, chosen, criterion), index_sets, batch_size=64
+        lambda chosen: _information_of_set(candidates, weighted_rows, chosen, criterion), candidate_sets, batch_size=64
     )
 
 
-def _information_and_slope(candidates: Candidates, fractions: Float[Array, " M"], criterion: Criterion):
-    """Information if candidate i is measured with the weight `fractions[i]`, and the derivative (M,) of the information
-    with respect to the weights, from the inverse posterior covariance C⁻¹ (r, r)."""
+def _information_and_slope(candidates: Candidates, measured_fractions: Float[Array, " M"], criterion: Criterion):
+    """Information if candidate i is measured with the weight `measured_fractions[i]`, and the derivative (M,) of the
+    information with respect to the weights, from the inverse posterior covariance C⁻¹ (r, r)."""
     rows, weight = candidates.rows, candidates.weight
-    inverse_root = _inverse_root(rows.T @ (fractions[:, None] * rows))
-    products_with_inverse_root = inverse_root @ rows.T
+    inverse_factor = _inverse_factor(rows.T @ (measured_fractions[:, None] * rows))
+    whitened_products = inverse_factor @ rows.T
     if criterion == "D":
-        return -2 * jnp.sum(jnp.log(jnp.diag(inverse_root))), jnp.sum(
-            products_with_inverse_root**2, axis=0
-        )  # f_jᵀC f_j
-    filtered_rows = inverse_root.T @ products_with_inverse_root
-    value = jnp.trace(weight) - jnp.sum((inverse_root @ weight) * inverse_root)
-    return value, jnp.sum(filtered_rows * (weight @ filtered_rows), axis=0)  # f_jᵀCVC f_j
+        return -2 * jnp.sum(jnp.log(jnp.diag(inverse_factor))), jnp.sum(whitened_products**2, axis=0)  # f_jᵀC f_j
+    residual_rows = inverse_factor.T @ whitened_products
+    information_value = jnp.trace(weight) - jnp.sum((inverse_factor @ weight) * inverse_factor)
+    return information_value, jnp.sum(residual_rows * (weight @ residual_rows), axis=0)  # f_jᵀCVC f_j
 
 
-def _inverse_root(matrix: Float[Array, "s s"]) -> Float[Array, "s s"]:
-    """Inverse L⁻¹ of the Cholesky factor of I + `matrix`. Only matrix products are used, which can always be batched,
-    unlike LAPACK's solvers."""
-    return inverse_cholesky(jnp.eye(len(matrix)) + matrix[None])[0]
+def _inverse_factor(gram_matrix: Float[Array, "s s"]) -> Float[Array, "s s"]:
+    """Inverse L⁻¹ of the Cholesky factor of I + `gram_matrix`. Only matrix products are used, which can always be
+    batched, unlike LAPACK's solvers."""
+    return inverse_cholesky(jnp.eye(len(gram_matrix)) + gram_matrix[None])[0]
 
 
 @partial(jax.jit, static_argnames=("number", "criterion", "iterations"))
 def _relaxed_bound(candidates: Candidates, number: int, criterion: Criterion, iterations: int):
-    def step(step_index, state):
-        fractions, information_bound = state
-        value, slope = _information_and_slope(candidates, fractions, criterion)
-        _, best_candidates = jax.lax.top_k(slope, number)
-        best_vertex_fractions = jnp.zeros_like(fractions).at[best_candidates].set(1.0)
-        information_bound = jnp.minimum(information_bound, value + slope @ (best_vertex_fractions - fractions))
-        return fractions + 2 / (step_index + 2) * (best_vertex_fractions - fractions), information_bound
+    def improve_fractions(step_index, bound_state):
+        measured_fractions, information_bound = bound_state
+        information_value, information_slope = _information_and_slope(candidates, measured_fractions, criterion)
+        _, best_candidates = jax.lax.top_k(information_slope, number)
+        vertex_fractions = jnp.zeros_like(measured_fractions).at[best_candidates].set(1.0)
+        information_bound = jnp.minimum(
+            information_bound, information_value + information_slope @ (vertex_fractions - measured_fractions)
+        )
+        return measured_fractions + 2 / (step_index + 2) * (vertex_fractions - measured_fractions), information_bound
 
     initial_fractions = jnp.full(candidates.num_candidates, number / candidates.num_candidates)
     # The Frank-Wolfe step size is 2 / (k + 2) at step k. The loop starts at k = 2, with a step size of 1/2, since the
     # full step at k = 0 would discard the initial fractions.
-    return jax.lax.fori_loop(2, iterations + 2, step, (initial_fractions, jnp.array(jnp.inf)))[1]
+    return jax.lax.fori_loop(2, iterations + 2, improve_fractions, (initial_fractions, jnp.array(jnp.inf)))[1]

@@ -71,16 +71,24 @@ class TouchPrior(Module):
             raise ValueError(
                 f"correlation (metres) and deviation must be positive; they are {correlation!r} and {deviation!r}."
             )
-        positions = check_places(places, 3 if np.shape(places)[-1:] == (3,) else 2)
-        squared_distances = np.sum((positions[:, None] - positions) ** 2, axis=-1)
-        squared_lengths = squared_distances if lengths is None else np.asarray(lengths, float) ** 2
-        if squared_lengths.shape != squared_distances.shape:
+        touched_positions = check_places(places, 3 if np.shape(places)[-1:] == (3,) else 2)
+        squared_distances = np.sum((touched_positions[:, None] - touched_positions) ** 2, axis=-1)
+        squared_path_lengths = squared_distances if lengths is None else np.asarray(lengths, float) ** 2
+        if squared_path_lengths.shape != squared_distances.shape:
             raise ValueError(
-                f"lengths has shape {squared_lengths.shape}; give one between any two of {len(positions)} places."
+                f"lengths has shape {squared_path_lengths.shape}; give one between any two of {len(touched_positions)} "
+                "places."
             )
-        eigenvalues, eigenvectors = np.linalg.eigh(deviation**2 * np.exp(-squared_lengths / (2 * correlation**2)))
-        is_significant = eigenvalues > 1e-6 * eigenvalues[-1]
-        return cls(as_array(eigenvectors[:, is_significant] * np.sqrt(eigenvalues[is_significant])))
+        covariance_eigenvalues, covariance_eigenvectors = np.linalg.eigh(
+            deviation**2 * np.exp(-squared_path_lengths / (2 * correlation**2))
+        )
+        is_significant_eigenvalue = covariance_eigenvalues > 1e-6 * covariance_eigenvalues[-1]
+        return cls(
+            as_array(
+                covariance_eigenvectors[:, is_significant_eigenvalue]
+                * np.sqrt(covariance_eigenvalues[is_significant_eigenvalue])
+            )
+        )
 
 
 class Scores(Module):
@@ -202,38 +210,40 @@ def _compute_scores(jacobian, conductivity, touches: SheetTouches, prior: TouchP
     """Compute the scores of a layout from the Jacobian (M, m) of the M voltages with respect to the conductivities of m
     cells."""
     xp = namespace(jacobian)
-    weights, weight_slopes = touches.weights(conductivity)
-    changes = weights @ jacobian.T  # (n, M)
-    sensitivity = xp.linalg.norm(changes, axis=1)
-    powers = -xp.log(sensitivity) / temperature
-    max_power = undifferentiated(powers.max())
-    log_mean = max_power + xp.log(xp.exp(powers - max_power).mean())
-    whitened_changes = changes / noise
+    conductivity_changes, conductivity_slopes = touches.weights(conductivity)
+    voltage_changes = conductivity_changes @ jacobian.T  # (n, M)
+    sensitivity = xp.linalg.norm(voltage_changes, axis=1)
+    soft_minimum_exponents = -xp.log(sensitivity) / temperature
+    max_exponent = undifferentiated(soft_minimum_exponents.max())
+    log_mean_exponential = max_exponent + xp.log(xp.exp(soft_minimum_exponents - max_exponent).mean())
+    whitened_changes = voltage_changes / noise
     information_rows = prior.factor.T @ whitened_changes  # (r, M)
-    inverse_root = inverse_cholesky((xp.eye(len(information_rows)) + information_rows @ information_rows.T)[None])[0]
-    covariance_factor = prior.factor @ inverse_root.T  # factor B of the posterior covariance C = BBᵀ
+    inverse_cholesky_factor = inverse_cholesky(
+        (xp.eye(len(information_rows)) + information_rows @ information_rows.T)[None]
+    )[0]
+    covariance_factor = prior.factor @ inverse_cholesky_factor.T  # factor B of the posterior covariance C = BBᵀ
     return Scores(
         sensitivity,
-        xp.exp(-temperature * log_mean),
+        xp.exp(-temperature * log_mean_exponential),
         (covariance_factor**2).sum(axis=1),
-        -2 * xp.log(xp.diagonal(inverse_root)).sum(),
+        -2 * xp.log(xp.diagonal(inverse_cholesky_factor)).sum(),
         _largest_eigenvalue(covariance_factor.T @ covariance_factor),
-        _localisation_error(whitened_changes, weight_slopes @ jacobian.T / noise),
+        _localisation_error(whitened_changes, conductivity_slopes @ jacobian.T / noise),
     )
 
 
-def _largest_eigenvalue(matrix: Float[Array, "r r"]) -> Float[Array, ""]:
-    """Largest eigenvalue of a positive semidefinite `matrix`. The eigenvalue is computed by repeated squaring, which
-    needs only matrix products and can be batched.
+def _largest_eigenvalue(semidefinite_matrix: Float[Array, "r r"]) -> Float[Array, ""]:
+    """Largest eigenvalue of a positive semidefinite `semidefinite_matrix`. The eigenvalue is computed by repeated
+    squaring, which needs only matrix products and can be batched.
 
     The derivative of a simple eigenvalue is the derivative of vᵀ(matrix)v with the eigenvector v held fixed.
     """
-    power = undifferentiated(matrix)
+    matrix_power = undifferentiated(semidefinite_matrix)
     for _ in range(_NUM_SQUARINGS):
-        power = power @ power
-        power = power / abs(power).max()
-    vector = power[:, namespace(power).diagonal(power).argmax()]
-    return vector @ matrix @ vector / (vector @ vector)
+        matrix_power = matrix_power @ matrix_power
+        matrix_power = matrix_power / abs(matrix_power).max()
+    dominant_vector = matrix_power[:, namespace(matrix_power).diagonal(matrix_power).argmax()]
+    return dominant_vector @ semidefinite_matrix @ dominant_vector / (dominant_vector @ dominant_vector)
 
 
 def _localisation_error(
@@ -243,13 +253,22 @@ def _localisation_error(
     inverse Fisher information, by a Schur complement. The bound is infinite if the information is singular.
     `amplitude_slope`, `position_slopes`: derivatives of the whitened voltages with respect to the amplitude, and to x
     and y."""
-    xp, size = namespace(amplitude_slope), (amplitude_slope**2).sum(axis=1)
+    xp, squared_amplitude_slopes = namespace(amplitude_slope), (amplitude_slope**2).sum(axis=1)
     # Part of the position derivatives that is orthogonal to the amplitude derivative. This part may be small, so it is
     # computed before squaring.
     x_slope, y_slope = (
-        position_slopes - ((position_slopes * amplitude_slope).sum(axis=2) / size)[..., None] * amplitude_slope
+        position_slopes
+        - ((position_slopes * amplitude_slope).sum(axis=2) / squared_amplitude_slopes)[..., None] * amplitude_slope
     )
-    xx, yy, xy = (x_slope * x_slope).sum(axis=1), (y_slope * y_slope).sum(axis=1), (x_slope * y_slope).sum(axis=1)
-    determinant = xx * yy - xy**2
-    is_invertible = determinant > 1e-12 * xx * yy
-    return xp.where(is_invertible, xp.sqrt((xx + yy) / xp.where(is_invertible, determinant, 1.0)), xp.inf)
+    information_xx, information_yy, information_xy = (
+        (x_slope * x_slope).sum(axis=1),
+        (y_slope * y_slope).sum(axis=1),
+        (x_slope * y_slope).sum(axis=1),
+    )
+    information_determinant = information_xx * information_yy - information_xy**2
+    is_invertible = information_determinant > 1e-12 * information_xx * information_yy
+    return xp.where(
+        is_invertible,
+        xp.sqrt((information_xx + information_yy) / xp.where(is_invertible, information_determinant, 1.0)),
+        xp.inf,
+    )

@@ -24,8 +24,8 @@ def uniformity(sensitivities: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
 
 
 @numpy_or_compiled
-def _fraction_below_level(level, sensitivities: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
-    return (sensitivities < level).astype(sensitivities.dtype).mean(axis=-1)
+def _fraction_below_level(sensitivity_level, sensitivities: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
+    return (sensitivities < sensitivity_level).astype(sensitivities.dtype).mean(axis=-1)
 
 
 class SensitivityMap(Module):
@@ -76,8 +76,8 @@ class SensitivityMap(Module):
     def histogram(self, bins: int | np.ndarray = 40) -> tuple[np.ndarray, np.ndarray]:
         """Fraction of the skin's area in each bin of the sensitivity Θ, and the edges of the bins in volts; `bins` as
         in `numpy.histogram`."""
-        counts, edges = np.histogram(np.asarray(self.values), bins=bins)
-        return counts / self.values.size, edges
+        bin_counts, bin_edges = np.histogram(np.asarray(self.values), bins=bins)
+        return bin_counts / self.values.size, bin_edges
 
     def image(self) -> Float[np.ndarray, "rows columns"]:
         """Sensitivity Θ as an image (rows, columns), volts, with row 0 at the smallest y, and NaN outside the skin."""

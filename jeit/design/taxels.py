@@ -58,8 +58,8 @@ class Taxels(Module):
         """Centroid of the touched positions in each cluster, metres; on a curved skin, the centroid lies slightly below
         the surface."""
         num_taxels = self.similarity.shape[-2]
-        weights = (self.labels[..., None, :] == np.arange(num_taxels)[:, None]) * self.cell_area[..., None, :]
-        return weights @ self.places / weights.sum(axis=-1, keepdims=True)
+        area_weights = (self.labels[..., None, :] == np.arange(num_taxels)[:, None]) * self.cell_area[..., None, :]
+        return area_weights @ self.places / area_weights.sum(axis=-1, keepdims=True)
 
     @property
     @numpy_or_compiled
@@ -165,56 +165,68 @@ def find_taxels(
     """
     check_key(key)
     _check_arguments(changes, places, cell_area, num_taxels, threshold)
-    checked_changes, positions = jnp.asarray(changes, float), jnp.asarray(places, float)
-    unit_changes = _normalise(checked_changes)
+    checked_changes, touched_positions = jnp.asarray(changes, float), jnp.asarray(places, float)
+    unit_changes = _normalise_rows(checked_changes)
     clusters = kmeans(unit_changes if directions else checked_changes, num_taxels, key, restarts=restarts)
-    cell_areas = as_array(namespace(cell_area).broadcast_to(cell_area, positions.shape[:1]), float)
+    cell_areas = as_array(namespace(cell_area).broadcast_to(cell_area, touched_positions.shape[:1]), float)
     return Taxels(
-        positions, cell_areas, clusters, _cosine_similarities(clusters.centres, unit_changes), float(threshold)
+        touched_positions, cell_areas, clusters, _cosine_similarities(clusters.centres, unit_changes), float(threshold)
     )
 
 
 @numpy_or_compiled
-def _cosine_similarities(vectors: Float[Array, "k m"], unit_changes: Float[Array, "n m"]) -> Float[Array, "k n"]:
-    return _normalise(vectors) @ unit_changes.T
+def _cosine_similarities(row_vectors: Float[Array, "k m"], unit_changes: Float[Array, "n m"]) -> Float[Array, "k n"]:
+    return _normalise_rows(row_vectors) @ unit_changes.T
 
 
 @numpy_or_compiled
-def _normalise(vectors: Float[Array, "n m"]) -> Float[Array, "n m"]:
+def _normalise_rows(row_vectors: Float[Array, "n m"]) -> Float[Array, "n m"]:
     """Scale n vectors (n, m) to length 1; zero vectors remain zero and have a derivative of zero."""
-    xp, squared_norms = namespace(vectors), (vectors**2).sum(axis=1, keepdims=True)
-    return xp.where(squared_norms > 0, vectors / xp.sqrt(xp.where(squared_norms > 0, squared_norms, 1)), 0)
+    xp, squared_norms = namespace(row_vectors), (row_vectors**2).sum(axis=1, keepdims=True)
+    return xp.where(squared_norms > 0, row_vectors / xp.sqrt(xp.where(squared_norms > 0, squared_norms, 1)), 0)
 
 
 def _check_arguments(changes, places, cell_area, num_taxels, threshold) -> None:
     """Raise `ValueError` for invalid arguments; of traced arrays, only the shape is checked."""
-    shape = np.shape(changes)
-    has_space_coordinates = np.shape(places) == (*shape[:1], 3) and not (
+    changes_shape = np.shape(changes)
+    has_space_coordinates = np.shape(places) == (*changes_shape[:1], 3) and not (
         has_values(places) and not np.ptp(places, axis=0).any()
     )
-    has_valid_shape = np.shape(places) == (*shape[:1], 2) or has_space_coordinates
-    if len(shape) != 2 or 0 in shape or not has_valid_shape or np.shape(cell_area) not in ((), shape[:1]):
+    has_valid_shape = np.shape(places) == (*changes_shape[:1], 2) or has_space_coordinates
+    if (
+        len(changes_shape) != 2
+        or 0 in changes_shape
+        or not has_valid_shape
+        or np.shape(cell_area) not in ((), changes_shape[:1])
+    ):
         raise ValueError(
-            f"changes has shape {shape}, places {np.shape(places)} and cell_area {np.shape(cell_area)}; give (n, m), "
-            "(n, 2), on a curved skin (n, 3), and a number or (n,): one touch for each of n places, m voltages each."
+            f"changes has shape {changes_shape}, places {np.shape(places)} and cell_area {np.shape(cell_area)}; give "
+            "(n, m), (n, 2), on a curved skin (n, 3), and a number or (n,): one touch for each of n places, m voltages "
+            "each."
         )
     if jnp.iscomplexobj(changes):
         raise ValueError("changes are complex; give their real part or the changes of the magnitudes.")
-    if not isinstance(num_taxels, (int, np.integer)) or not 1 <= num_taxels <= shape[0]:
-        raise ValueError(f"num_taxels must be a whole number from 1 to the {shape[0]} places; it is {num_taxels!r}.")
+    if not isinstance(num_taxels, (int, np.integer)) or not 1 <= num_taxels <= changes_shape[0]:
+        raise ValueError(
+            f"num_taxels must be a whole number from 1 to the {changes_shape[0]} places; it is {num_taxels!r}."
+        )
     if not 0 < threshold < 1:
         raise ValueError(f"threshold is a cosine, more than 0 and less than 1; it is {threshold!r}.")
     if has_values(changes):
-        is_invalid = ~np.isfinite(np.asarray(changes)).all(axis=1)
-        if is_invalid.any():
-            raise ValueError(f"changes: those of {is_invalid.sum()} of {shape[0]} places are NaN or infinite.")
+        is_invalid_change = ~np.isfinite(np.asarray(changes)).all(axis=1)
+        if is_invalid_change.any():
+            raise ValueError(
+                f"changes: those of {is_invalid_change.sum()} of {changes_shape[0]} places are NaN or infinite."
+            )
         if not np.asarray(changes).any():
             raise ValueError("changes are all zero: none of the touches changes any voltage.")
     if has_values(places, cell_area):
-        _check_lengths(np.asarray(places, float), np.broadcast_to(np.asarray(cell_area, float), shape[:1]))
+        _check_plausible_lengths(
+            np.asarray(places, float), np.broadcast_to(np.asarray(cell_area, float), changes_shape[:1])
+        )
 
 
-def _check_lengths(places: np.ndarray, cell_area: np.ndarray) -> None:
+def _check_plausible_lengths(places: np.ndarray, cell_area: np.ndarray) -> None:
     if not np.isfinite(places).all():
         raise ValueError("places must be finite, in metres.")
     if not (np.isfinite(cell_area) & (cell_area > 0)).all():

@@ -19,11 +19,11 @@ from jeit.layout.layout import MAX_SKIN_SIZE, MIN_SKIN_SIZE, Layout, bounds, che
 from jeit.layout.surface_layout import SurfaceLayout
 from jeit.mesh import Domain, Mesh
 
-_UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+_METRES_PER_UNIT = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _PLANE_COLUMNS = ("x", "y", "diameter")
 _LENGTH_COLUMNS = ("x", "y", "z", "diameter")
 # Title of a column of lengths with its unit: "x_mm", "x [mm]", "x (mm)" or "xmm".
-_LENGTH_TITLE = re.compile(rf"({'|'.join(_LENGTH_COLUMNS)})[ _]*[\[(]?({'|'.join(_UNITS)})[\])]?")
+_LENGTH_TITLE = re.compile(rf"({'|'.join(_LENGTH_COLUMNS)})[ _]*[\[(]?({'|'.join(_METRES_PER_UNIT)})[\])]?")
 _LABEL_COLUMN, _IMPEDANCE_COLUMN = "label", "contact_impedance_ohm_m2"
 MAX_FILE_BYTES = 2**24
 """Maximum size of a layout file in bytes: reading a larger file would take more than a minute."""
@@ -52,33 +52,41 @@ def millimetres(metres: float) -> float:
 
 def write_csv(layout: Layout | SurfaceLayout, file: BinaryIO) -> None:
     """Write the electrodes of a layout as a CSV table, without the outline or the surface."""
-    lengths = np.column_stack([layout.centres, layout.diameters])
-    names = _PLANE_COLUMNS if lengths.shape[1] == 3 else _LENGTH_COLUMNS
-    header = [*(f"{name}_mm" for name in names), _LABEL_COLUMN]
-    columns: list[Iterable] = [*(map(millimetres, column) for column in lengths.T), layout.labels]
+    length_matrix = np.column_stack([layout.centres, layout.diameters])
+    column_names = _PLANE_COLUMNS if length_matrix.shape[1] == 3 else _LENGTH_COLUMNS
+    header_row = [*(f"{column_name}_mm" for column_name in column_names), _LABEL_COLUMN]
+    table_columns: list[Iterable] = [
+        *(map(millimetres, length_column) for length_column in length_matrix.T),
+        layout.labels,
+    ]
     if layout.contact_impedance is not None:
-        header.append(_IMPEDANCE_COLUMN)
-        columns.append(np.asarray(layout.contact_impedance).tolist())
-    text = io.StringIO(newline="")
-    writer = csv.writer(text)
-    writer.writerow(header)
-    writer.writerows(zip(*columns, strict=True))
-    file.write(text.getvalue().encode())
+        header_row.append(_IMPEDANCE_COLUMN)
+        table_columns.append(np.asarray(layout.contact_impedance).tolist())
+    text_buffer = io.StringIO(newline="")
+    csv_writer = csv.writer(text_buffer)
+    csv_writer.writerow(header_row)
+    csv_writer.writerows(zip(*table_columns, strict=True))
+    file.write(text_buffer.getvalue().encode())
 
 
 def read_csv(path: Path, outline: Domain | None) -> Layout:
     """Read an electrode layout of a flat skin from a CSV table, written by `write_csv` or by hand. Raises `ValueError`
     for an invalid table, naming the line."""
-    table = read_table(path, _PLANE_COLUMNS)
-    centres, diameters = np.column_stack([table.lengths["x"], table.lengths["y"]]), table.lengths["diameter"]
-    _check_unit(centres, diameters, table.titles)
-    check_discs_fit(centres, diameters, outline, [f"the electrode of line {number}" for number in table.lines])
+    layout_table = read_table(path, _PLANE_COLUMNS)
+    centres, diameters = (
+        np.column_stack([layout_table.lengths["x"], layout_table.lengths["y"]]),
+        layout_table.lengths["diameter"],
+    )
+    _check_unit(centres, diameters, layout_table.titles)
+    check_discs_fit(
+        centres, diameters, outline, [f"the electrode of line {line_number}" for line_number in layout_table.lines]
+    )
     return Layout(
         centres,
         diameters,
-        contact_impedance=table.contact_impedance,
+        contact_impedance=layout_table.contact_impedance,
         outline=outline,
-        labels=table.labels,
+        labels=layout_table.labels,
         name=path.stem,
     )
 
@@ -87,119 +95,132 @@ def read_table(path: Path, length_columns: Sequence[str]) -> LayoutTable:
     """Read a table of electrodes. `length_columns`: the columns of lengths that the table must have, from "x", "y", "z"
     and "diameter"; the title of each column states its unit. Raises `ValueError` for a table with other columns or
     invalid values."""
-    lines = _read_lines(path, length_columns)
-    delimiter = next((separator for separator in ";\t" if separator in lines[0][1]), ",")
-    (_, header), *rows = [(number, _split_cells(line, delimiter)) for number, line in lines]
-    columns = _find_columns(header, length_columns)
-    check_electrodes("the table", len(rows))
-    if not rows:
+    numbered_lines = _read_lines(path, length_columns)
+    delimiter = next((separator for separator in ";\t" if separator in numbered_lines[0][1]), ",")
+    (_, header_cells), *table_rows = [
+        (row_line, _split_cells(text_line, delimiter)) for row_line, text_line in numbered_lines
+    ]
+    columns_by_name = _find_columns(header_cells, length_columns)
+    check_electrodes("the table", len(table_rows))
+    if not table_rows:
         raise ValueError("there is no electrode below the names of the columns.")
-    for number, row in rows:
-        if len(row) != len(header):
+    for row_line, table_row in table_rows:
+        if len(table_row) != len(header_cells):
             decimal_hint = (
                 " Write decimals with a point, or separate columns by semicolons." if delimiter == "," else ""
             )
-            raise ValueError(f"line {number} has {len(row)} values for {len(header)} columns.{decimal_hint}")
+            raise ValueError(
+                f"line {row_line} has {len(table_row)} values for {len(header_cells)} columns.{decimal_hint}"
+            )
 
-    def numbers(name: str) -> np.ndarray:
-        column_index, unit = columns[name]
-        return unit * np.array(
+    def parse_column(column_name: str) -> np.ndarray:
+        column_index, metres_per_unit = columns_by_name[column_name]
+        return metres_per_unit * np.array(
             [
-                _parse_number(row[column_index], delimiter, f"line {line_number}: {header[column_index]}")
-                for line_number, row in rows
+                _parse_number(table_row[column_index], delimiter, f"line {line_number}: {header_cells[column_index]}")
+                for line_number, table_row in table_rows
             ]
         )
 
-    lengths = {name: numbers(name) for name in length_columns}
-    contact_impedance = numbers(_IMPEDANCE_COLUMN) if _IMPEDANCE_COLUMN in columns else None
-    for name, values in (("diameter", lengths["diameter"]), (_IMPEDANCE_COLUMN, contact_impedance)):
-        if values is not None and values.min() <= 0:
-            raise ValueError(f"line {rows[int(values.argmin())][0]}: {name} is not positive.")
+    lengths = {column_name: parse_column(column_name) for column_name in length_columns}
+    contact_impedance = parse_column(_IMPEDANCE_COLUMN) if _IMPEDANCE_COLUMN in columns_by_name else None
+    for column_name, column_values in (("diameter", lengths["diameter"]), (_IMPEDANCE_COLUMN, contact_impedance)):
+        if column_values is not None and column_values.min() <= 0:
+            raise ValueError(f"line {table_rows[int(column_values.argmin())][0]}: {column_name} is not positive.")
     labels = (
-        [row[columns[_LABEL_COLUMN][0]] or str(row_index + 1) for row_index, (_, row) in enumerate(rows)]
-        if _LABEL_COLUMN in columns
+        [
+            table_row[columns_by_name[_LABEL_COLUMN][0]] or str(row_index + 1)
+            for row_index, (_, table_row) in enumerate(table_rows)
+        ]
+        if _LABEL_COLUMN in columns_by_name
         else None
     )
-    titles = [header[columns[name][0]] for name in length_columns]
-    return LayoutTable(lengths, contact_impedance, labels, [number for number, _ in rows], titles)
+    column_titles = [header_cells[columns_by_name[column_name][0]] for column_name in length_columns]
+    return LayoutTable(lengths, contact_impedance, labels, [row_line for row_line, _ in table_rows], column_titles)
 
 
-def _check_unit(centres: np.ndarray, diameters: np.ndarray, titles: list[str]) -> None:
+def _check_unit(centres: np.ndarray, diameters: np.ndarray, column_titles: list[str]) -> None:
     """Raise `ValueError` for lengths that are implausible in the unit that the titles of the columns state."""
     x_min, x_max, y_min, y_max = bounds(centres, diameters)
-    size = max(x_max - x_min, y_max - y_min)
-    if size < MIN_SKIN_SIZE:
+    skin_extent = max(x_max - x_min, y_max - y_min)
+    if skin_extent < MIN_SKIN_SIZE:
         raise ValueError(
-            f"the electrodes would span {1e3 * size:.3g} mm under the columns {names_text(titles)}; if the values are "
-            "in metres, multiply them by 1000 and call the columns x_mm, y_mm, diameter_mm."
+            f"the electrodes would span {1e3 * skin_extent:.3g} mm under the columns {names_text(column_titles)}; if "
+            "the values are in metres, multiply them by 1000 and call the columns x_mm, y_mm, diameter_mm."
         )
-    if size > MAX_SKIN_SIZE:
+    if skin_extent > MAX_SKIN_SIZE:
         raise ValueError(
-            f"the electrodes would span {size:.3g} m under the columns {names_text(titles)}; if the values are in "
-            "millimetres, call the columns x_mm, y_mm, diameter_mm."
+            f"the electrodes would span {skin_extent:.3g} m under the columns {names_text(column_titles)}; if the "
+            "values are in millimetres, call the columns x_mm, y_mm, diameter_mm."
         )
 
 
 def _read_lines(path: Path, length_columns: Sequence[str]) -> list[tuple[int, str]]:
     """Read the lines that are neither empty nor comments, with their numbers from 1."""
     try:
-        text = read_text(path, encoding="utf-8-sig", max_bytes=MAX_FILE_BYTES)
+        file_text = read_text(path, encoding="utf-8-sig", max_bytes=MAX_FILE_BYTES)
     except UnicodeError:
         raise ValueError("this is not a text file in UTF-8; in the spreadsheet, save it as 'CSV UTF-8'.") from None
-    lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)]
-    lines = [(number, line) for number, line in lines if line.strip(" \t,;") and not line.lstrip().startswith("#")]
-    if not lines:
+    numbered_lines = [(line_number, text_line) for line_number, text_line in enumerate(file_text.splitlines(), start=1)]
+    numbered_lines = [
+        (line_number, text_line)
+        for line_number, text_line in numbered_lines
+        if text_line.strip(" \t,;") and not text_line.lstrip().startswith("#")
+    ]
+    if not numbered_lines:
         raise ValueError(f"the file is empty; the first line names the columns: {_header_example(length_columns)}.")
-    return lines
+    return numbered_lines
 
 
-def _split_cells(line: str, delimiter: str) -> list[str]:
+def _split_cells(text_line: str, delimiter: str) -> list[str]:
     with read_as("a line is no row of a table"):
-        return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
+        return [
+            cell_text.strip() for cell_text in next(csv.reader([text_line], delimiter=delimiter, skipinitialspace=True))
+        ]
 
 
-def _find_columns(header: list[str], length_columns: Sequence[str]) -> dict[str, tuple[int, float]]:
+def _find_columns(header_cells: list[str], length_columns: Sequence[str]) -> dict[str, tuple[int, float]]:
     """Index and unit (in metres) of every column of a table, by name. Raises `ValueError` for columns that are missing,
     unknown, repeated, or do not state their unit."""
-    columns: dict[str, tuple[int, float]] = {}
-    for column_index, title in enumerate(header):
-        length = _LENGTH_TITLE.fullmatch(title.lower())
-        name = length[1] if length else title.lower()
-        if name in length_columns and not length:
+    columns_by_name: dict[str, tuple[int, float]] = {}
+    for column_index, column_title in enumerate(header_cells):
+        length_match = _LENGTH_TITLE.fullmatch(column_title.lower())
+        column_name = length_match[1] if length_match else column_title.lower()
+        if column_name in length_columns and not length_match:
             raise ValueError(
-                f"the title of the column {describe(title)} does not state a unit; call it {name}_mm (or {name}_cm, "
-                f"{name}_m)."
+                f"the title of the column {describe(column_title)} does not state a unit; call it {column_name}_mm (or "
+                f"{column_name}_cm, {column_name}_m)."
             )
-        if name not in (*length_columns, _LABEL_COLUMN, _IMPEDANCE_COLUMN):
+        if column_name not in (*length_columns, _LABEL_COLUMN, _IMPEDANCE_COLUMN):
             raise ValueError(
-                f"there is no column {describe(title)} in a layout; the first line names columns: "
+                f"there is no column {describe(column_title)} in a layout; the first line names columns: "
                 f"{_header_example(length_columns)}."
             )
-        if name in columns:
-            raise ValueError(f"there are two columns for {name}; keep one.")
-        columns[name] = (column_index, _UNITS[length[2]] if length else 1.0)
-    missing_columns = [name for name in length_columns if name not in columns]
+        if column_name in columns_by_name:
+            raise ValueError(f"there are two columns for {column_name}; keep one.")
+        columns_by_name[column_name] = (column_index, _METRES_PER_UNIT[length_match[2]] if length_match else 1.0)
+    missing_columns = [column_name for column_name in length_columns if column_name not in columns_by_name]
     if missing_columns:
         raise ValueError(
             f"there is no column {missing_columns[0]}_mm; the first line names the columns: "
             f"{_header_example(length_columns)}."
         )
-    return columns
+    return columns_by_name
 
 
 def _header_example(length_columns: Sequence[str]) -> str:
-    first_columns = ", ".join(f"{name}_mm" for name in length_columns)
+    first_columns = ", ".join(f"{column_name}_mm" for column_name in length_columns)
     return f"{first_columns} and, if wanted, {_LABEL_COLUMN} and {_IMPEDANCE_COLUMN}"
 
 
-def _parse_number(cell: str, delimiter: str, cell_name: str) -> float:
+def _parse_number(cell_text: str, delimiter: str, cell_name: str) -> float:
     try:
-        value = float(cell if delimiter == "," else cell.replace(",", "."))
+        parsed_number = float(cell_text if delimiter == "," else cell_text.replace(",", "."))
     except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(f"{cell_name} is {describe(cell)}; give a finite number, such as 12.5.")
-    return value
+        parsed_number = math.nan
+    if not math.isfinite(parsed_number):
+        raise ValueError(f"{cell_name} is {describe(cell_text)}; give a finite number, such as 12.5.")
+    return parsed_number
 
 
 def read_surface_layout(path: str | Path, surface: Mesh, *, outward: bool = True) -> SurfaceLayout:
@@ -227,14 +248,14 @@ def read_surface_layout(path: str | Path, surface: Mesh, *, outward: bool = True
     if not path.is_file():
         raise FileNotFoundError(f"path: there is no file {path}. Check the name and the working directory.")
     try:
-        table = read_table(path, ("x", "y", "z", "diameter"))
+        layout_table = read_table(path, ("x", "y", "z", "diameter"))
         return SurfaceLayout(
-            np.column_stack([table.lengths[axis] for axis in "xyz"]),
-            table.lengths["diameter"],
+            np.column_stack([layout_table.lengths[axis_name] for axis_name in "xyz"]),
+            layout_table.lengths["diameter"],
             surface,
-            contact_impedance=table.contact_impedance,
+            contact_impedance=layout_table.contact_impedance,
             outward=outward,
-            labels=table.labels,
+            labels=layout_table.labels,
             name=path.stem,
         )
     except ValueError as error:

@@ -20,8 +20,8 @@ from jeit.layout.surface_layout import SurfaceLayout
 from jeit.layout.svg_file import read_svg, write_svg
 from jeit.mesh import Domain
 
-_READERS = {".csv": read_csv, ".dxf": read_dxf, ".svg": read_svg}
-_WRITERS = {".csv": write_csv, ".dxf": write_dxf, ".svg": write_svg}
+_READERS_BY_SUFFIX = {".csv": read_csv, ".dxf": read_dxf, ".svg": read_svg}
+_WRITERS_BY_SUFFIX = {".csv": write_csv, ".dxf": write_dxf, ".svg": write_svg}
 
 
 def read_layout(path: str | Path, *, outline: Domain | None = None) -> Layout:
@@ -58,11 +58,11 @@ def read_layout(path: str | Path, *, outline: Domain | None = None) -> Layout:
     ```
     """
     path = Path(path)
-    reader = _function_for_suffix(path, _READERS)
+    read_function = _function_for_suffix(path, _READERS_BY_SUFFIX)
     if not path.is_file():
         raise FileNotFoundError(f"path: there is no file {path}. Check the name and the working directory.")
     try:
-        return reader(path, outline)
+        return read_function(path, outline)
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from None
 
@@ -93,20 +93,22 @@ def write_layout(layout: Layout | SurfaceLayout, path: str | Path) -> None:
     ```
     """
     path = Path(path)
-    writer = _function_for_suffix(path, _WRITERS)
-    if isinstance(layout, SurfaceLayout) and writer is not write_csv:
+    write_function = _function_for_suffix(path, _WRITERS_BY_SUFFIX)
+    if isinstance(layout, SurfaceLayout) and write_function is not write_csv:
         raise ValueError(f"path: drawings are flat, and '{layout.name}' is of a curved skin; give a name in .csv.")
     if not isinstance(layout, Layout | SurfaceLayout):
         raise ValueError(f"layout must be a Layout, not {type(layout).__name__}; see jeit.layout.Layout.")
     try:
-        with atomically_written_file(path) as file:
-            writer(layout, file)
+        with atomically_written_file(path) as layout_file:
+            write_function(layout, layout_file)
     except OSError as error:
         raise ValueError(f"path: {path} cannot be written: {error.strerror}. Is there such a folder?") from None
 
 
-def _function_for_suffix(path: Path, table: dict):
-    suffix = path.suffix.lower()
-    if suffix not in table:
-        raise ValueError(f"path: {path} ends with none of {', '.join(table)}, which give the format of a layout.")
-    return table[suffix]
+def _function_for_suffix(path: Path, functions_by_suffix: dict):
+    file_suffix = path.suffix.lower()
+    if file_suffix not in functions_by_suffix:
+        raise ValueError(
+            f"path: {path} ends with none of {', '.join(functions_by_suffix)}, which give the format of a layout."
+        )
+    return functions_by_suffix[file_suffix]

@@ -30,9 +30,9 @@ def check_labels(labels: Sequence[str] | None, num_electrodes: int) -> tuple[str
             raise ValueError(
                 f"labels: {label!r} is no label; give text on one line, without blanks before or after it."
             )
-    repeated = sorted({label for label in labels if labels.count(label) > 1})
-    if repeated:
-        raise ValueError(f"labels: {repeated[0]!r} is the label of several electrodes; give each its own.")
+    repeated_labels = sorted({label for label in labels if labels.count(label) > 1})
+    if repeated_labels:
+        raise ValueError(f"labels: {repeated_labels[0]!r} is the label of several electrodes; give each its own.")
     return tuple(labels)
 
 
@@ -100,15 +100,15 @@ class Layout(Module):
         not one for each electrode, and for a skin so small or so large that its lengths cannot be in metres.
         """
         self.centres = as_positions(centres, (2,))
-        number = self.num_electrodes
-        self.diameters = as_electrode_values("diameters", diameters, number, unit="metres")
+        num_electrodes = self.num_electrodes
+        self.diameters = as_electrode_values("diameters", diameters, num_electrodes, unit="metres")
         self.contact_impedance = (
             None
             if contact_impedance is None
-            else as_electrode_values("contact_impedance", contact_impedance, number, unit="ohm·m²")
+            else as_electrode_values("contact_impedance", contact_impedance, num_electrodes, unit="ohm·m²")
         )
         self.outline = outline
-        self.labels = check_labels(labels, number)
+        self.labels = check_labels(labels, num_electrodes)
         self.name = name
         if has_values(self.centres, self.diameters, outline):
             electrode_texts = [
@@ -141,8 +141,8 @@ class Layout(Module):
 
     def lengths(self) -> Float[np.ndarray, "L L"]:
         """Distances (L, L) between the centres of the electrodes, metres."""
-        centres = np.asarray(self.centres)
-        return np.linalg.norm(centres[:, None] - centres, axis=-1)
+        electrode_centres = np.asarray(self.centres)
+        return np.linalg.norm(electrode_centres[:, None] - electrode_centres, axis=-1)
 
     def sheet_discs(self, contact_impedance: ArrayLike | None = None) -> SheetDiscs:
         """Create the electrodes for a forward model on a sheet.
@@ -150,10 +150,10 @@ class Layout(Module):
         `contact_impedance`: contact impedance, ohm·m², by default the layout's. Raises `ValueError` if the contact
         impedance is neither specified nor known from the layout.
         """
-        impedance = self.contact_impedance if contact_impedance is None else contact_impedance
-        if impedance is None:
+        disc_impedance = self.contact_impedance if contact_impedance is None else contact_impedance
+        if disc_impedance is None:
             raise ValueError(f"contact_impedance: '{self.name}' does not say it; give it in ohm·m².")
-        return SheetDiscs(self.centres, self.diameters / 2, impedance)
+        return SheetDiscs(self.centres, self.diameters / 2, disc_impedance)
 
 
 def check_discs_fit(
@@ -162,33 +162,33 @@ def check_discs_fit(
     """Raise `ValueError` if discs overlap or extend beyond `outline`; lengths in metres. `disc_names` (L,): names of
     the discs in the error message."""
     x_min, x_max, y_min, y_max = bounds(centres, diameters) if outline is None else outline.extent
-    size = max(x_max - x_min, y_max - y_min)
-    check_size(size)
-    gaps = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
-    np.fill_diagonal(gaps, np.inf)
-    if gaps.min() < -_ROUNDING_TOLERANCE:
-        first_electrode, second_electrode = map(int, np.unravel_index(gaps.argmin(), gaps.shape))
+    skin_size = max(x_max - x_min, y_max - y_min)
+    check_size(skin_size)
+    electrode_gaps = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
+    np.fill_diagonal(electrode_gaps, np.inf)
+    if electrode_gaps.min() < -_ROUNDING_TOLERANCE:
+        first_electrode, second_electrode = map(int, np.unravel_index(electrode_gaps.argmin(), electrode_gaps.shape))
         is_same_place = np.linalg.norm(centres[first_electrode] - centres[second_electrode]) < _ROUNDING_TOLERANCE
-        fault = "are at the same place" if is_same_place else f"overlap by {-1e3 * gaps.min():.3g} mm"
+        fault_text = "are at the same place" if is_same_place else f"overlap by {-1e3 * electrode_gaps.min():.3g} mm"
         raise ValueError(
-            f"centres: {disc_names[first_electrode]} and {disc_names[second_electrode]} {fault}; remove one or "
+            f"centres: {disc_names[first_electrode]} and {disc_names[second_electrode]} {fault_text}; remove one or "
             "move them apart."
         )
     if outline is None:
         return
-    clearances = np.asarray(outline.signed_distance(centres)) - diameters / 2
-    electrode_index = int(clearances.argmin())
-    if clearances[electrode_index] < -_ROUNDING_TOLERANCE:
+    edge_clearances = np.asarray(outline.signed_distance(centres)) - diameters / 2
+    electrode_index = int(edge_clearances.argmin())
+    if edge_clearances[electrode_index] < -_ROUNDING_TOLERANCE:
         unit_hint = ""
         if (np.abs(centres) > MAX_SKIN_SIZE).any() and bool((outline.signed_distance(centres / 1000) > 0).all()):
             unit_hint = " Are they in millimetres? Divide by 1000."
-        elif diameters[electrode_index] > size:
+        elif diameters[electrode_index] > skin_size:
             unit_hint = " Is its diameter in metres?"
         x, y = 1e3 * centres[electrode_index]
         raise ValueError(
             f"centres: {disc_names[electrode_index]}, {1e3 * diameters[electrode_index]:g} mm across at ({x:g}, {y:g}) "
-            f"mm, reaches {-1e3 * clearances[electrode_index]:.3g} mm beyond the outline, which spans {1e3 * x_min:g} "
-            f"to {1e3 * x_max:g} mm by {1e3 * y_min:g} to {1e3 * y_max:g} mm.{unit_hint}"
+            f"mm, reaches {-1e3 * edge_clearances[electrode_index]:.3g} mm beyond the outline, which spans "
+            f"{1e3 * x_min:g} to {1e3 * x_max:g} mm by {1e3 * y_min:g} to {1e3 * y_max:g} mm.{unit_hint}"
         )
 
 
@@ -201,12 +201,12 @@ def check_size(size: float) -> None:
         )
 
 
-def _length_text(length: float) -> str:
-    return f"{length:.3g} m" if length > MAX_SKIN_SIZE else f"{1e3 * length:.3g} mm"
+def _length_text(length_metres: float) -> str:
+    return f"{length_metres:.3g} m" if length_metres > MAX_SKIN_SIZE else f"{1e3 * length_metres:.3g} mm"
 
 
 def bounds(centres: np.ndarray, diameters: np.ndarray) -> tuple[float, float, float, float]:
     """Bounding box (x_min, x_max, y_min, y_max) of discs, in the unit of their centres (L, 2) and diameters (L,)."""
-    low = (centres - diameters[:, None] / 2).min(axis=0)
-    high = (centres + diameters[:, None] / 2).max(axis=0)
-    return float(low[0]), float(high[0]), float(low[1]), float(high[1])
+    lower_corner = (centres - diameters[:, None] / 2).min(axis=0)
+    upper_corner = (centres + diameters[:, None] / 2).max(axis=0)
+    return float(lower_corner[0]), float(upper_corner[0]), float(lower_corner[1]), float(upper_corner[1])

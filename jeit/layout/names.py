@@ -46,10 +46,16 @@ def ring(
     check_count(num_electrodes, 2)
     if not radius > 0:
         raise ValueError(f"radius must be positive, in metres; it is {radius}.")
-    step = (-1 if clockwise else 1) * 2 * np.pi / num_electrodes
-    angle = start_angle + step * np.arange(num_electrodes)
-    position = np.asarray(centre) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return position if height is None else np.column_stack([position, np.full(num_electrodes, float(height))])
+    angle_step = (-1 if clockwise else 1) * 2 * np.pi / num_electrodes
+    electrode_angles = start_angle + angle_step * np.arange(num_electrodes)
+    electrode_positions = np.asarray(centre) + radius * np.stack(
+        [np.cos(electrode_angles), np.sin(electrode_angles)], axis=1
+    )
+    return (
+        electrode_positions
+        if height is None
+        else np.column_stack([electrode_positions, np.full(num_electrodes, float(height))])
+    )
 
 
 def ring_and_centre(radius: float, num_electrodes: int, **options: Any) -> np.ndarray:
@@ -68,8 +74,8 @@ def ring_and_centre(radius: float, num_electrodes: int, **options: Any) -> np.nd
     positions = ring_and_centre(0.1, 16, clockwise=True)
     ```
     """
-    position = ring(radius, num_electrodes, **options)
-    return np.vstack([position, position.mean(axis=0)])
+    ring_positions = ring(radius, num_electrodes, **options)
+    return np.vstack([ring_positions, ring_positions.mean(axis=0)])
 
 
 def perimeter(domain: Domain, num_electrodes: int, *, start: float = 0.0) -> np.ndarray:
@@ -148,29 +154,42 @@ def quasi_uniform(domain: Domain, num_electrodes: int, *, margin: float = 0.0, i
     """
     check_count(num_electrodes, 1)
     x_min, x_max, y_min, y_max = domain.extent
-    spacing = np.sqrt((x_max - x_min) * (y_max - y_min) / max(20_000, 200 * num_electrodes))
-    x, y = np.arange(x_min + spacing / 2, x_max, spacing), np.arange(y_min + spacing / 2, y_max, spacing)
-    samples = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    samples = samples[np.asarray(domain.contains(samples))]
+    sample_spacing = np.sqrt((x_max - x_min) * (y_max - y_min) / max(20_000, 200 * num_electrodes))
+    x, y = (
+        np.arange(x_min + sample_spacing / 2, x_max, sample_spacing),
+        np.arange(y_min + sample_spacing / 2, y_max, sample_spacing),
+    )
+    sample_points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    sample_points = sample_points[np.asarray(domain.contains(sample_points))]
     if margin > 0:
-        edge = domain.boundary(np.linspace(0, domain.perimeter, int(4 * domain.perimeter / spacing), endpoint=False))
-        samples = samples[KDTree(edge).query(samples)[0] >= margin]
-    if len(samples) < num_electrodes:
+        edge_points = domain.boundary(
+            np.linspace(0, domain.perimeter, int(4 * domain.perimeter / sample_spacing), endpoint=False)
+        )
+        sample_points = sample_points[KDTree(edge_points).query(sample_points)[0] >= margin]
+    if len(sample_points) < num_electrodes:
         raise ValueError(f"margin: {margin} m leaves no room for {num_electrodes} electrodes inside the outline.")
-    position = samples[[np.argmin(np.sum((samples - samples.mean(axis=0)) ** 2, axis=1))]]
-    distance = np.full(len(samples), np.inf)
-    while len(position) < num_electrodes:
-        distance = np.minimum(distance, np.sum((samples - position[-1]) ** 2, axis=1))
-        position = np.vstack([position, samples[distance.argmax()]])
+    electrode_positions = sample_points[[np.argmin(np.sum((sample_points - sample_points.mean(axis=0)) ** 2, axis=1))]]
+    squared_distances = np.full(len(sample_points), np.inf)
+    while len(electrode_positions) < num_electrodes:
+        squared_distances = np.minimum(
+            squared_distances, np.sum((sample_points - electrode_positions[-1]) ** 2, axis=1)
+        )
+        electrode_positions = np.vstack([electrode_positions, sample_points[squared_distances.argmax()]])
     for _ in range(iterations):
-        nearest_electrodes = KDTree(position).query(samples)[1]
-        count = np.bincount(nearest_electrodes, minlength=num_electrodes)
-        total = np.stack([np.bincount(nearest_electrodes, samples[:, k], num_electrodes) for k in range(2)], axis=1)
-        moved_positions = np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None], position)
-        if np.abs(moved_positions - position).max() < 1e-3 * spacing:
+        nearest_electrodes = KDTree(electrode_positions).query(sample_points)[1]
+        samples_per_electrode = np.bincount(nearest_electrodes, minlength=num_electrodes)
+        sample_sums = np.stack(
+            [np.bincount(nearest_electrodes, sample_points[:, k], num_electrodes) for k in range(2)], axis=1
+        )
+        moved_positions = np.where(
+            samples_per_electrode[:, None] > 0,
+            sample_sums / np.maximum(samples_per_electrode, 1)[:, None],
+            electrode_positions,
+        )
+        if np.abs(moved_positions - electrode_positions).max() < 1e-3 * sample_spacing:
             break
-        position = moved_positions
-    return position
+        electrode_positions = moved_positions
+    return electrode_positions
 
 
 def check_count(num_electrodes: int, minimum: int) -> None:
@@ -229,25 +248,25 @@ def named_layout(name: str, outline: Domain | None = None, *, diameter: float = 
     grid_match = re.fullmatch(r"grid-(\d{1,4})x(\d{1,4})", name) if isinstance(name, str) else None
     if name in _PARK_NAMES:
         _check_park(name, outline)
-        centres = _park_centres(name)
+        electrode_centres = _park_centres(name)
     elif grid_match is not None:
-        centres = _grid_centres(name, outline, diameter, int(grid_match[1]), int(grid_match[2]))
+        electrode_centres = _grid_centres(name, outline, diameter, int(grid_match[1]), int(grid_match[2]))
     elif spread_match is not None:
-        number = int(spread_match[2])
-        if number > _MAX_ELECTRODES:
-            raise ValueError(f"name: {name!r} has {number} electrodes; give {_MAX_ELECTRODES} or fewer.")
-        centres = (
-            _inner_centres(outline, number, diameter)
+        num_electrodes = int(spread_match[2])
+        if num_electrodes > _MAX_ELECTRODES:
+            raise ValueError(f"name: {name!r} has {num_electrodes} electrodes; give {_MAX_ELECTRODES} or fewer.")
+        electrode_centres = (
+            _inner_centres(outline, num_electrodes, diameter)
             if spread_match[1] == "inner"
-            else _perimeter_centres(name, outline, diameter, number)
+            else _perimeter_centres(name, outline, diameter, num_electrodes)
         )
     else:
-        suggestion = did_you_mean(name, [*_PARK_NAMES, *NAMES[2:]])
+        name_suggestion = did_you_mean(name, [*_PARK_NAMES, *NAMES[2:]])
         raise ValueError(
-            f"name: there is no layout {name!r}{suggestion}; take {', '.join(BUILT_IN)} (or another grid-CxR), "
+            f"name: there is no layout {name!r}{name_suggestion}; take {', '.join(BUILT_IN)} (or another grid-CxR), "
             "perimeter-N, inner-N, or a file's."
         )
-    return Layout(centres, diameter, outline=outline, name=name)
+    return Layout(electrode_centres, diameter, outline=outline, name=name)
 
 
 def same_outline(outline: Domain | None, other_outline: Domain) -> bool:
@@ -260,62 +279,68 @@ def same_outline(outline: Domain | None, other_outline: Domain) -> bool:
 
 
 @lru_cache(maxsize=2)
-def _park_centres(name: str) -> np.ndarray:
-    if name == "park-inner":
+def _park_centres(layout_name: str) -> np.ndarray:
+    if layout_name == "park-inner":
         return quasi_uniform(Rectangle(_PARK_SIDE, _PARK_SIDE), 32)
     edge_distance = DIAMETER + 2 * _PARK_EDGE_DISTANCE
-    track = Rectangle(_PARK_SIDE - edge_distance, _PARK_SIDE - edge_distance)
-    pitch = track.perimeter / 32
-    return np.asarray(track.boundary(pitch * (np.arange(32) + 0.5)))
+    electrode_track = Rectangle(_PARK_SIDE - edge_distance, _PARK_SIDE - edge_distance)
+    electrode_pitch = electrode_track.perimeter / 32
+    return np.asarray(electrode_track.boundary(electrode_pitch * (np.arange(32) + 0.5)))
 
 
-def _check_park(name: str, outline: Domain) -> None:
+def _check_park(layout_name: str, outline: Domain) -> None:
     if not same_outline(outline, Rectangle(_PARK_SIDE, _PARK_SIDE)):
         span_text = f"{-5e2 * _PARK_SIDE:g} to {5e2 * _PARK_SIDE:g} mm"
-        alternative = "inner-32" if name == "park-inner" else "perimeter-32"
-        raise ValueError(f"name: its skin spans {span_text} by {span_text}; on another take {alternative}.")
+        alternative_name = "inner-32" if layout_name == "park-inner" else "perimeter-32"
+        raise ValueError(f"name: its skin spans {span_text} by {span_text}; on another take {alternative_name}.")
 
 
-def _grid_centres(name: str, outline: Domain, diameter: float, columns: int, rows: int) -> np.ndarray:
-    if min(columns, rows) < 1:
-        raise ValueError(f"name: {name!r} has no electrodes; give at least one column and one row.")
-    if columns * rows > _MAX_ELECTRODES:
-        raise ValueError(f"name: {name!r} has {columns * rows} electrodes; give {_MAX_ELECTRODES} or fewer.")
-    x_min, x_max, y_min, y_max = outline.extent
-    pitches = (x_max - x_min) / columns, (y_max - y_min) / rows
-    if min(pitches) < diameter:
+def _grid_centres(layout_name: str, outline: Domain, diameter: float, num_columns: int, num_rows: int) -> np.ndarray:
+    if min(num_columns, num_rows) < 1:
+        raise ValueError(f"name: {layout_name!r} has no electrodes; give at least one column and one row.")
+    if num_columns * num_rows > _MAX_ELECTRODES:
         raise ValueError(
-            f"name: the electrodes of {name!r} would be {1e3 * min(pitches):.3g} mm apart, and they are "
-            f"{1e3 * diameter:g} mm across: they would overlap by {1e3 * (diameter - min(pitches)):.3g} mm; give "
+            f"name: {layout_name!r} has {num_columns * num_rows} electrodes; give {_MAX_ELECTRODES} or fewer."
+        )
+    x_min, x_max, y_min, y_max = outline.extent
+    grid_pitches = (x_max - x_min) / num_columns, (y_max - y_min) / num_rows
+    if min(grid_pitches) < diameter:
+        raise ValueError(
+            f"name: the electrodes of {layout_name!r} would be {1e3 * min(grid_pitches):.3g} mm apart, and they are "
+            f"{1e3 * diameter:g} mm across: they would overlap by {1e3 * (diameter - min(grid_pitches)):.3g} mm; give "
             "fewer, or move them apart."
         )
-    centre = (x_min + x_max) / 2, (y_min + y_max) / 2
-    return grid(x_max - x_min - pitches[0], y_max - y_min - pitches[1], columns, rows, centre=centre)
+    grid_centre = (x_min + x_max) / 2, (y_min + y_max) / 2
+    return grid(
+        x_max - x_min - grid_pitches[0], y_max - y_min - grid_pitches[1], num_columns, num_rows, centre=grid_centre
+    )
 
 
-def _perimeter_centres(name: str, outline: Domain, diameter: float, number: int) -> np.ndarray:
+def _perimeter_centres(layout_name: str, outline: Domain, diameter: float, num_electrodes: int) -> np.ndarray:
     if not isinstance(outline, Disk | Rectangle):
-        raise ValueError(f"name: {name!r} is of rectangles and disks, and this skin is neither; take inner-N.")
+        raise ValueError(f"name: {layout_name!r} is of rectangles and disks, and this skin is neither; take inner-N.")
     x_min, x_max, y_min, y_max = outline.extent
-    width, height, edge_distance = x_max - x_min, y_max - y_min, diameter + 2 * _PARK_EDGE_DISTANCE
-    if edge_distance >= min(width, height):
+    outline_width, outline_height, edge_distance = x_max - x_min, y_max - y_min, diameter + 2 * _PARK_EDGE_DISTANCE
+    if edge_distance >= min(outline_width, outline_height):
         raise ValueError(
             f"name: electrodes {1e3 * diameter:g} mm across do not fit around the edge; make them smaller."
         )
     if isinstance(outline, Disk):
-        return perimeter(Disk(outline.radius - edge_distance / 2, outline.centre), number)
-    track = Rectangle(width - edge_distance, height - edge_distance, outline.centre)
-    return perimeter(track, number, start=track.perimeter / number / 2 if number else 0.0)
+        return perimeter(Disk(outline.radius - edge_distance / 2, outline.centre), num_electrodes)
+    electrode_track = Rectangle(outline_width - edge_distance, outline_height - edge_distance, outline.centre)
+    return perimeter(
+        electrode_track, num_electrodes, start=electrode_track.perimeter / num_electrodes / 2 if num_electrodes else 0.0
+    )
 
 
-def _inner_centres(outline: Domain, number: int, diameter: float) -> np.ndarray:
-    """Centres of `number` electrodes spread evenly inside an outline. The centres in rectangles are cached, since a
-    study needs the same centres for many parameters."""
+def _inner_centres(outline: Domain, num_electrodes: int, diameter: float) -> np.ndarray:
+    """Centres of `num_electrodes` electrodes spread evenly inside an outline. The centres in rectangles are cached,
+    since a study needs the same centres for many parameters."""
     if isinstance(outline, Rectangle):
-        return _spread_centres(outline, number, diameter)
-    return quasi_uniform(outline, number, margin=diameter / 2)
+        return _spread_centres(outline, num_electrodes, diameter)
+    return quasi_uniform(outline, num_electrodes, margin=diameter / 2)
 
 
 @lru_cache(maxsize=256)
-def _spread_centres(outline: Rectangle, number: int, diameter: float) -> np.ndarray:
-    return quasi_uniform(outline, number, margin=diameter / 2)
+def _spread_centres(outline: Rectangle, num_electrodes: int, diameter: float) -> np.ndarray:
+    return quasi_uniform(outline, num_electrodes, margin=diameter / 2)

@@ -62,61 +62,75 @@ def spread(
     ```
     """
     check_count(number, 1)
-    triangles = surface if isinstance(surface, Triangles) else Triangles.of(surface, face)
-    while len(triangles.points) < min(_MIN_NODES_PER_POSITION * number, _MAX_REFINED_NODES):
-        triangles = triangles.finer()
-    weight = triangles.node_areas * (triangles.distance_to_border(triangles.points) >= margin)
-    usable = np.flatnonzero(weight > 0)
-    if len(usable) < number:
+    refined_surface = surface if isinstance(surface, Triangles) else Triangles.of(surface, face)
+    while len(refined_surface.points) < min(_MIN_NODES_PER_POSITION * number, _MAX_REFINED_NODES):
+        refined_surface = refined_surface.finer()
+    node_weights = refined_surface.node_areas * (refined_surface.distance_to_border(refined_surface.points) >= margin)
+    usable_nodes = np.flatnonzero(node_weights > 0)
+    if len(usable_nodes) < number:
         raise ValueError(f"margin: {1e3 * margin:g} mm leaves no room for {number} electrodes on the surface.")
-    geodesics = Geodesics.create(triangles)
-    position = triangles.points[_initial_nodes(geodesics, usable, weight, number)]
+    geodesics = Geodesics.create(refined_surface)
+    electrode_positions = refined_surface.points[_initial_nodes(geodesics, usable_nodes, node_weights, number)]
     for _ in range(iterations):
         nearest_electrodes = (
-            geodesics.owners(position)[0]
+            geodesics.owners(electrode_positions)[0]
             if number <= _MAX_GEODESIC_POSITIONS
-            else _nearest_positions(triangles, position)
-        )[usable]
-        position_weights = np.bincount(nearest_electrodes, weight[usable], number)
+            else _nearest_positions(refined_surface, electrode_positions)
+        )[usable_nodes]
+        position_weights = np.bincount(nearest_electrodes, node_weights[usable_nodes], number)
         centroid_sums = np.stack(
-            [np.bincount(nearest_electrodes, weight[usable] * x, number) for x in triangles.points[usable].T], axis=1
+            [
+                np.bincount(nearest_electrodes, node_weights[usable_nodes] * x, number)
+                for x in refined_surface.points[usable_nodes].T
+            ],
+            axis=1,
         )
-        new_positions = np.where(
-            position_weights[:, None] > 0, centroid_sums / np.maximum(position_weights, 1e-300)[:, None], position
+        moved_positions = np.where(
+            position_weights[:, None] > 0,
+            centroid_sums / np.maximum(position_weights, 1e-300)[:, None],
+            electrode_positions,
         )
-        new_positions = triangles.nearest(new_positions).points
-        is_converged = np.linalg.norm(new_positions - position, axis=1).max() < 1e-3 * np.sqrt(weight.sum() / number)
-        position = new_positions
+        moved_positions = refined_surface.nearest(moved_positions).points
+        is_converged = np.linalg.norm(moved_positions - electrode_positions, axis=1).max() < 1e-3 * np.sqrt(
+            node_weights.sum() / number
+        )
+        electrode_positions = moved_positions
         if is_converged:
             break
-    return position
+    return electrode_positions
 
 
-def _nearest_positions(triangles: Triangles, position: Float[np.ndarray, "L 3"]) -> np.ndarray:
+def _nearest_positions(triangles: Triangles, electrode_positions: Float[np.ndarray, "L 3"]) -> np.ndarray:
     """Index of the position nearest to each node, according to the distance in space and the difference of the
     normals."""
-    half_spacing = 0.5 * np.sqrt(triangles.areas.sum() / len(position))
-    scaled_normals = half_spacing * triangles.normals[triangles.nearest(position).triangle]
-    tree = KDTree(np.hstack([position, scaled_normals]))
-    return np.asarray(tree.query(np.hstack([triangles.points, half_spacing * triangles.node_normals]))[1])
+    half_spacing = 0.5 * np.sqrt(triangles.areas.sum() / len(electrode_positions))
+    scaled_normals = half_spacing * triangles.normals[triangles.nearest(electrode_positions).triangle]
+    position_tree = KDTree(np.hstack([electrode_positions, scaled_normals]))
+    return np.asarray(position_tree.query(np.hstack([triangles.points, half_spacing * triangles.node_normals]))[1])
 
 
-def _initial_nodes(geodesics: Geodesics, usable: np.ndarray, weight: np.ndarray, number: int) -> np.ndarray:
-    """Indices of `number` nodes with which Lloyd's algorithm starts: by farthest-point sampling or, for many positions,
-    drawn at random with probabilities proportional to their areas."""
-    if number > _MAX_GEODESIC_POSITIONS:
-        probabilities = weight[usable] / weight.sum()
-        return np.random.default_rng(0).choice(usable, number, replace=False, p=probabilities)
-    points = geodesics.surface.points
+def _initial_nodes(
+    geodesics: Geodesics, usable_nodes: np.ndarray, node_weights: np.ndarray, num_nodes: int
+) -> np.ndarray:
+    """Indices of `num_nodes` nodes with which Lloyd's algorithm starts: by farthest-point sampling or, for many
+    positions, drawn at random with probabilities proportional to their areas."""
+    if num_nodes > _MAX_GEODESIC_POSITIONS:
+        node_probabilities = node_weights[usable_nodes] / node_weights.sum()
+        return np.random.default_rng(0).choice(usable_nodes, num_nodes, replace=False, p=node_probabilities)
+    node_positions = geodesics.surface.points
     # The first node is the node farthest from the centroid, so that the result depends on the surface only.
-    centroid = np.average(points[usable], axis=0, weights=weight[usable])
-    nodes = [usable[np.linalg.norm(points[usable] - centroid, axis=1).round(9).argmax()]]
-    distances = geodesics.distances(points[nodes[:1]])[0]
-    while len(nodes) < number:
-        nodes.append(usable[distances[usable].argmax()])
-        max_distance = float(distances[usable].max())
-        distances = np.minimum(distances, geodesics.distances(points[nodes[-1:]], limit=max_distance)[0])
-    return np.array(nodes)
+    surface_centroid = np.average(node_positions[usable_nodes], axis=0, weights=node_weights[usable_nodes])
+    start_nodes = [
+        usable_nodes[np.linalg.norm(node_positions[usable_nodes] - surface_centroid, axis=1).round(9).argmax()]
+    ]
+    node_distances = geodesics.distances(node_positions[start_nodes[:1]])[0]
+    while len(start_nodes) < num_nodes:
+        start_nodes.append(usable_nodes[node_distances[usable_nodes].argmax()])
+        max_distance = float(node_distances[usable_nodes].max())
+        node_distances = np.minimum(
+            node_distances, geodesics.distances(node_positions[start_nodes[-1:]], limit=max_distance)[0]
+        )
+    return np.array(start_nodes)
 
 
 # Overlap of two discs that is tolerated.
@@ -176,15 +190,15 @@ class SurfaceLayout(Module):
         if not surface.is_surface:
             raise ValueError("surface is flat or a solid; a Layout is of flat skins, and a shell is made of a surface.")
         self.centres = as_positions(centres, (3,))
-        number = len(self.centres)
-        self.diameters = as_electrode_values("diameters", diameters, number, unit="metres")
+        num_electrodes = len(self.centres)
+        self.diameters = as_electrode_values("diameters", diameters, num_electrodes, unit="metres")
         self.contact_impedance = (
             None
             if contact_impedance is None
-            else as_electrode_values("contact_impedance", contact_impedance, number, unit="ohm·m²")
+            else as_electrode_values("contact_impedance", contact_impedance, num_electrodes, unit="ohm·m²")
         )
         self.surface, self.outward = surface, bool(outward)
-        self.labels = check_labels(labels, number)
+        self.labels = check_labels(labels, num_electrodes)
         self.name = name
         if has_values(self.centres, self.diameters, surface):
             check_size(float(np.ptp(np.asarray(surface.points), axis=0).max()))
@@ -212,10 +226,10 @@ class SurfaceLayout(Module):
         `SurfaceLayout` do.
         """
         check_kind("surface", surface, Mesh, "a surface in space, such as jeit.mesh.tube(0.03, 0.15)")
-        room = margin + float(np.max(np.asarray(diameters, float))) / 2
-        centres = spread(surface, number, margin=room)
-        options = {"contact_impedance": contact_impedance, "outward": outward, "name": name}
-        return cls(centres, diameters, surface, **options)
+        edge_distance = margin + float(np.max(np.asarray(diameters, float))) / 2
+        spread_centres = spread(surface, number, margin=edge_distance)
+        layout_options = {"contact_impedance": contact_impedance, "outward": outward, "name": name}
+        return cls(spread_centres, diameters, surface, **layout_options)
 
     @property
     def num_electrodes(self) -> int:
@@ -238,23 +252,25 @@ class SurfaceLayout(Module):
         `contact_impedance`: contact impedance, ohm·m², by default the layout's. Raises `ValueError` if the contact
         impedance is neither specified nor known from the layout.
         """
-        impedance = self.contact_impedance if contact_impedance is None else contact_impedance
-        if impedance is None:
+        disc_impedance = self.contact_impedance if contact_impedance is None else contact_impedance
+        if disc_impedance is None:
             raise ValueError(f"contact_impedance: '{self.name}' does not say it; give it in ohm·m².")
-        return (SurfaceDiscs if sheet else FaceDiscs)(self.centres, self.diameters / 2, impedance)
+        return (SurfaceDiscs if sheet else FaceDiscs)(self.centres, self.diameters / 2, disc_impedance)
 
 
-def _check_no_overlap(centres: np.ndarray, diameters: np.ndarray, labels: Sequence[str]) -> None:
+def _check_no_overlap(electrode_centres: np.ndarray, diameters: np.ndarray, labels: Sequence[str]) -> None:
     """Raise `ValueError` for discs that overlap. Straight-line distances are used, since for discs that overlap they
     hardly differ from distances along the surface."""
-    gaps = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
-    np.fill_diagonal(gaps, np.inf)
-    if gaps.min() < -_OVERLAP_TOLERANCE:
-        first_electrode, second_electrode = map(int, np.unravel_index(gaps.argmin(), gaps.shape))
+    electrode_gaps = (
+        np.linalg.norm(electrode_centres[:, None] - electrode_centres, axis=-1) - (diameters[:, None] + diameters) / 2
+    )
+    np.fill_diagonal(electrode_gaps, np.inf)
+    if electrode_gaps.min() < -_OVERLAP_TOLERANCE:
+        first_electrode, second_electrode = map(int, np.unravel_index(electrode_gaps.argmin(), electrode_gaps.shape))
         raise ValueError(
             f"centres: electrode {first_electrode + 1} ('{labels[first_electrode]}') and electrode "
             f"{second_electrode + 1} ('{labels[second_electrode]}') overlap by "
-            f"{-1e3 * gaps.min():.3g} mm; remove one or move them apart."
+            f"{-1e3 * electrode_gaps.min():.3g} mm; remove one or move them apart."
         )
 
 

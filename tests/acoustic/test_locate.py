@@ -33,7 +33,7 @@ def known(microphone_array):
 @pytest.fixture
 def in_numpy(monkeypatch):
     """Exchanges are searched in NumPy, in a third of the frames: programs for all of them take seconds to compile."""
-    monkeypatch.setattr("jeit.acoustic.localisation.array_changes._NUM_FRAMES", 8)
+    monkeypatch.setattr("jeit.acoustic.localisation.array_changes._NUM_SEARCHED_FRAMES", 8)
     create = Localiser.create
     fixed = SimpleNamespace(create=lambda array: create(array, compiled=False))
     monkeypatch.setattr("jeit.acoustic.localisation.array_changes.Localiser", fixed)
@@ -149,7 +149,7 @@ def test_all_zeros(known):
 
 def test_outside(known, microphone_array, in_numpy, monkeypatch):
     """Two to five centimetres outside: flagged, and located on the near side of the outline."""
-    monkeypatch.setattr("jeit.acoustic.localisation.array_changes._NUM_FRAMES", 24)
+    monkeypatch.setattr("jeit.acoustic.localisation.array_changes._NUM_SEARCHED_FRAMES", 24)
     along = np.linspace(-0.08, 0.08, 16)
     beyond = np.concatenate(
         [np.stack([along, np.full(16, sign * 0.14)], axis=1)[:, ::step] for sign in (1, -1) for step in (1, -1)]

@@ -116,7 +116,7 @@ def test_nearly_removed_layers_are_exact(models):
 
 @pytest.mark.slow
 def test_touches_that_do_not_converge_are_an_error(models, monkeypatch):
-    monkeypatch.setattr("jeit.design.skin.voltage_changes._MAX_STEPS", 1)
+    monkeypatch.setattr("jeit.design.skin.voltage_changes._MAX_SOLVER_STEPS", 1)
     model = models["sheet"]
     touched = touched_cells(model.mesh, Bell(), np.array([[0.01, 0.02], [0.0, 0.0], [0.02, 0.0]]), **SHEET)
     with pytest.raises(RuntimeError, match=r"3 of 3 touches were not found in 1 steps, the first at \(10, 20\) mm"):

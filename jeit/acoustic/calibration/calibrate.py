@@ -87,11 +87,14 @@ class CalibrationFit(Module):
         errors are unknown."""
         if not self.left_out:
             return ""
-        selected_error, *other_model_errors = (_distance_text(error) for _, error in self.left_out)
-        names = [name for name, _ in self.left_out[1:]]
-        comparison = ", ".join(f"{name} {error}" for name, error in zip(names, other_model_errors, strict=True))
+        selected_error, *other_model_errors = (_distance_text(model_error) for _, model_error in self.left_out)
+        model_names = [model_name for model_name, _ in self.left_out[1:]]
+        comparison_text = ", ".join(
+            f"{model_name} {model_error}"
+            for model_name, model_error in zip(model_names, other_model_errors, strict=True)
+        )
         return f"locates taps left out of the fit to {selected_error}, median" + (
-            f" ({comparison})" if comparison else ""
+            f" ({comparison_text})" if comparison_text else ""
         )
 
     @property
@@ -107,8 +110,8 @@ class CalibrationFit(Module):
         )
 
 
-def _distance_text(distance: float) -> str:
-    return f"{1e3 * distance:.1f} mm" if np.isfinite(distance) else "refused"
+def _distance_text(distance_metres: float) -> str:
+    return f"{1e3 * distance_metres:.1f} mm" if np.isfinite(distance_metres) else "refused"
 
 
 def calibrate_microphones(
@@ -145,8 +148,8 @@ def calibrate_microphones(
     calibration = fit.calibration
     ```
     """
-    is_auto = isinstance(decay, str) and decay == AUTO
-    decay_classes = () if is_auto else (find_decay(decay),)
+    is_automatic_choice = isinstance(decay, str) and decay == AUTO
+    decay_classes = () if is_automatic_choice else (find_decay(decay),)
     fits, rejection_reasons = fit_each_decay(
         taps, decay_classes, place_error=place_error, intensity=intensity, progress=progress
     )
@@ -160,8 +163,12 @@ def select_fit(fits: dict[str, CalibrationFit], rejection_reasons: dict[str, str
     if not fits:
         raise ValueError(next(iter(rejection_reasons.values())))
     # The fits are in the order of the number of parameters of their decay models.
-    smallest_error = min(fit.left_out[0][1] for fit in fits.values())
-    return next(fit for fit in fits.values() if not fit.left_out[0][1] > (1 + _MIN_ERROR_DECREASE) * smallest_error)
+    smallest_error = min(candidate_fit.left_out[0][1] for candidate_fit in fits.values())
+    return next(
+        candidate_fit
+        for candidate_fit in fits.values()
+        if not candidate_fit.left_out[0][1] > (1 + _MIN_ERROR_DECREASE) * smallest_error
+    )
 
 
 @np.errstate(all="ignore")  # decay models that cannot be fitted are reported with a reason
@@ -185,7 +192,7 @@ def fit_each_decay(
         raise ValueError(f"place_error must be zero or positive, in metres; it is {describe(place_error)}.")
     if intensity is not None and taps.samples is None:
         raise ValueError("intensity: band and window are for taps that come as samples; these are intensities.")
-    report_step = progress or (lambda step: None)
+    report_step = progress or (lambda step_name: None)
     if taps.samples is not None:
         report_step("measure intensities")
     fit_input = _read_taps(taps, intensity, place_error)
@@ -196,13 +203,17 @@ def fit_each_decay(
             fitted_models[decay_class.name] = _fit_decay_model(decay_class, fit_input)
         except _NoFitError as error:
             rejection_reasons[decay_class.name] = str(error)
-    localisation_errors = {name: fitted.left_out_taps.median for name, fitted in fitted_models.items()} | dict.fromkeys(
-        rejection_reasons, np.inf
-    )
+    localisation_errors = {
+        decay_name: fitted_model.left_out_taps.median for decay_name, fitted_model in fitted_models.items()
+    } | dict.fromkeys(rejection_reasons, np.inf)
     fits = {}
-    for name, fitted in fitted_models.items():
-        other_model_errors = tuple(item for item in localisation_errors.items() if item[0] != name)
-        fits[name] = _calibration_fit(taps, fit_input, fitted, ((name, localisation_errors[name]), *other_model_errors))
+    for decay_name, fitted_model in fitted_models.items():
+        other_model_errors = tuple(
+            name_and_error for name_and_error in localisation_errors.items() if name_and_error[0] != decay_name
+        )
+        fits[decay_name] = _calibration_fit(
+            taps, fit_input, fitted_model, ((decay_name, localisation_errors[decay_name]), *other_model_errors)
+        )
     return fits, rejection_reasons
 
 
@@ -211,7 +222,7 @@ class _FitInput(NamedTuple):
 
     **Fields**: `microphones`, `positions`: positions of microphones and taps in metres; `surface`: the surface of the
     skin; `place_error`: standard deviation of the microphones' coordinates in metres; `power`: intensities minus the
-    noise floor, NaN where unusable; `noise`: noise of the microphones; `known_noise`: whether the noise floor was
+    noise floor, NaN where unusable; `noise`: noise of the microphones; `is_noise_known`: whether the noise floor was
     measured; `faults`: fault of each microphone; `settings`: band and windows, for taps given as samples.
     """
 
@@ -221,7 +232,7 @@ class _FitInput(NamedTuple):
     place_error: float
     power: Float[np.ndarray, "M T"]
     noise: IntensityNoise
-    known_noise: bool
+    is_noise_known: bool
     faults: tuple[str, ...]
     settings: IntensitySettings | None
 
@@ -249,73 +260,99 @@ class _NoFitError(Exception):
 
 def _read_taps(taps: Taps, intensity: IntensitySettings | None, place_error: float) -> _FitInput:
     surface = make_surface(taps.outline, taps.positions)
-    settings = None
+    intensity_settings = None
     if taps.samples is None:
         assert taps.power is not None
-        power, (usable, faults) = taps.power, intensity_faults(taps.power)
-        noise = IntensityNoise.create(power.shape[1], deviation=noise_from_negative_powers(power, usable))
+        tap_power, (is_usable_reading, microphone_faults) = taps.power, intensity_faults(taps.power)
+        intensity_noise = IntensityNoise.create(
+            tap_power.shape[1], deviation=noise_from_negative_powers(tap_power, is_usable_reading)
+        )
     else:
-        settings = intensity if intensity is not None else IntensitySettings()
-        power, floor, degrees_of_freedom, usable, faults = tap_intensities(taps, settings)
-        noise = IntensityNoise.create(power.shape[1], floor=floor, freedom=np.median(degrees_of_freedom))
-    usable_power = np.where(usable, power, np.nan).T
-    noise_fields = noise, settings is not None, tuple(faults), settings
+        intensity_settings = intensity if intensity is not None else IntensitySettings()
+        tap_power, noise_floor, degrees_of_freedom, is_usable_reading, microphone_faults = tap_intensities(
+            taps, intensity_settings
+        )
+        intensity_noise = IntensityNoise.create(
+            tap_power.shape[1], floor=noise_floor, freedom=np.median(degrees_of_freedom)
+        )
+    usable_power = np.where(is_usable_reading, tap_power, np.nan).T
+    noise_fields = intensity_noise, intensity_settings is not None, tuple(microphone_faults), intensity_settings
     return _FitInput(taps.microphones, surface, taps.positions, float(place_error), usable_power, *noise_fields)
 
 
 def _fit_decay_model(decay_class: type[AbstractDecay], fit_input: _FitInput) -> _FittedModel:
     """Fit one decay model to all microphones. Raises `_NoFitError` if too few microphones received the taps or agree
     with the model."""
-    distance = np.linalg.norm(fit_input.microphones[:, None] - fit_input.positions, axis=-1)
-    has_enough_taps, rejection_reason = check_received(decay_class, distance, fit_input.power, fit_input.faults)
+    tap_distances = np.linalg.norm(fit_input.microphones[:, None] - fit_input.positions, axis=-1)
+    has_enough_taps, rejection_reason = check_received(decay_class, tap_distances, fit_input.power, fit_input.faults)
     if rejection_reason:
         raise _NoFitError(rejection_reason)
-    noise = fit_input.noise, fit_input.known_noise
-    fit = fit_taps(
-        decay_class, fit_input.microphones, fit_input.positions, fit_input.power, *noise, fit_input.place_error
+    noise_arguments = fit_input.noise, fit_input.is_noise_known
+    tap_fit = fit_taps(
+        decay_class,
+        fit_input.microphones,
+        fit_input.positions,
+        fit_input.power,
+        *noise_arguments,
+        fit_input.place_error,
     )
-    initial_use = fit.use.T
-    fit, is_usable, reasons, explained_variance = exclude_unusable(fit, fit_input.faults)
-    left_out_taps = locate_held_out_taps(fit, fit_input.microphones, fit_input.surface, fit_input.positions)
+    initial_use = tap_fit.use.T
+    tap_fit, is_usable, exclusion_reasons, explained_variance = exclude_unusable(tap_fit, fit_input.faults)
+    left_out_taps = locate_held_out_taps(tap_fit, fit_input.microphones, fit_input.surface, fit_input.positions)
     if is_usable.sum() < 3 or (
         is_usable.sum() < _MIN_USABLE_MICROPHONE_SHARE * has_enough_taps.sum() and not left_out_taps.is_better_than_mean
     ):
         raise _NoFitError(
             f"only {is_usable.sum()} of the {has_enough_taps.sum()} microphones that received the taps follow a decay "
             "model, and three are needed, or half: are the rows of positions in the order of the taps, those of "
-            f"microphones in the order of the channels? {describe_faults(reasons)}."
+            f"microphones in the order of the channels? {describe_faults(exclusion_reasons)}."
         )
-    return _FittedModel(fit, initial_use, is_usable, reasons, explained_variance, left_out_taps)
+    return _FittedModel(tap_fit, initial_use, is_usable, exclusion_reasons, explained_variance, left_out_taps)
 
 
-def _calibration_fit(taps: Taps, fit_input: _FitInput, fitted: _FittedModel, localisation_errors) -> CalibrationFit:
+def _calibration_fit(
+    taps: Taps, fit_input: _FitInput, fitted_model: _FittedModel, localisation_errors
+) -> CalibrationFit:
     """Create the `CalibrationFit` of a fitted decay model. `localisation_errors`: name and localisation error of each
     decay model."""
-    fit, is_usable = fitted.fit, fitted.usable
+    tap_fit, is_usable = fitted_model.fit, fitted_model.usable
     # Logarithm of the factor by which gains are divided and strengths are multiplied; see `Calibration`.
-    log_gain = np.log(np.asarray(fit.kind.from_logarithms(host.asarray(fit.logarithms)).gain))[is_usable].mean()
-    strength = np.where(fit.received, np.exp(fit.strength + log_gain), np.nan)
-    shared, errors = fit.shared & is_usable, standard_errors(fit)[: len(fit.logarithms)]
-    errors[1:, shared] = np.nan
-    decay = on_device(fit.kind.from_logarithms(host.concatenate([fit.logarithms[:1] - log_gain, fit.logarithms[1:]])))
-    is_loud_microphone = (fit.use & (fit_input.power > 3 * fit.noise.deviation[:, None])).any(axis=0)
-    microphones = fit_input.microphones + fit.displacement
+    mean_log_gain = np.log(np.asarray(tap_fit.kind.from_logarithms(host.asarray(tap_fit.logarithms)).gain))[
+        is_usable
+    ].mean()
+    tap_strengths = np.where(tap_fit.received, np.exp(tap_fit.strength + mean_log_gain), np.nan)
+    has_shared_decay, parameter_errors = tap_fit.shared & is_usable, standard_errors(tap_fit)[: len(tap_fit.logarithms)]
+    parameter_errors[1:, has_shared_decay] = np.nan
+    fitted_decay = on_device(
+        tap_fit.kind.from_logarithms(host.concatenate([tap_fit.logarithms[:1] - mean_log_gain, tap_fit.logarithms[1:]]))
+    )
+    is_loud_microphone = (tap_fit.use & (fit_input.power > 3 * tap_fit.noise.deviation[:, None])).any(axis=0)
+    microphone_positions = fit_input.microphones + tap_fit.displacement
     calibration = Calibration(
-        MicrophoneArray(as_array(microphones), fit_input.surface, decay, on_device(fit.noise)),
+        MicrophoneArray(as_array(microphone_positions), fit_input.surface, fitted_decay, on_device(tap_fit.noise)),
         is_usable,
-        fitted.reasons,
-        errors,
+        fitted_model.reasons,
+        parameter_errors,
         fit_input.settings,
         taps.name,
-        _strength_range(strength[is_loud_microphone]),
-        fitted.left_out_taps.widening,
+        _strength_range(tap_strengths[is_loud_microphone]),
+        fitted_model.left_out_taps.widening,
     )
-    remaining_fields = strength, fit.outlier, fitted.explained, shared, fit.displacement, localisation_errors
-    distance = np.linalg.norm(fit_input.positions[:, None] - microphones, axis=-1)
-    return CalibrationFit(calibration, distance, fit_input.power.T, fitted.initial_use, *remaining_fields)
+    remaining_fit_fields = (
+        tap_strengths,
+        tap_fit.outlier,
+        fitted_model.explained,
+        has_shared_decay,
+        tap_fit.displacement,
+        localisation_errors,
+    )
+    tap_distances = np.linalg.norm(fit_input.positions[:, None] - microphone_positions, axis=-1)
+    return CalibrationFit(
+        calibration, tap_distances, fit_input.power.T, fitted_model.initial_use, *remaining_fit_fields
+    )
 
 
-def _strength_range(strength: np.ndarray) -> tuple[float, float] | None:
+def _strength_range(tap_strengths: np.ndarray) -> tuple[float, float] | None:
     """Strengths of the weakest and the strongest tap; None if no strength is known."""
-    positive_strengths = strength[strength > 0]
+    positive_strengths = tap_strengths[tap_strengths > 0]
     return (float(positive_strengths.min()), float(positive_strengths.max())) if positive_strengths.size else None

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from jeit.acoustic.calibration.calibration_tables import CalibrationTable, SurfaceTable
 
 FORMAT, VERSION = "jeit microphone calibration", 1
-_UNITS = {"length": "m", "intensity": "square of the samples' unit"}
+_QUANTITY_UNITS = {"length": "m", "intensity": "square of the samples' unit"}
 _SCALE_DESCRIPTION = (
     "strength 1 is the source whose intensity upon a microphone has geometric mean 1 over the usable ones"
 )
@@ -86,9 +86,9 @@ class Calibration(Module):
 
     def save(self, path: str | Path) -> None:
         """Write the calibration to a JSON file, together with the format version and the units."""
-        text = json.dumps(self._to_json(), indent=1, ensure_ascii=False, allow_nan=False)
-        with atomically_written_file(path) as file:
-            file.write(f"{text}\n".encode())
+        json_text = json.dumps(self._to_json(), indent=1, ensure_ascii=False, allow_nan=False)
+        with atomically_written_file(path) as calibration_file:
+            calibration_file.write(f"{json_text}\n".encode())
 
     @classmethod
     def load(cls, path: str | Path) -> Calibration:
@@ -99,44 +99,53 @@ class Calibration(Module):
         from jeit.files.limits import faults_message
         from jeit.files.schema import validated
 
-        name = Path(path).name
+        file_name = Path(path).name
         try:
-            content = read_json(path, max_bytes=_MAX_FILE_SIZE)
+            file_content = read_json(path, max_bytes=_MAX_FILE_SIZE)
         except ValueError:
-            content = None
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            file_content = None
+        if not isinstance(file_content, dict) or file_content.get("format") != FORMAT:
             raise ValueError(
-                f"{name[:80]} is no calibration of microphones; make one with 'jeit calibrate-microphones'."
+                f"{file_name[:80]} is no calibration of microphones; make one with 'jeit calibrate-microphones'."
             )
-        if content.get("version") != VERSION:
+        if file_content.get("version") != VERSION:
             raise ValueError(
-                f"{name[:80]} is of version {describe(content.get('version'))} of the format; this jeit reads version "
-                f"{VERSION}. Calibrate again, or use the jeit that wrote it."
+                f"{file_name[:80]} is of version {describe(file_content.get('version'))} of the format; this jeit "
+                f"reads version {VERSION}. Calibrate again, or use the jeit that wrote it."
             )
-        table = validated(CalibrationTable, content, name)
+        calibration_table = validated(CalibrationTable, file_content, file_name)
         try:
-            return cls._from_table(table)
+            return cls._from_table(calibration_table)
         except ValueError as error:
-            raise ValueError(faults_message(name, [str(error)])) from None
+            raise ValueError(faults_message(file_name, [str(error)])) from None
 
     def _to_json(self) -> dict[str, Any]:
         microphone_array = on_host(self.microphone_array)
-        surface: dict[str, Any] = {
+        surface_fields: dict[str, Any] = {
             "outline": _array_to_lists(microphone_array.surface.outline.vertices),
-            "holes": [_array_to_lists(hole) for hole in microphone_array.surface.outline.holes],
+            "holes": [_array_to_lists(hole_vertices) for hole_vertices in microphone_array.surface.outline.holes],
         }
         if isinstance(microphone_array.surface, CurvedSurface):
-            surface["curve"] = {key: _array_to_lists(getattr(microphone_array.surface, key)) for key in _CURVE_FIELDS}
-        kind = type(microphone_array.decay)
-        microphones = []
+            surface_fields["curve"] = {
+                field_name: _array_to_lists(getattr(microphone_array.surface, field_name))
+                for field_name in _CURVE_FIELDS
+            }
+        decay_class = type(microphone_array.decay)
+        microphone_entries = []
         for microphone_index in range(self.num_microphones):
-            parameters = {key: float(getattr(microphone_array.decay, key)[microphone_index]) for key in kind.parameters}
-            errors = dict(zip(kind.parameters, self.standard_errors[:, microphone_index], strict=True))
-            microphones.append(
+            decay_parameters = {
+                field_name: float(getattr(microphone_array.decay, field_name)[microphone_index])
+                for field_name in decay_class.parameters
+            }
+            parameter_errors = dict(zip(decay_class.parameters, self.standard_errors[:, microphone_index], strict=True))
+            microphone_entries.append(
                 {
                     "position": _array_to_lists(microphone_array.microphones[microphone_index]),
-                    **parameters,
-                    "relative_standard_error": {key: _number_or_none(error) for key, error in errors.items()},
+                    **decay_parameters,
+                    "relative_standard_error": {
+                        field_name: _number_or_none(parameter_error)
+                        for field_name, parameter_error in parameter_errors.items()
+                    },
                     "relative_noise": float(microphone_array.noise.relative[microphone_index]),
                     "noise_floor": float(microphone_array.noise.floor[microphone_index]),
                     "noise_deviation": float(microphone_array.noise.deviation[microphone_index]),
@@ -145,105 +154,126 @@ class Calibration(Module):
                     "reason": self.reasons[microphone_index],
                 }
             )
-        settings = self.intensity
+        intensity_settings = self.intensity
         return {
             "format": FORMAT,
             "version": VERSION,
-            "units": _UNITS,
+            "units": _QUANTITY_UNITS,
             "scale": _SCALE_DESCRIPTION,
             "name": self.name,
-            "decay": kind.name,
-            "surface": surface,
+            "decay": decay_class.name,
+            "surface": surface_fields,
             "intensity": None
-            if settings is None
-            else {key: float(getattr(settings, key)) for key in ("low", "high", "window", "hop")},
-            "strengths": None if self.strengths is None else [float(value) for value in self.strengths],
+            if intensity_settings is None
+            else {
+                field_name: float(getattr(intensity_settings, field_name))
+                for field_name in ("low", "high", "window", "hop")
+            },
+            "strengths": None
+            if self.strengths is None
+            else [float(strength_limit) for strength_limit in self.strengths],
             "widening": float(self.widening),
-            "microphones": microphones,
+            "microphones": microphone_entries,
         }
 
     @classmethod
-    def _from_table(cls, table: CalibrationTable) -> Calibration:
+    def _from_table(cls, calibration_table: CalibrationTable) -> Calibration:
         microphone_tables, decay_class, surface = (
-            table.microphones,
-            DECAY_MODELS[table.decay],
-            _surface_from_table(table.surface),
+            calibration_table.microphones,
+            DECAY_MODELS[calibration_table.decay],
+            _surface_from_table(calibration_table.surface),
         )
-        for microphone_index, microphone in enumerate(microphone_tables):
-            if len(microphone.position) != surface.dimension:
+        for microphone_index, microphone_table in enumerate(microphone_tables):
+            if len(microphone_table.position) != surface.dimension:
                 raise ValueError(
                     f"microphones[{microphone_index}].position must be {surface.dimension} coordinates in metres; it "
-                    f"has {len(microphone.position)}."
+                    f"has {len(microphone_table.position)}."
                 )
-            missing_parameters = [key for key in decay_class.parameters if getattr(microphone, key) is None]
+            missing_parameters = [
+                field_name for field_name in decay_class.parameters if getattr(microphone_table, field_name) is None
+            ]
             missing_errors = [
-                key for key in decay_class.parameters if key not in microphone.relative_standard_error.model_fields_set
+                field_name
+                for field_name in decay_class.parameters
+                if field_name not in microphone_table.relative_standard_error.model_fields_set
             ]
             if missing_parameters or missing_errors:
-                key = missing_parameters[0] if missing_parameters else f"relative_standard_error.{missing_errors[0]}"
+                field_name = (
+                    missing_parameters[0] if missing_parameters else f"relative_standard_error.{missing_errors[0]}"
+                )
                 raise ValueError(
-                    f"microphones[{microphone_index}].{key} is missing; decay is '{decay_class.name}', which has it."
+                    f"microphones[{microphone_index}].{field_name} is missing; decay is '{decay_class.name}', which "
+                    "has it."
                 )
 
-        def column(key: str) -> Array:
-            return as_array(np.array([getattr(microphone, key) for microphone in microphone_tables]))
+        def microphone_column(field_name: str) -> Array:
+            return as_array(np.array([getattr(microphone_table, field_name) for microphone_table in microphone_tables]))
 
-        positions = np.array([microphone.position for microphone in microphone_tables])
+        microphone_positions = np.array([microphone_table.position for microphone_table in microphone_tables])
         host_surface = on_host(surface)
         surface_points: Any = host_surface.outline.vertices
         if isinstance(host_surface, CurvedSurface):
             surface_points = np.concatenate([surface_points, host_surface.knots])
-        check_microphones(positions, np.asarray(host_surface.place(surface_points.T)).T)
+        check_microphones(microphone_positions, np.asarray(host_surface.place(surface_points.T)).T)
         microphone_array = MicrophoneArray(
-            as_array(positions),
+            as_array(microphone_positions),
             surface,
-            decay_class(*(column(key) for key in decay_class.parameters)),
+            decay_class(*(microphone_column(field_name) for field_name in decay_class.parameters)),
             IntensityNoise(
-                column("noise_floor"), column("noise_deviation"), column("noise_cross"), column("relative_noise")
+                microphone_column("noise_floor"),
+                microphone_column("noise_deviation"),
+                microphone_column("noise_cross"),
+                microphone_column("relative_noise"),
             ),
         )
-        errors = [
-            [getattr(microphone.relative_standard_error, key) for microphone in microphone_tables]
-            for key in decay_class.parameters
+        parameter_errors = [
+            [getattr(microphone_table.relative_standard_error, field_name) for microphone_table in microphone_tables]
+            for field_name in decay_class.parameters
         ]
-        settings = table.intensity
+        intensity_settings = calibration_table.intensity
         return cls(
             microphone_array,
-            np.array([microphone.usable for microphone in microphone_tables]),
-            tuple(microphone.reason for microphone in microphone_tables),
-            np.array([[math.nan if value is None else value for value in row] for row in errors]),
-            None if settings is None else IntensitySettings(**settings.model_dump()),
-            table.name,
-            None if table.strengths is None else _check_strengths(table.strengths),
-            table.widening,
+            np.array([microphone_table.usable for microphone_table in microphone_tables]),
+            tuple(microphone_table.reason for microphone_table in microphone_tables),
+            np.array(
+                [
+                    [math.nan if error_value is None else error_value for error_value in error_row]
+                    for error_row in parameter_errors
+                ]
+            ),
+            None if intensity_settings is None else IntensitySettings(**intensity_settings.model_dump()),
+            calibration_table.name,
+            None if calibration_table.strengths is None else _check_strengths(calibration_table.strengths),
+            calibration_table.widening,
         )
 
 
-def _surface_from_table(table: SurfaceTable) -> AbstractSurface:
-    check_extent(table.outline, "surface.outline")
-    outline, curve = Polygon(table.outline, table.holes), table.curve
-    if curve is None:
+def _surface_from_table(surface_table: SurfaceTable) -> AbstractSurface:
+    check_extent(surface_table.outline, "surface.outline")
+    outline, curve_table = Polygon(surface_table.outline, surface_table.holes), surface_table.curve
+    if curve_table is None:
         return Plane(outline)
-    if len(curve.knots) != len(curve.weights):
+    if len(curve_table.knots) != len(curve_table.weights):
         raise ValueError(
-            f"surface.curve has {len(curve.knots)} knots and {len(curve.weights)} weights; give a weight for each knot."
+            f"surface.curve has {len(curve_table.knots)} knots and {len(curve_table.weights)} weights; give a weight "
+            "for each knot."
         )
-    return CurvedSurface(outline, *(as_array(getattr(curve, key)) for key in _CURVE_FIELDS))
+    return CurvedSurface(outline, *(as_array(getattr(curve_table, field_name)) for field_name in _CURVE_FIELDS))
 
 
-def _check_strengths(strengths: np.ndarray) -> tuple[float, float]:
-    min_strength, max_strength = map(float, strengths)
+def _check_strengths(strength_limits: np.ndarray) -> tuple[float, float]:
+    min_strength, max_strength = map(float, strength_limits)
     if min_strength > max_strength:
         raise ValueError(f"strengths are {min_strength:g} and {max_strength:g}; give the weaker first.")
     return min_strength, max_strength
 
 
-def _array_to_lists(array) -> list:
-    return np.asarray(array).tolist()
+def _array_to_lists(numeric_array) -> list:
+    return np.asarray(numeric_array).tolist()
 
 
-def _number_or_none(value) -> float | None:
-    return float(value) if np.isfinite(value) else None
+def _number_or_none(number) -> float | None:
+    return float(number) if np.isfinite(number) else None
 
 
 def calibrated_intensities(
@@ -262,15 +292,22 @@ def calibrated_intensities(
     recording, and for arguments of the wrong type.
     """
     recordings = {"recording": recording} if silence is None else {"recording": recording, "silence": silence}
-    for name, value in recordings.items():
-        check_kind(name, value, (Recording, Intensities), "a Recording or Intensities, as of read_recording(path)")
+    for argument_name, checked_value in recordings.items():
+        check_kind(
+            argument_name,
+            checked_value,
+            (Recording, Intensities),
+            "a Recording or Intensities, as of read_recording(path)",
+        )
     check_kind("calibration", calibration, Calibration, "a Calibration, as of Calibration.load(path)")
     check_settings("intensity", intensity)
-    for value in recordings.values():
-        num_channels = value.samples.shape[0] if isinstance(value, Recording) else value.power.shape[1]
+    for checked_value in recordings.values():
+        num_channels = (
+            checked_value.samples.shape[0] if isinstance(checked_value, Recording) else checked_value.power.shape[1]
+        )
         if num_channels != calibration.num_microphones:
             raise ValueError(
-                f"'{value.name}' has {num_channels} microphones and the calibration '{calibration.name}' "
+                f"'{checked_value.name}' has {num_channels} microphones and the calibration '{calibration.name}' "
                 f"{calibration.num_microphones}; give the calibration of this array."
             )
     if silence is not None and not (isinstance(recording, Recording) and isinstance(silence, Recording)):
@@ -280,12 +317,12 @@ def calibrated_intensities(
         )
     if isinstance(recording, Intensities):
         return recording
-    settings = intensity or calibration.intensity or IntensitySettings()
-    recorded_intensities = intensities(recording, settings)
+    intensity_settings = intensity or calibration.intensity or IntensitySettings()
+    recorded_intensities = intensities(recording, intensity_settings)
     if silence is not None:
-        return _replace_floor(recorded_intensities, intensities(silence, settings))
+        return _replace_floor(recorded_intensities, intensities(silence, intensity_settings))
     # Noise floors can be compared only if frequency band and windows are those of the calibration.
-    if settings != calibration.intensity:
+    if intensity_settings != calibration.intensity:
         if calibration.intensity is None:
             return recorded_intensities
         settings_note = (
@@ -293,13 +330,15 @@ def calibrated_intensities(
         )
         return dataclasses.replace(recorded_intensities, notes=(settings_note,))
     calibration_floor = np.asarray(calibration.microphone_array.noise.floor)
-    ratio = np.where(
+    floor_ratios = np.where(
         calibration.usable, recorded_intensities.floor / np.where(calibration_floor > 0, calibration_floor, np.inf), 0.0
     )
-    description = (
-        f"the noise floor, taken from the quietest windows, is up to {ratio.max():.3g} times the calibration's"
+    excess_description = (
+        f"the noise floor, taken from the quietest windows, is up to {floor_ratios.max():.3g} times the calibration's"
     )
-    floor_faults = describe_faults([description if value > _MAX_FLOOR_RATIO else "" for value in ratio])
+    floor_faults = describe_faults(
+        [excess_description if checked_value > _MAX_FLOOR_RATIO else "" for checked_value in floor_ratios]
+    )
     settings_note = (
         f"{floor_faults}. If the recording never pauses, touches count as silence: give a recording of the array "
         "untouched (silence=). If gain, unit, surroundings or microphones have changed, calibrate again."
@@ -307,33 +346,33 @@ def calibrated_intensities(
     return dataclasses.replace(recorded_intensities, notes=(settings_note,)) if floor_faults else recorded_intensities
 
 
-def _replace_floor(recorded_intensities: Intensities, silence: Intensities) -> Intensities:
-    """Replace the noise floor of a recording by the noise floor of `silence`. Microphones that are unusable in the
-    silence become unusable in the recording."""
-    is_usable = np.asarray(silence.usable.any(axis=0))
-    has_floors = (silence.floor > 0) & (recorded_intensities.floor > 0)
-    ratio = (
-        float(np.median(silence.floor[has_floors] / recorded_intensities.floor[has_floors]))
-        if has_floors.any()
+def _replace_floor(recorded_intensities: Intensities, silence_intensities: Intensities) -> Intensities:
+    """Replace the noise floor of a recording by the noise floor of `silence_intensities`. Microphones that are unusable
+    in the silence become unusable in the recording."""
+    is_usable = np.asarray(silence_intensities.usable.any(axis=0))
+    has_noise_floors = (silence_intensities.floor > 0) & (recorded_intensities.floor > 0)
+    floor_ratio = (
+        float(np.median(silence_intensities.floor[has_noise_floors] / recorded_intensities.floor[has_noise_floors]))
+        if has_noise_floors.any()
         else 1.0
     )
-    if ratio > _MAX_FLOOR_RATIO:
+    if floor_ratio > _MAX_FLOOR_RATIO:
         raise ValueError(
-            f"silence '{silence.name}' is {ratio:.3g} times as loud as the quietest windows of "
+            f"silence '{silence_intensities.name}' is {floor_ratio:.3g} times as loud as the quietest windows of "
             f"'{recorded_intensities.name}': record the array untouched, at the same gain."
         )
     silence_faults = [
-        ("" if is_working else f"in the silence: {fault}")
-        for is_working, fault in zip(is_usable, silence.faults, strict=True)
+        ("" if is_working else f"in the silence: {microphone_fault}")
+        for is_working, microphone_fault in zip(is_usable, silence_intensities.faults, strict=True)
     ]
-    faults = [
-        "; ".join(filter(None, floor_pair))
-        for floor_pair in zip(recorded_intensities.faults, silence_faults, strict=True)
+    combined_faults = [
+        "; ".join(filter(None, fault_pair))
+        for fault_pair in zip(recorded_intensities.faults, silence_faults, strict=True)
     ]
     return dataclasses.replace(
         recorded_intensities,
-        power=recorded_intensities.power + recorded_intensities.floor - silence.floor,
-        floor=silence.floor,
+        power=recorded_intensities.power + recorded_intensities.floor - silence_intensities.floor,
+        floor=silence_intensities.floor,
         usable=recorded_intensities.usable & is_usable,
-        faults=faults,
+        faults=combined_faults,
     )

@@ -21,13 +21,13 @@ from jeit_solvers import Descent, minimise_small, solve_definite
 from jeit_solvers.engines import host, slopes
 
 # Maximum number of steps of a least-squares minimisation.
-_MAX_STEPS = 100
+_MAX_DESCENT_STEPS = 100
 # Maximum change of the logarithm of a tap's strength in a step.
 _MAX_LOG_STEP = 3.0
 # Maximum number of iterations in which parameters are fixed at their bounds or released from a bound.
 _MAX_ACTIVE_SET_STEPS = 6
 # The tolerance `atol`, in the unit of the cost, ends the fit once the levels are fitted to rounding error.
-_SOLVER = Descent(rtol=1e-10, atol=1e-20, damping=1e-2, history=1)
+_DESCENT_SOLVER = Descent(rtol=1e-10, atol=1e-20, damping=1e-2, history=1)
 
 
 class DecayProblem(NamedTuple):
@@ -58,9 +58,9 @@ class DecayProblem(NamedTuple):
 
     def log_response(self, values: Any) -> Float[np.ndarray, "M T"]:
         """Logarithm of the responses f (M, T) to the taps for the decay models with the given `values` (P, M)."""
-        squared = ((self.offset + self.displacement(values)[:, None]) ** 2).sum(axis=-1)
-        decay = self.decay.from_logarithms(values[: len(self.decay.parameters)])
-        return np.asarray(decay.log_response(host.asarray(squared)))
+        squared_distances = ((self.offset + self.displacement(values)[:, None]) ** 2).sum(axis=-1)
+        decay_model = self.decay.from_logarithms(values[: len(self.decay.parameters)])
+        return np.asarray(decay_model.log_response(host.asarray(squared_distances)))
 
     def expected_levels(
         self, values: Float[np.ndarray, "P M"], strength: Float[np.ndarray, " T"]
@@ -76,17 +76,17 @@ class DecayProblem(NamedTuple):
         """Levels log(S + N) for the received power S and the noise floor N, and their derivatives with respect to log
         S; `log_received` is log S."""
         received_power = np.exp(log_received)
-        total = received_power + self.floor[:, None]
-        return np.log(total), received_power / total
+        total_power = received_power + self.floor[:, None]
+        return np.log(total_power), received_power / total_power
 
     def expand(
         self, values: Float[np.ndarray, "P M"], strength: Float[np.ndarray, " T"]
     ) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T"], Float[np.ndarray, "P M T"]]:
         """Residuals y − m of the levels y, the derivatives of the expected levels m with respect to the logarithmic
         strengths s, and the derivatives with respect to the values. Residuals with weight 0 are 0."""
-        log_response, derivatives = slopes(self.log_response, values)
-        mean, signal_share = self.levels(strength + log_response)
-        return self.residual(mean), signal_share, signal_share * np.stack(derivatives)
+        log_response, response_derivatives = slopes(self.log_response, values)
+        expected_levels, signal_share = self.levels(strength + log_response)
+        return self.residual(expected_levels), signal_share, signal_share * np.stack(response_derivatives)
 
     def residual(self, mean: Float[np.ndarray, "M T"]) -> Float[np.ndarray, "M T"]:
         """Residuals y − m of the levels for the expected levels m = `mean`; 0 where the weight is 0."""
@@ -98,27 +98,33 @@ def fit_strengths(
 ) -> Float[np.ndarray, " T"]:
     """Fit the logarithms of the strengths of all taps for given decay models."""
 
-    def expand(unknowns, tap_data):
-        level, log_response, weight = tap_data
-        tap_problem = problem._replace(level=level, weight=weight)
-        mean, signal_share = tap_problem.levels(unknowns[0] + log_response)
-        residual = tap_problem.residual(mean)
-        value = 0.5 * np.sum(weight * residual**2, axis=0)
-        gradient = -np.sum(weight * signal_share * residual, axis=0)
-        curvature = np.sum(weight * signal_share**2, axis=0)
-        return value, gradient[None], np.maximum(curvature, 1e-30)[None, None]
+    def expand_tap(log_strength, tap_data):
+        tap_level, log_response, tap_weight = tap_data
+        tap_problem = problem._replace(level=tap_level, weight=tap_weight)
+        expected_levels, signal_share = tap_problem.levels(log_strength[0] + log_response)
+        level_residual = tap_problem.residual(expected_levels)
+        weighted_cost = 0.5 * np.sum(tap_weight * level_residual**2, axis=0)
+        cost_gradient = -np.sum(tap_weight * signal_share * level_residual, axis=0)
+        cost_curvature = np.sum(tap_weight * signal_share**2, axis=0)
+        return weighted_cost, cost_gradient[None], np.maximum(cost_curvature, 1e-30)[None, None]
 
     tap_data = problem.level, problem.log_response(values), problem.weight
-    return _minimise(expand, start[None], tap_data, (np.full(1, -np.inf), np.full(1, np.inf)))[0]
+    return _minimise_cost(expand_tap, start[None], tap_data, (np.full(1, -np.inf), np.full(1, np.inf)))[0]
 
 
-def _minimise(expand, start, data, bounds) -> np.ndarray:
-    lower_bounds, upper_bounds = (bound[:, None] for bound in bounds)
-    max_step = np.full_like(lower_bounds, _MAX_LOG_STEP)
-    minimum = minimise_small(
-        expand, start, data, lower=lower_bounds, upper=upper_bounds, largest_step=max_step, max_steps=_MAX_STEPS
+def _minimise_cost(expand_cost, initial_values, tap_data, bounds) -> np.ndarray:
+    lower_bounds, upper_bounds = (bound_values[:, None] for bound_values in bounds)
+    max_log_steps = np.full_like(lower_bounds, _MAX_LOG_STEP)
+    cost_minimum = minimise_small(
+        expand_cost,
+        initial_values,
+        tap_data,
+        lower=lower_bounds,
+        upper=upper_bounds,
+        largest_step=max_log_steps,
+        max_steps=_MAX_DESCENT_STEPS,
     )
-    return np.asarray(minimum.x)
+    return np.asarray(cost_minimum.x)
 
 
 def fit_jointly(
@@ -133,24 +139,35 @@ def fit_jointly(
     def unpack_unknowns(unknowns):
         return unknowns[: start.size].reshape(start.shape), unknowns[start.size :]
 
-    def expand(unknowns, _):
-        cost, system = _normal_equations(problem, *unpack_unknowns(unknowns), is_fitted)
+    def expand_cost(unknowns, _):
+        cost, normal_equations = _normal_equations(problem, *unpack_unknowns(unknowns), is_fitted)
 
         def solve_step(damping):
-            step_of_values, step_of_strengths = _solve_step(system, damping)
-            slope = np.sum(system.gradient * step_of_values) + system.tap_gradient @ step_of_strengths
-            quadratic_term = np.einsum("km,lm,mkl->", step_of_values, step_of_values, system.matrix)
-            quadratic_term += np.einsum("km,kmn,kn->", step_of_values, system.penalty, step_of_values)
-            cross_term = 2 * np.einsum("km,kmt,t->", step_of_values, system.coupling, step_of_strengths, optimize=True)
+            step_of_values, step_of_strengths = _solve_step(normal_equations, damping)
+            directional_slope = (
+                np.sum(normal_equations.microphone_gradient * step_of_values)
+                + normal_equations.tap_gradient @ step_of_strengths
+            )
+            quadratic_term = np.einsum(
+                "km,lm,mkl->", step_of_values, step_of_values, normal_equations.microphone_matrices
+            )
+            quadratic_term += np.einsum(
+                "km,kmn,kn->", step_of_values, normal_equations.penalty_matrices, step_of_values
+            )
+            cross_term = 2 * np.einsum(
+                "km,kmt,t->", step_of_values, normal_equations.tap_coupling, step_of_strengths, optimize=True
+            )
             return (
                 np.concatenate([step_of_values.ravel(), step_of_strengths]),
-                slope,
-                quadratic_term + cross_term + np.sum(system.tap_matrix * step_of_strengths**2),
+                directional_slope,
+                quadratic_term + cross_term + np.sum(normal_equations.tap_matrix * step_of_strengths**2),
             )
 
         return cost, solve_step
 
-    return unpack_unknowns(_SOLVER.at_once(expand, np.concatenate([start.ravel(), strength]), None, _MAX_STEPS)[0])
+    return unpack_unknowns(
+        _DESCENT_SOLVER.at_once(expand_cost, np.concatenate([start.ravel(), strength]), None, _MAX_DESCENT_STEPS)[0]
+    )
 
 
 def fit_with_bounds(
@@ -166,20 +183,22 @@ def fit_with_bounds(
     the parameters that are fixed at a bound. A fixed parameter is released if the cost decreases from the bound towards
     the interior.
     """
-    lower_bounds, upper_bounds = (bound[:, None] for bound in bounds)
-    is_fixed = ((start <= lower_bounds) | (start >= upper_bounds)) & is_usable
+    lower_bounds, upper_bounds = (bound_values[:, None] for bound_values in bounds)
+    is_fixed_value = ((start <= lower_bounds) | (start >= upper_bounds)) & is_usable
     values = start
     for _ in range(_MAX_ACTIVE_SET_STEPS):
-        slope = _normal_equations(problem, values, strength, is_usable & np.ones_like(is_fixed))[1].gradient
-        descends_inwards = np.where(values <= lower_bounds, slope < 0, slope > 0)
-        is_fixed &= ~descends_inwards
-        fitted_values, strength = fit_jointly(problem, values, strength, ~is_fixed & is_usable)
+        cost_slope = _normal_equations(problem, values, strength, is_usable & np.ones_like(is_fixed_value))[
+            1
+        ].microphone_gradient
+        descends_inwards = np.where(values <= lower_bounds, cost_slope < 0, cost_slope > 0)
+        is_fixed_value &= ~descends_inwards
+        fitted_values, strength = fit_jointly(problem, values, strength, ~is_fixed_value & is_usable)
         values = np.clip(np.where(np.isfinite(fitted_values), fitted_values, values), lower_bounds, upper_bounds)
-        is_outside = (values != fitted_values) & ~is_fixed & is_usable
-        is_fixed |= is_outside
-        if not is_outside.any():
+        is_outside_bounds = (values != fitted_values) & ~is_fixed_value & is_usable
+        is_fixed_value |= is_outside_bounds
+        if not is_outside_bounds.any():
             break
-    return values, strength, is_fixed
+    return values, strength, is_fixed_value
 
 
 def log_covariance(
@@ -191,107 +210,122 @@ def log_covariance(
     fixed by the condition `scale` · values = constant, with `scale` (P M,). Entries of values that are not `is_fitted`
     (P, M) are NaN.
     """
-    schur = _schur_complement(_normal_equations(problem, values, strength, is_fitted)[1], 0.0)
+    schur_complement = _schur_complement(_normal_equations(problem, values, strength, is_fitted)[1], 0.0)
     num_parameters, num_microphones = values.shape
     is_free_parameter = np.asarray(is_fitted).ravel()
     null_direction = np.concatenate([np.ones(num_microphones), np.zeros((num_parameters - 1) * num_microphones)])[
         is_free_parameter
     ]
     constraint_matrix = np.asarray(scale)[is_free_parameter]
-    result = np.full((num_parameters * num_microphones, num_parameters * num_microphones), np.nan)
+    full_covariance = np.full((num_parameters * num_microphones, num_parameters * num_microphones), np.nan)
     # The data do not determine the direction in which all gains increase and all strengths decrease. This direction is
     # projected out according to the condition on `scale`.
-    inverse = np.linalg.pinv(schur[np.ix_(is_free_parameter, is_free_parameter)], rcond=1e-12, hermitian=True)
-    projector = np.eye(len(null_direction)) - np.outer(null_direction, constraint_matrix) / (
+    pseudo_inverse = np.linalg.pinv(
+        schur_complement[np.ix_(is_free_parameter, is_free_parameter)], rcond=1e-12, hermitian=True
+    )
+    scale_projector = np.eye(len(null_direction)) - np.outer(null_direction, constraint_matrix) / (
         constraint_matrix @ null_direction
     )
-    result[np.ix_(is_free_parameter, is_free_parameter)] = projector @ inverse @ projector.T
-    return result
+    full_covariance[np.ix_(is_free_parameter, is_free_parameter)] = scale_projector @ pseudo_inverse @ scale_projector.T
+    return full_covariance
 
 
 class _NormalEquations(NamedTuple):
     """Normal equations of the least-squares problem of a calibration, for microphones with values (P, M) and taps with
     strengths (T,).
 
-    **Fields**: `matrix`: block (M, P, P) of each microphone; `penalty`: matrices (P, M, M) of the penalty, which couple
-    the microphones; `coupling`: block (P, M, T) between values and strengths; `tap_matrix`: diagonal (T,) of the
-    strengths; `gradient`, `tap_gradient`: gradients with respect to values (P, M) and strengths (T,); `is_fitted`: mask
-    (P, M) of the fitted values.
+    **Fields**: `microphone_matrices`: block (M, P, P) of each microphone; `penalty_matrices`: matrices (P, M, M) of the
+    penalty, which couple the microphones; `tap_coupling`: block (P, M, T) between values and strengths; `tap_matrix`:
+    diagonal (T,) of the strengths; `microphone_gradient`, `tap_gradient`: gradients with respect to values (P, M) and
+    strengths (T,); `is_fitted`: mask (P, M) of the fitted values.
     """
 
-    matrix: np.ndarray
-    penalty: np.ndarray
-    coupling: np.ndarray
+    microphone_matrices: np.ndarray
+    penalty_matrices: np.ndarray
+    tap_coupling: np.ndarray
     tap_matrix: np.ndarray
-    gradient: np.ndarray
+    microphone_gradient: np.ndarray
     tap_gradient: np.ndarray
     is_fitted: np.ndarray
 
 
-def _normal_equations(problem: DecayProblem, values, strengths, is_fitted) -> tuple[np.ndarray, _NormalEquations]:
-    residual, signal_share, jacobian = problem.expand(values, strengths)
-    weight = problem.weight
-    penalty = _penalty_matrices(problem)
-    penalty_gradient = np.einsum("kmn,kn->km", penalty, values)
+def _normal_equations(
+    problem: DecayProblem, microphone_values, tap_strengths, is_fitted
+) -> tuple[np.ndarray, _NormalEquations]:
+    level_residual, signal_share, jacobian = problem.expand(microphone_values, tap_strengths)
+    level_weights = problem.weight
+    penalty_matrices = _penalty_matrices(problem)
+    penalty_gradient = np.einsum("kmn,kn->km", penalty_matrices, microphone_values)
     jacobian = np.where(is_fitted[:, :, None], jacobian, 0.0)
-    weighted_jacobian = weight * jacobian
-    system = _NormalEquations(
-        matrix=np.einsum("kmt,lmt->mkl", weighted_jacobian, jacobian),
-        penalty=penalty * (is_fitted[:, :, None] & is_fitted[:, None]),
-        coupling=weighted_jacobian * signal_share,
-        tap_matrix=np.sum(weight * signal_share**2, axis=0),
-        gradient=np.where(is_fitted, penalty_gradient, 0.0) - np.sum(weighted_jacobian * residual, axis=-1),
-        tap_gradient=-np.sum(weight * signal_share * residual, axis=0),
+    weighted_jacobian = level_weights * jacobian
+    normal_equations = _NormalEquations(
+        microphone_matrices=np.einsum("kmt,lmt->mkl", weighted_jacobian, jacobian),
+        penalty_matrices=penalty_matrices * (is_fitted[:, :, None] & is_fitted[:, None]),
+        tap_coupling=weighted_jacobian * signal_share,
+        tap_matrix=np.sum(level_weights * signal_share**2, axis=0),
+        microphone_gradient=np.where(is_fitted, penalty_gradient, 0.0)
+        - np.sum(weighted_jacobian * level_residual, axis=-1),
+        tap_gradient=-np.sum(level_weights * signal_share * level_residual, axis=0),
         is_fitted=is_fitted,
     )
-    return 0.5 * np.sum(weight * residual**2) + 0.5 * np.sum(values * penalty_gradient), system
+    return 0.5 * np.sum(level_weights * level_residual**2) + 0.5 * np.sum(
+        microphone_values * penalty_gradient
+    ), normal_equations
 
 
 def _penalty_matrices(problem: DecayProblem) -> Float[np.ndarray, "P M M"]:
     """Matrices (P, M, M) of the penalties Σ_m (v_m − v̄)² / spread², where v̄ is the mean over the microphones with at
     least one reading of nonzero weight, or 0 for displacements."""
     usable_weights = (problem.weight > 0).any(axis=1).astype(float)
-    mean_matrix = np.outer(usable_weights, usable_weights) / max(usable_weights.sum(), 1.0)
+    averaging_matrix = np.outer(usable_weights, usable_weights) / max(usable_weights.sum(), 1.0)
     has_common_value = np.arange(len(problem.spread)) < len(problem.decay.parameters)
-    return (np.diag(usable_weights) - has_common_value[:, None, None] * mean_matrix) / problem.spread[
+    return (np.diag(usable_weights) - has_common_value[:, None, None] * averaging_matrix) / problem.spread[
         :, None, None
     ] ** 2
 
 
-def _solve_step(system: _NormalEquations, damping):
-    num_parameters, num_microphones = system.gradient.shape
-    diagonal = _tap_diagonal(system, damping)
-    schur = _schur_complement(system, damping)
+def _solve_step(normal_equations: _NormalEquations, damping):
+    num_parameters, num_microphones = normal_equations.microphone_gradient.shape
+    tap_diagonal = _tap_diagonal(normal_equations, damping)
+    schur_complement = _schur_complement(normal_equations, damping)
     # The step has no component along the undetermined direction, in which all gains increase and all strengths
     # decrease, nor along fixed parameters.
     null_direction = np.concatenate(
-        [np.where(system.is_fitted[0], 1.0, 0.0), np.zeros((num_parameters - 1) * num_microphones)]
+        [np.where(normal_equations.is_fitted[0], 1.0, 0.0), np.zeros((num_parameters - 1) * num_microphones)]
     )
-    mean_diagonal = np.trace(schur) / schur.shape[0] + 1e-300
-    is_fixed = ~system.is_fitted.ravel()
-    schur = schur + mean_diagonal * (
-        np.outer(null_direction, null_direction) / num_microphones + np.diag(np.where(is_fixed, 1.0, 1e-14))
+    mean_diagonal = np.trace(schur_complement) / schur_complement.shape[0] + 1e-300
+    is_fixed_value = ~normal_equations.is_fitted.ravel()
+    schur_complement = schur_complement + mean_diagonal * (
+        np.outer(null_direction, null_direction) / num_microphones + np.diag(np.where(is_fixed_value, 1.0, 1e-14))
     )
-    right_hand_side = -system.gradient + np.einsum("kmt,t->km", system.coupling, system.tap_gradient / diagonal)
-    step_of_values = solve_definite(schur, right_hand_side.ravel()).reshape(num_parameters, num_microphones)
-    step_of_strengths = -(system.tap_gradient + np.einsum("kmt,km->t", system.coupling, step_of_values)) / diagonal
+    right_hand_side = -normal_equations.microphone_gradient + np.einsum(
+        "kmt,t->km", normal_equations.tap_coupling, normal_equations.tap_gradient / tap_diagonal
+    )
+    step_of_values = solve_definite(schur_complement, right_hand_side.ravel()).reshape(num_parameters, num_microphones)
+    step_of_strengths = (
+        -(normal_equations.tap_gradient + np.einsum("kmt,km->t", normal_equations.tap_coupling, step_of_values))
+        / tap_diagonal
+    )
     return step_of_values, step_of_strengths
 
 
-def _tap_diagonal(system: _NormalEquations, damping):
-    return np.where(system.tap_matrix > 0, system.tap_matrix * (1 + damping), 1.0)
+def _tap_diagonal(normal_equations: _NormalEquations, damping):
+    return np.where(normal_equations.tap_matrix > 0, normal_equations.tap_matrix * (1 + damping), 1.0)
 
 
-def _schur_complement(system: _NormalEquations, damping):
-    num_parameters, num_microphones = system.gradient.shape
-    size = num_parameters * num_microphones
-    blocks = system.matrix * (1 + damping * np.eye(num_parameters))
+def _schur_complement(normal_equations: _NormalEquations, damping):
+    num_parameters, num_microphones = normal_equations.microphone_gradient.shape
+    num_microphone_values = num_parameters * num_microphones
+    damped_blocks = normal_equations.microphone_matrices * (1 + damping * np.eye(num_parameters))
     microphone_index, full_matrix = (
         np.arange(num_microphones),
         np.zeros((num_parameters, num_microphones, num_parameters, num_microphones)),
     )
-    full_matrix[:, microphone_index, :, microphone_index] = blocks
+    full_matrix[:, microphone_index, :, microphone_index] = damped_blocks
     parameter_index = np.arange(num_parameters)
-    full_matrix[parameter_index, :, parameter_index] += system.penalty
-    coupling = system.coupling.reshape(size, -1)
-    return full_matrix.reshape(size, size) - (coupling / _tap_diagonal(system, damping)) @ coupling.T
+    full_matrix[parameter_index, :, parameter_index] += normal_equations.penalty_matrices
+    flat_coupling = normal_equations.tap_coupling.reshape(num_microphone_values, -1)
+    return (
+        full_matrix.reshape(num_microphone_values, num_microphone_values)
+        - (flat_coupling / _tap_diagonal(normal_equations, damping)) @ flat_coupling.T
+    )

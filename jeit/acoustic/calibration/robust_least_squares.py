@@ -49,15 +49,17 @@ def relative_errors(
     negative if there are few taps, each estimate is shrunk towards the median over all microphones, with the weight of
     20 taps.
     """
-    floor, deviation, cross_coefficients = (np.asarray(x) for x in (noise.floor, noise.deviation, noise.cross))
+    floor, additive_deviation, cross_coefficients = (np.asarray(x) for x in (noise.floor, noise.deviation, noise.cross))
     num_inliers, excess_errors = np.zeros(len(received_power)), np.zeros(len(received_power))
     for k in range(len(received_power)):
-        is_used = use[k] & (received_power[k] > 3 * deviation[k])
+        is_used = use[k] & (received_power[k] > 3 * additive_deviation[k])
         if is_used.sum() < 3:
             continue
-        signal, usable_residual = received_power[k, is_used], residual[k, is_used]
-        squared_signal_share = (signal / (signal + floor[k])) ** 2
-        additive_variance = (cross_coefficients[k] * signal + deviation[k] ** 2) / (signal + floor[k]) ** 2
+        signal_power, usable_residual = received_power[k, is_used], residual[k, is_used]
+        squared_signal_share = (signal_power / (signal_power + floor[k])) ** 2
+        additive_variance = (cross_coefficients[k] * signal_power + additive_deviation[k] ** 2) / (
+            signal_power + floor[k]
+        ) ** 2
         is_inlier = np.abs(usable_residual) <= _MAX_RESIDUAL_DEVIATIONS * max(
             1.4826 * np.median(np.abs(usable_residual)), 1e-15
         )
@@ -92,36 +94,40 @@ def additive_deviations(
     estimate is at least half the median over all microphones, since few taps determine the noise poorly, and
     underestimated noise causes false detections.
     """
-    deviation = np.zeros(len(received_power))
+    additive_deviation = np.zeros(len(received_power))
     trial_additive_variance_shares = np.concatenate([[0.0], np.geomspace(1e-6, 0.5, 18)])
     trial_errors = np.geomspace(MIN_RELATIVE_ERROR, 1.0, 30)
     for k in range(len(received_power)):
         if use[k].sum() < _MIN_TAPS:
             continue
-        tap_power, signal = power[k, use[k]], received_power[k, use[k]]
+        tap_power, signal_power = power[k, use[k]], received_power[k, use[k]]
         max_power = np.abs(tap_power).max()
         if max_power == 0:
             continue
 
-        def negative_log_likelihood(relative_deviations, tap_power=tap_power, signal=signal, max_power=max_power):
+        def negative_log_likelihood(
+            relative_deviations, tap_power=tap_power, signal_power=signal_power, max_power=max_power
+        ):
             variance = (
-                (trial_errors[:, None, None] * signal) ** 2
+                (trial_errors[:, None, None] * signal_power) ** 2
                 + (max_power * relative_deviations[:, None]) ** 2
                 + 1e-30 * max_power**2
             )
-            ratio = np.minimum(
-                fixed_parameter_inflation * (tap_power - signal) ** 2 / variance, _MAX_RESIDUAL_DEVIATIONS**2
+            squared_ratio = np.minimum(
+                fixed_parameter_inflation * (tap_power - signal_power) ** 2 / variance, _MAX_RESIDUAL_DEVIATIONS**2
             )
-            return np.sum(ratio + np.log(variance), axis=-1).min(axis=0)
+            return np.sum(squared_ratio + np.log(variance), axis=-1).min(axis=0)
 
-        scores = negative_log_likelihood(trial_additive_variance_shares)
-        best_index = int(scores.argmin())
-        if scores[best_index] < scores[0] - 6:
+        trial_costs = negative_log_likelihood(trial_additive_variance_shares)
+        best_index = int(trial_costs.argmin())
+        if trial_costs[best_index] < trial_costs[0] - 6:
             refined_trial_shares = trial_additive_variance_shares[best_index] * np.geomspace(0.5, 2.0, 9)
-            deviation[k] = max_power * refined_trial_shares[negative_log_likelihood(refined_trial_shares).argmin()]
+            additive_deviation[k] = (
+                max_power * refined_trial_shares[negative_log_likelihood(refined_trial_shares).argmin()]
+            )
     has_enough_taps = use.sum(axis=1) >= _MIN_TAPS
-    median_deviation = float(np.median(deviation[has_enough_taps])) if has_enough_taps.any() else 0.0
-    return np.where(has_enough_taps, np.maximum(deviation, 0.5 * median_deviation), deviation)
+    median_deviation = float(np.median(additive_deviation[has_enough_taps])) if has_enough_taps.any() else 0.0
+    return np.where(has_enough_taps, np.maximum(additive_deviation, 0.5 * median_deviation), additive_deviation)
 
 
 # Maximum number of iterations of the fit with a shared shape, and of the fit with individual shapes.
@@ -252,27 +258,31 @@ def fit_taps(
     """Fit the decay model `kind` to all microphones: first with a shared shape, then with individual shapes and
     displacements. `microphones`, `tap_positions`: given positions in metres; the other arguments are fields of
     `TapFit`."""
-    offset = microphones[:, None] - tap_positions
-    array_size = float(np.linalg.norm(offset, axis=-1).max())
-    spacing = float(np.median(KDTree(microphones).query(microphones, k=2)[0][:, 1])) if len(microphones) > 1 else 0.0
-    num_displacements = offset.shape[2] if place_error > 0 else 0
-    low, high = kind.bounds(array_size)
-    lower_bounds, upper_bounds = (
-        np.array([*low, *[-_MAX_RELATIVE_DISPLACEMENT] * num_displacements]),
-        np.array([*high, *[_MAX_RELATIVE_DISPLACEMENT] * num_displacements]),
+    tap_offsets = microphones[:, None] - tap_positions
+    array_size = float(np.linalg.norm(tap_offsets, axis=-1).max())
+    microphone_spacing = (
+        float(np.median(KDTree(microphones).query(microphones, k=2)[0][:, 1])) if len(microphones) > 1 else 0.0
     )
-    start = np.asarray(kind.start(spacing if spacing > 0 else array_size / 4, len(microphones)).logarithms())
-    start = np.concatenate([start, np.zeros((num_displacements, len(microphones)))])
+    num_displacements = tap_offsets.shape[2] if place_error > 0 else 0
+    lower_limits, upper_limits = kind.bounds(array_size)
+    lower_bounds, upper_bounds = (
+        np.array([*lower_limits, *[-_MAX_RELATIVE_DISPLACEMENT] * num_displacements]),
+        np.array([*upper_limits, *[_MAX_RELATIVE_DISPLACEMENT] * num_displacements]),
+    )
+    initial_values = np.asarray(
+        kind.start(microphone_spacing if microphone_spacing > 0 else array_size / 4, len(microphones)).logarithms()
+    )
+    initial_values = np.concatenate([initial_values, np.zeros((num_displacements, len(microphones)))])
     num_shapes, num_taps = len(kind.parameters) - 1, len(tap_positions)
     fit = TapFit(
         kind,
-        offset,
+        tap_offsets,
         place_error,
         power,
         on_host(noise),
         known_noise,
-        values=np.clip(start, lower_bounds[:, None], upper_bounds[:, None]),
-        at_bound=np.zeros(start.shape, bool),
+        values=np.clip(initial_values, lower_bounds[:, None], upper_bounds[:, None]),
+        at_bound=np.zeros(initial_values.shape, bool),
         spread=_prior_spread(
             np.full(num_shapes, _SHARED_SHAPE_DEVIATION), np.full(num_displacements, _SHARED_SHAPE_DEVIATION)
         ),
@@ -285,8 +295,8 @@ def fit_taps(
     # The initial strength of a tap is estimated from the loudest microphone only.
     used_power = np.where(fit.use, power, -np.inf)
     loudest_index = used_power.argmax(axis=0), np.arange(num_taps)
-    response = fit.problem().log_response(fit.values)
-    strength = np.log(np.clip(used_power[loudest_index], 1e-300, 1e300)) - response[loudest_index]
+    log_responses = fit.problem().log_response(fit.values)
+    strength = np.log(np.clip(used_power[loudest_index], 1e-300, 1e300)) - log_responses[loudest_index]
     fit = replace(
         fit,
         strength=np.where(fit.received & np.isfinite(strength), strength, 0.0),
@@ -316,18 +326,18 @@ def standard_errors(fit: TapFit) -> Float[np.ndarray, "P M"]:
         return np.full(is_fitted.shape, np.nan)
     num_parameters = len(fit.kind.parameters)
 
-    def scale(values):
+    def log_gains(values):
         return np.where(is_fitted[0], np.log(fit.kind.from_logarithms(values[:num_parameters]).gain), 0.0)
 
-    gain_gradient = np.ravel(slopes(scale, fit.values)[1])
+    gain_gradient = np.ravel(slopes(log_gains, fit.values)[1])
     covariance = log_covariance(fit.problem(), fit.values, fit.strength, is_fitted, gain_gradient)
     return np.sqrt(np.maximum(np.diag(covariance), 0)).reshape(is_fitted.shape)
 
 
-def _alternate_fits(fit: TapFit, iterations: int, *, updates_shape_deviation: bool = False) -> TapFit:
+def _alternate_fits(fit: TapFit, max_iterations: int, *, updates_shape_deviation: bool = False) -> TapFit:
     """Alternate between the fit of all microphones and the re-estimation of noise and weights, until convergence or for
-    `iterations` iterations. If `updates_shape_deviation`, the `spread` of the parameters is also re-estimated."""
-    for _ in range(iterations):
+    `max_iterations` iterations. If `updates_shape_deviation`, the `spread` of the parameters is also re-estimated."""
+    for _ in range(max_iterations):
         previous_values, has_readings = fit.values, np.asarray(fit.usable.any(axis=1))
         values, strength, is_at_bound = fit_with_bounds(
             fit.problem(), previous_values, fit.strength, has_readings, fit.bounds
@@ -342,10 +352,10 @@ def _alternate_fits(fit: TapFit, iterations: int, *, updates_shape_deviation: bo
     return fit
 
 
-def _prior_spread(shapes, displacements) -> Float[np.ndarray, " P"]:
+def _prior_spread(shape_spreads, displacement_spreads) -> Float[np.ndarray, " P"]:
     """Concatenate the spreads (P,) of all values: of the gain (infinite, since the gain has no prior), of the shape
-    parameters (`shapes`) and of the displacements (`displacements`)."""
-    return np.concatenate([[np.inf], shapes, displacements])
+    parameters (`shape_spreads`) and of the displacements (`displacement_spreads`)."""
+    return np.concatenate([[np.inf], shape_spreads, displacement_spreads])
 
 
 def _update_spread(fit: TapFit) -> Float[np.ndarray, " P"]:
@@ -354,20 +364,23 @@ def _update_spread(fit: TapFit) -> Float[np.ndarray, " P"]:
     has_readings = fit.usable.any(axis=1)
     if has_readings.sum() < 2:
         return fit.spread
-    num_parameters, errors = len(fit.kind.parameters), np.nan_to_num(standard_errors(fit)[:, has_readings])
-    shapes, displacements = fit.logarithms[1:, has_readings], fit.values[num_parameters:, has_readings]
+    num_parameters, value_errors = len(fit.kind.parameters), np.nan_to_num(standard_errors(fit)[:, has_readings])
+    shape_values, displacements = fit.logarithms[1:, has_readings], fit.values[num_parameters:, has_readings]
     # Deviations from the median are limited, so that an outlying microphone does not dominate.
-    deviations = np.abs(shapes - np.median(shapes, axis=1, keepdims=True))
+    deviations = np.abs(shape_values - np.median(shape_values, axis=1, keepdims=True))
     limited_deviations = np.minimum(deviations, 3 * fit.spread[1:num_parameters, None])
-    shape_variance = (limited_deviations**2 + errors[1:num_parameters] ** 2).sum(axis=1) / (has_readings.sum() - 1)
+    shape_variance = (limited_deviations**2 + value_errors[1:num_parameters] ** 2).sum(axis=1) / (
+        has_readings.sum() - 1
+    )
     # All coordinates of the displacements have the same spread, which is at most `place_error`.
     displacement_variance = np.full(
-        len(displacements), (displacements**2 + errors[num_parameters:] ** 2).mean() if displacements.size else 0.0
+        len(displacements),
+        (displacements**2 + value_errors[num_parameters:] ** 2).mean() if displacements.size else 0.0,
     )
     return _prior_spread(
         *(
-            np.clip(np.sqrt(variance), _MIN_SHAPE_DEVIATION, _MAX_SHAPE_DEVIATION)
-            for variance in (shape_variance, displacement_variance)
+            np.clip(np.sqrt(value_variance), _MIN_SHAPE_DEVIATION, _MAX_SHAPE_DEVIATION)
+            for value_variance in (shape_variance, displacement_variance)
         )
     )
 
@@ -377,24 +390,26 @@ def _update_noise_and_weights(fit: TapFit) -> TapFit:
     expected_levels = fit.predicted_level()
     received_power = np.maximum(np.exp(expected_levels) - fit.noise.floor[:, None], 0.0)
     # The residuals are smaller than the errors of the data, since strengths and parameters were fitted to the data;
-    # `inflation` corrects for the difference.
+    # `residual_inflation` corrects for the difference.
     num_readings = fit.use.sum()
     num_fitted = fit.received.sum() + fit.is_fitted_parameter.sum()
-    inflation = num_readings / max(num_readings - num_fitted, 0.1 * num_readings)
+    residual_inflation = num_readings / max(num_readings - num_fitted, 0.1 * num_readings)
     if not fit.known_noise:
-        use = np.isfinite(fit.power) & ~fit.outlier
-        deviation = additive_deviations(fit.power, received_power, use, inflation)
+        is_used = np.isfinite(fit.power) & ~fit.outlier
+        additive_deviation = additive_deviations(fit.power, received_power, is_used, residual_inflation)
         negative_power_deviation = noise_from_negative_powers(fit.power.T, np.isfinite(fit.power.T))
         fit = replace(
             fit,
             noise=on_host(
-                IntensityNoise.create(len(received_power), deviation=np.maximum(deviation, negative_power_deviation))
+                IntensityNoise.create(
+                    len(received_power), deviation=np.maximum(additive_deviation, negative_power_deviation)
+                )
             ),
         )
-    relative = relative_errors(
-        fit.noise, received_power, _residual_for_equal_errors(fit, received_power), fit.use, inflation
+    relative_error = relative_errors(
+        fit.noise, received_power, _residual_for_equal_errors(fit, received_power), fit.use, residual_inflation
     )
-    fit = replace(fit, noise=replace(fit.noise, relative=relative))
+    fit = replace(fit, noise=replace(fit.noise, relative=relative_error))
     residual = np.where(fit.usable, fit.level - expected_levels, 0.0)
     squared_residual = residual**2 / np.maximum(
         _power_variance(fit, np.maximum(received_power, 1e-150)), MIN_RELATIVE_ERROR**2
@@ -417,8 +432,8 @@ def _residual_for_equal_errors(fit: TapFit, received_power: np.ndarray) -> Float
     With individual relative errors, a single microphone could dominate the strengths: its residuals would become ever
     smaller, and its weight ever larger.
     """
-    relative = fit.noise.relative
-    equal_fit = replace(fit, noise=replace(fit.noise, relative=np.full(len(relative), np.median(relative))))
+    relative_error = fit.noise.relative
+    equal_fit = replace(fit, noise=replace(fit.noise, relative=np.full(len(relative_error), np.median(relative_error))))
     equal_fit = replace(equal_fit, weight=1 / _level_variance(equal_fit, received_power))
     strength = fit_strengths(equal_fit.problem(with_outliers=True), fit.values, fit.strength)
     return np.where(fit.usable, fit.level - replace(equal_fit, strength=strength).predicted_level(), 0.0)
@@ -427,8 +442,8 @@ def _residual_for_equal_errors(fit: TapFit, received_power: np.ndarray) -> Float
 def _level_variance(fit: TapFit, received_power: np.ndarray) -> np.ndarray:
     """Variance (M, T) of the levels for the expected power `received_power`, which is bounded from below so that all
     weights are finite."""
-    floor = 1e-6 * np.nanmax(np.where(fit.use, fit.power, np.nan), axis=1, initial=1e-300)[:, None]
-    return _power_variance(fit, np.maximum(received_power, floor))
+    min_power = 1e-6 * np.nanmax(np.where(fit.use, fit.power, np.nan), axis=1, initial=1e-300)[:, None]
+    return _power_variance(fit, np.maximum(received_power, min_power))
 
 
 def _power_variance(fit: TapFit, received_power: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from jeit.acoustic import Taps
     from jeit.acoustic.calibration.calibrate import CalibrationFit
 
-_OPTIONS = {"path": "--output", "intensity": "--low, --high, --window and --hop"}
+_OPTION_NAMES = {"path": "--output", "intensity": "--low, --high, --window and --hop"}
 
 LowestFrequencyOption = Annotated[
     float | None, typer.Option(help="Lowest frequency of the band, hertz (default 50, or the calibration's).")
@@ -34,13 +34,15 @@ HopOption = Annotated[
 
 def intensity_settings(low: float | None, high: float | None, window: float | None, hop: float | None):
     """Create `IntensitySettings` from the command-line options that were given; None if all options are None."""
-    options = {"low": low, "high": high, "window": window, "hop": hop}
-    options = {name: value for name, value in options.items() if value is not None}
-    if not options:
+    given_options = {"low": low, "high": high, "window": window, "hop": hop}
+    given_options = {
+        option_name: option_value for option_name, option_value in given_options.items() if option_value is not None
+    }
+    if not given_options:
         return None
     from jeit.acoustic import IntensitySettings
 
-    return IntensitySettings(**options)
+    return IntensitySettings(**given_options)
 
 
 def calibrate_microphones(
@@ -92,104 +94,122 @@ def calibrate_microphones(
 
     if not 0 <= place_error < float("inf"):
         raise ValueError(f"--place-error must be zero or positive, in metres; it is {place_error}.")
-    settings = intensity_settings(low, high, window, hop)
+    intensity_options = intensity_settings(low, high, window, hop)
     console = plain_console()
-    with naming_options_in_errors(_OPTIONS):
+    with naming_options_in_errors(_OPTION_NAMES):
         decay_model = decay if decay == AUTO else find_decay(decay)
-        files = calibration_files(output)
-        make_folder(output.parent, tuple(file.name for file in files))
-        with Steps(console, quiet=quiet) as step:
-            step("read")
-            tap_data = read_taps(taps)
-            fit = calibrate(tap_data, decay=decay_model, place_error=place_error, intensity=settings, progress=step)
-            step("write")
-            write_calibration(fit, output)
+        calibration_paths = calibration_files(output)
+        make_folder(output.parent, tuple(calibration_path.name for calibration_path in calibration_paths))
+        with Steps(console, quiet=quiet) as progress_steps:
+            progress_steps("read")
+            calibration_taps = read_taps(taps)
+            calibration_fit = calibrate(
+                calibration_taps,
+                decay=decay_model,
+                place_error=place_error,
+                intensity=intensity_options,
+                progress=progress_steps,
+            )
+            progress_steps("write")
+            write_calibration(calibration_fit, output)
     if not quiet:
-        _print_summary(console, fit, tap_data)
-        print_written_files(console, output, files[1].name)
+        _print_summary(console, calibration_fit, calibration_taps)
+        print_written_files(console, output, calibration_paths[1].name)
 
 
-def _print_summary(console, fit: "CalibrationFit", taps: "Taps") -> None:
+def _print_summary(console, calibration_fit: "CalibrationFit", taps: "Taps") -> None:
     import numpy as np
 
     from jeit.cli.console import name_value_table
 
-    calibration = fit.calibration
-    usable = calibration.usable
-    rows = [
-        ("microphones", f"{int(usable.sum())} of {len(usable)} usable"),
-        ("taps", f"{len(fit.outlier)}, {int(fit.outlier.sum())} left out as outliers"),
-        ("decay model", f"{calibration.microphone_array.decay.name}: {fit.evidence}"),
-        ("error of the model", f"{100 * fit.error:.1f} % of an intensity, median"),
+    calibration = calibration_fit.calibration
+    is_usable = calibration.usable
+    table_rows = [
+        ("microphones", f"{int(is_usable.sum())} of {len(is_usable)} usable"),
+        ("taps", f"{len(calibration_fit.outlier)}, {int(calibration_fit.outlier.sum())} left out as outliers"),
+        ("decay model", f"{calibration.microphone_array.decay.name}: {calibration_fit.evidence}"),
+        ("error of the model", f"{100 * calibration_fit.error:.1f} % of an intensity, median"),
         (
             "error of location",
-            f"± {1e3 * _location_error(fit, taps):.1f} mm from one window, median (Cramér-Rao bound)",
+            f"± {1e3 * _location_error(calibration_fit, taps):.1f} mm from one window, median (Cramér-Rao bound)",
         ),
-        *([("note", with_option_names(fit.note, {"decay": "--decay"}))] if fit.note else []),
+        *([("note", with_option_names(calibration_fit.note, {"decay": "--decay"}))] if calibration_fit.note else []),
         ("scale", "a source of strength 1 has intensity 1 at a typical microphone directly below it"),
     ]
-    if fit.shared.any():
-        numbers = ", ".join(str(k) for k in np.flatnonzero(fit.shared))
-        rows.append(
-            ("tap nearer to", f"{numbers}: no tap determines the decay of their response; that of the others is used")
+    if calibration_fit.shared.any():
+        microphone_numbers = ", ".join(str(k) for k in np.flatnonzero(calibration_fit.shared))
+        table_rows.append(
+            (
+                "tap nearer to",
+                f"{microphone_numbers}: no tap determines the decay of their response; that of the others is used",
+            )
         )
     console.print()
-    console.print(name_value_table(calibration.name, rows))
+    console.print(name_value_table(calibration.name, table_rows))
     console.print()
-    console.print(_parameter_table(fit))
+    console.print(_parameter_table(calibration_fit))
     unusable_rows = [
-        (f"microphone {k}", f"not usable: {reason}") for k, reason in enumerate(calibration.reasons) if reason
+        (f"microphone {k}", f"not usable: {exclusion_reason}")
+        for k, exclusion_reason in enumerate(calibration.reasons)
+        if exclusion_reason
     ]
     if unusable_rows:
         console.print()
         console.print(name_value_table("Left out", unusable_rows))
 
 
-def _location_error(fit: "CalibrationFit", taps: "Taps") -> float:
+def _location_error(calibration_fit: "CalibrationFit", taps: "Taps") -> float:
     """Cramér-Rao bound of the localisation of sources with the positions and strengths of the taps: median over the
     taps of the standard deviation along the major axis of the error ellipse, metres."""
     import numpy as np
 
     from jeit.acoustic import cramer_rao
 
-    is_received, usable = fit.strength > 0, np.asarray(fit.calibration.usable)
+    is_received, is_usable = calibration_fit.strength > 0, np.asarray(calibration_fit.calibration.usable)
     cramer_rao_bound = cramer_rao(
-        fit.calibration.microphone_array, taps.positions[is_received], fit.strength[is_received], use=usable
+        calibration_fit.calibration.microphone_array,
+        taps.positions[is_received],
+        calibration_fit.strength[is_received],
+        use=is_usable,
     )
     return float(np.median(np.sqrt(np.linalg.eigvalsh(cramer_rao_bound)[:, -1])))
 
 
-def _parameter_table(fit: "CalibrationFit"):
+def _parameter_table(calibration_fit: "CalibrationFit"):
     """Create a table of the decay models and displacements of all usable microphones."""
     import numpy as np
     from rich.table import Table
 
     from jeit_solvers.engines import on_host
 
-    calibration = fit.calibration
-    decay, noise = on_host((calibration.microphone_array.decay, calibration.microphone_array.noise))
-    factors, unit_names = {"a": 1.0, "b": 1e6, "length": 1e3}, {"a": "m²", "b": "mm²", "length": "mm"}
+    calibration = calibration_fit.calibration
+    decay, intensity_noise = on_host((calibration.microphone_array.decay, calibration.microphone_array.noise))
+    unit_factors, unit_names = {"a": 1.0, "b": 1e6, "length": 1e3}, {"a": "m²", "b": "mm²", "length": "mm"}
     if decay.name == "exponential":
         unit_names["a"] = "1"
-    columns = [text for name in decay.parameters for text in (f"{name} / {unit_names[name]}", "± %")]
-    table = Table("", *columns, "moved / mm", "error %", "explained %", box=None, padding=(0, 1))
-    for column in table.columns[1:]:
-        column.justify = "right"
-    for k, reason in enumerate(calibration.reasons):
-        if reason:
+    column_titles = [
+        column_title
+        for parameter_name in decay.parameters
+        for column_title in (f"{parameter_name} / {unit_names[parameter_name]}", "± %")
+    ]
+    printed_table = Table("", *column_titles, "moved / mm", "error %", "explained %", box=None, padding=(0, 1))
+    for table_column in printed_table.columns[1:]:
+        table_column.justify = "right"
+    for k, exclusion_reason in enumerate(calibration.reasons):
+        if exclusion_reason:
             continue
-        cells = []
-        for i, name in enumerate(decay.parameters):
-            error = 100 * calibration.standard_errors[i, k]
-            cells += [
-                f"{factors[name] * float(getattr(decay, name)[k]):.3g}",
-                f"{error:.1f}" if error == error else "–",
+        row_cells = []
+        for i, parameter_name in enumerate(decay.parameters):
+            error_percent = 100 * calibration.standard_errors[i, k]
+            row_cells += [
+                f"{unit_factors[parameter_name] * float(getattr(decay, parameter_name)[k]):.3g}",
+                f"{error_percent:.1f}" if error_percent == error_percent else "–",
             ]
-        displacement = 1e3 * float(np.linalg.norm(fit.displacement[k]))
-        cells += [
-            f"{displacement:.1f}",
-            f"{100 * float(noise.relative[k]):.1f}",
-            f"{100 * float(fit.explained[k]):.1f}",
+        displacement_mm = 1e3 * float(np.linalg.norm(calibration_fit.displacement[k]))
+        row_cells += [
+            f"{displacement_mm:.1f}",
+            f"{100 * float(intensity_noise.relative[k]):.1f}",
+            f"{100 * float(calibration_fit.explained[k]):.1f}",
         ]
-        table.add_row(str(k), *cells)
-    return table
+        printed_table.add_row(str(k), *row_cells)
+    return printed_table

@@ -40,7 +40,7 @@ from jeit_solvers.engines import as_array, host, on_device, on_host, slopes
 # since large changes of the gains let one source explain some pairs of touches too.
 _PRIOR_DEVIATION_FACTORS, _MIN_EXPLAINED_BY_FIRST_FACTOR, _MIN_EXPLAINED_BY_LATER_FACTORS = (1.0, 2.0, 4.0), 0.5, 0.9
 # Maximum number of iterations of the estimate.
-_MAX_ITERATIONS = 4
+_MAX_GAIN_ITERATIONS = 4
 # Change of the estimated logarithms below which the iteration ends.
 _CONVERGENCE_TOLERANCE = 0.05
 # Side of square cells of the skin, as a fraction of the skin's size. All frames with positions in one cell together
@@ -54,7 +54,7 @@ _RANK_TOLERANCE = 1e-8
 # few microphones respond.
 _RELATIVE_REGULARISATION = 1e-12
 # Number of the loudest frames, in which changes of the setup are searched for.
-_NUM_FRAMES = 24
+_NUM_SEARCHED_FRAMES = 24
 # Misfit per degree of freedom above which the search begins.
 _SEARCH_MISFIT = 3.0
 # Value at which the misfit per degree of freedom is clipped.
@@ -81,14 +81,14 @@ class GainChanges(NamedTuple):
     def apply(self, microphone_array: MicrophoneArray) -> MicrophoneArray:
         """Return the array with the changed gains, and with the variances of the changes added to its squared relative
         errors."""
-        logarithms = on_host(microphone_array.decay).logarithms()
+        decay_logarithms = on_host(microphone_array.decay).logarithms()
         # The first parameter of a decay model is a factor of the response.
-        changed_logarithms = host.concatenate([logarithms[:1] + self.logarithm, logarithms[1:]])
-        relative = np.sqrt(np.asarray(microphone_array.noise.relative) ** 2 + np.diag(self.covariance))
+        changed_logarithms = host.concatenate([decay_logarithms[:1] + self.logarithm, decay_logarithms[1:]])
+        relative_error = np.sqrt(np.asarray(microphone_array.noise.relative) ** 2 + np.diag(self.covariance))
         return eqx.tree_at(
-            lambda array: (array.decay, array.noise.relative),
+            lambda array_to_change: (array_to_change.decay, array_to_change.noise.relative),
             microphone_array,
-            (on_device(type(microphone_array.decay).from_logarithms(changed_logarithms)), as_array(relative)),
+            (on_device(type(microphone_array.decay).from_logarithms(changed_logarithms)), as_array(relative_error)),
         )
 
 
@@ -115,58 +115,65 @@ def estimate_gain_changes(
     zero_changes = GainChanges(np.zeros(len(used_mask)), np.zeros_like(centring_matrix))
     if deviation == 0:
         return (zero_changes,)
-    for factor in _PRIOR_DEVIATION_FACTORS:
-        changes, explained_share = _estimate_gain_changes(
-            microphone_array, power, use, factor * deviation * centring_matrix, locate_frames
+    for prior_deviation_factor in _PRIOR_DEVIATION_FACTORS:
+        gain_changes, explained_share = _estimate_gain_changes(
+            microphone_array, power, use, prior_deviation_factor * deviation * centring_matrix, locate_frames
         )
-        if explained_share >= (_MIN_EXPLAINED_BY_FIRST_FACTOR if factor == 1 else _MIN_EXPLAINED_BY_LATER_FACTORS):
-            return (changes,)
+        if explained_share >= (
+            _MIN_EXPLAINED_BY_FIRST_FACTOR if prior_deviation_factor == 1 else _MIN_EXPLAINED_BY_LATER_FACTORS
+        ):
+            return (gain_changes,)
     return zero_changes, zero_changes._replace(covariance=deviation**2 * centring_matrix)
 
 
 def _estimate_gain_changes(
-    microphone_array: MicrophoneArray, power, use, scale, locate_frames
+    microphone_array: MicrophoneArray, power, is_used_reading, prior_scale, locate_frames
 ) -> tuple[GainChanges, float]:
     """Estimate the changes of the gains for one prior standard deviation, and the fraction of the frames that one
-    source explains. `scale` (M, M): projection onto changes with the mean 0, times the prior standard deviation."""
-    deviation = np.linalg.norm(scale, 2)
-    centring_matrix = scale / deviation
-    changes, explained_share = GainChanges(np.zeros(len(scale)), deviation * scale), 0.0
-    is_significant = False
-    for _ in range(_MAX_ITERATIONS):
-        sources, is_explained_frame = locate_frames(changes.apply(microphone_array))
+    source explains. `prior_scale` (M, M): projection onto changes with the mean 0, times the prior standard
+    deviation."""
+    prior_deviation = np.linalg.norm(prior_scale, 2)
+    centring_matrix = prior_scale / prior_deviation
+    gain_changes, explained_share = GainChanges(np.zeros(len(prior_scale)), prior_deviation * prior_scale), 0.0
+    are_changes_significant = False
+    for _ in range(_MAX_GAIN_ITERATIONS):
+        source_estimates, is_explained_frame = locate_frames(gain_changes.apply(microphone_array))
         explained_share = float(np.mean(is_explained_frame))
         if not is_explained_frame.any():
             break
-        array_with_changes = _set_gains_without_uncertainty(microphone_array, changes)
-        matrix, right_hand_side = _normal_equations(
+        array_with_changes = _set_gains_without_uncertainty(microphone_array, gain_changes)
+        normal_matrix, right_hand_side = _normal_equations(
             array_with_changes,
             power[is_explained_frame],
-            use[is_explained_frame],
-            _unknowns_of_sources(array_with_changes, sources, is_explained_frame),
+            is_used_reading[is_explained_frame],
+            _unknowns_of_sources(array_with_changes, source_estimates, is_explained_frame),
         )
-        right_hand_side = right_hand_side + matrix @ changes.logarithm
-        is_significant = _are_significant(matrix, right_hand_side)
-        covariance = np.linalg.inv(matrix + np.eye(len(scale)) / deviation**2)
-        previous_logarithm = changes.logarithm
-        changes = GainChanges(
-            centring_matrix @ covariance @ right_hand_side, centring_matrix @ covariance @ centring_matrix
+        right_hand_side = right_hand_side + normal_matrix @ gain_changes.logarithm
+        are_changes_significant = _are_significant(normal_matrix, right_hand_side)
+        gain_covariance = np.linalg.inv(normal_matrix + np.eye(len(prior_scale)) / prior_deviation**2)
+        previous_logarithm = gain_changes.logarithm
+        gain_changes = GainChanges(
+            centring_matrix @ gain_covariance @ right_hand_side, centring_matrix @ gain_covariance @ centring_matrix
         )
-        if np.abs(changes.logarithm - previous_logarithm).max() < _CONVERGENCE_TOLERANCE:
+        if np.abs(gain_changes.logarithm - previous_logarithm).max() < _CONVERGENCE_TOLERANCE:
             break
-    if not is_significant:
+    if not are_changes_significant:
         # The covariance becomes the mean square of the changes about 0, instead of about their estimate.
-        logarithm = changes.logarithm
-        changes = GainChanges(np.zeros_like(logarithm), changes.covariance + np.outer(logarithm, logarithm))
-    return changes, explained_share
+        log_gain_change = gain_changes.logarithm
+        gain_changes = GainChanges(
+            np.zeros_like(log_gain_change), gain_changes.covariance + np.outer(log_gain_change, log_gain_change)
+        )
+    return gain_changes, explained_share
 
 
-def _are_significant(matrix: np.ndarray, right_hand_side: np.ndarray) -> bool:
+def _are_significant(normal_matrix: np.ndarray, right_hand_side: np.ndarray) -> bool:
     """Test whether the changes of the gains are larger than noise and errors of the decay models alone explain."""
-    eigenvalues, eigenvectors = np.linalg.eigh(matrix)
-    is_determined = eigenvalues > _RANK_TOLERANCE * eigenvalues[-1]
-    squared_components = (eigenvectors[:, is_determined].T @ right_hand_side) ** 2 / eigenvalues[is_determined]
-    return bool(chdtrc(is_determined.sum(), squared_components.sum()) < _FALSE_ALARM_PROBABILITY)
+    eigenvalues, eigenvectors = np.linalg.eigh(normal_matrix)
+    is_determined_component = eigenvalues > _RANK_TOLERANCE * eigenvalues[-1]
+    squared_components = (eigenvectors[:, is_determined_component].T @ right_hand_side) ** 2 / eigenvalues[
+        is_determined_component
+    ]
+    return bool(chdtrc(is_determined_component.sum(), squared_components.sum()) < _FALSE_ALARM_PROBABILITY)
 
 
 def covariance_with_gains(
@@ -183,67 +190,83 @@ def covariance_with_gains(
     C the covariance of the changes. The derivative of the frame's unknowns with respect to the gain changes is B = F⁻¹
     Jᵀ W S, and the covariance of the unknowns is F⁻¹ + B C Bᵀ.
     """
-    array, unknowns = (
+    array_with_changes, source_unknowns = (
         _set_gains_without_uncertainty(microphone_array, changes),
         _unknowns_of_sources(microphone_array, sources, slice(None)),
     )
-    has_position = np.isfinite(unknowns).all(axis=0)
-    unknowns = host.where(has_position, unknowns, 0.0)
-    likelihood, jacobian, signal_share, weight = _linearise_levels(array, power, use, unknowns)
-    inverse_fisher = _inverse_fisher(likelihood.expand(unknowns)[2])
-    gain_derivatives = np.einsum("klf,lmf->kmf", inverse_fisher[:2], weight * signal_share * jacobian)
+    has_position = np.isfinite(source_unknowns).all(axis=0)
+    source_unknowns = host.where(has_position, source_unknowns, 0.0)
+    likelihood, jacobian, signal_share, level_weights = _linearise_levels(
+        array_with_changes, power, use, source_unknowns
+    )
+    inverse_fisher = _inverse_fisher(likelihood.expand(source_unknowns)[2])
+    gain_derivatives = np.einsum("klf,lmf->kmf", inverse_fisher[:2], level_weights * signal_share * jacobian)
     total_covariance = inverse_fisher[:2, :2] + host.einsum(
         "kmf,mn,lnf->klf", gain_derivatives, changes.covariance, gain_derivatives, optimize=True
     )
     return np.where(
-        has_position[:, None, None], to_three_dimensions(array.surface, unknowns[:2], total_covariance)[1], np.nan
+        has_position[:, None, None],
+        to_three_dimensions(array_with_changes.surface, source_unknowns[:2], total_covariance)[1],
+        np.nan,
     )
 
 
-def _set_gains_without_uncertainty(microphone_array: MicrophoneArray, changes: GainChanges) -> MicrophoneArray:
+def _set_gains_without_uncertainty(microphone_array: MicrophoneArray, gain_changes: GainChanges) -> MicrophoneArray:
     """Return the microphone array in NumPy arrays, with the changed gains but without the variances of the changes in
     its noise."""
-    return on_host(changes._replace(covariance=np.zeros_like(changes.covariance)).apply(microphone_array))
+    return on_host(gain_changes._replace(covariance=np.zeros_like(gain_changes.covariance)).apply(microphone_array))
 
 
 def _unknowns_of_sources(
-    microphone_array: MicrophoneArray, sources: SourceEstimate, frames
+    microphone_array: MicrophoneArray, source_estimates: SourceEstimate, frame_indices
 ) -> Float[np.ndarray, "3 F"]:
-    """Chart coordinates and logarithmic strengths of `sources` in the frames with the indices or mask `frames`."""
-    chart_positions = on_host(microphone_array.surface).project(np.asarray(sources.position)[frames].T)
-    return np.concatenate([chart_positions, np.log(np.asarray(sources.strength))[None, frames]])
+    """Chart coordinates and logarithmic strengths of `source_estimates` in the frames with the indices or mask
+    `frame_indices`."""
+    chart_positions = on_host(microphone_array.surface).project(np.asarray(source_estimates.position)[frame_indices].T)
+    return np.concatenate([chart_positions, np.log(np.asarray(source_estimates.strength))[None, frame_indices]])
 
 
 def _linearise_levels(
-    array: MicrophoneArray, power, use, unknowns
+    microphone_array: MicrophoneArray, power, is_used_reading, source_unknowns
 ) -> tuple[Likelihood, np.ndarray, np.ndarray, np.ndarray]:
     """Compute the likelihood of the frames, the derivatives J (3, M, F) of the levels with respect to the unknowns, the
     shares s = S / (S + N) (M, F) of the source in the power, and the weights W (M, F)."""
-    use = use.T & (power.T + array.noise.floor[:, None] > 0)
-    likelihood = Likelihood.create(power.T, use, array)
-    (mean, variance), derivatives = slopes(array.expected, unknowns)
-    signal_share = 1 - array.noise.floor[:, None] * np.exp(-mean)
-    return likelihood, np.stack([dm for dm, _ in derivatives]), signal_share, np.where(use, 1 / variance, 0.0)
+    is_used_reading = is_used_reading.T & (power.T + microphone_array.noise.floor[:, None] > 0)
+    likelihood = Likelihood.create(power.T, is_used_reading, microphone_array)
+    (expected_levels, level_variance), level_derivatives = slopes(microphone_array.expected, source_unknowns)
+    signal_share = 1 - microphone_array.noise.floor[:, None] * np.exp(-expected_levels)
+    return (
+        likelihood,
+        np.stack([dm for dm, _ in level_derivatives]),
+        signal_share,
+        np.where(is_used_reading, 1 / level_variance, 0.0),
+    )
 
 
-def _normal_equations(array: MicrophoneArray, power, use, unknowns) -> tuple[np.ndarray, np.ndarray]:
+def _normal_equations(
+    microphone_array: MicrophoneArray, power, is_used_reading, source_unknowns
+) -> tuple[np.ndarray, np.ndarray]:
     """Matrix A (M, M) and right-hand side b (M,) of the normal equations of the gain changes, without the prior."""
-    likelihood, jacobian, signal_share, weight = _linearise_levels(array, power, use, unknowns)
-    cell_size = _RELATIVE_CELL_SIZE * float(longer_side(array.surface))
+    likelihood, jacobian, signal_share, level_weights = _linearise_levels(
+        microphone_array, power, is_used_reading, source_unknowns
+    )
+    cell_size = _RELATIVE_CELL_SIZE * float(longer_side(microphone_array.surface))
     _, cell_indices, frames_per_cell = np.unique(
-        np.floor(unknowns[:2] / cell_size), axis=1, return_inverse=True, return_counts=True
+        np.floor(source_unknowns[:2] / cell_size), axis=1, return_inverse=True, return_counts=True
     )
-    weight = weight / frames_per_cell[cell_indices.ravel()]
-    residual = likelihood.level - array.expected(unknowns)[0]
-    signal_weights = weight * signal_share
-    coupling = signal_weights * jacobian
-    inverse_fisher = _inverse_fisher(np.einsum("kmf,lmf->klf", weight * jacobian, jacobian))
-    source_response = np.einsum("klf,lmf->kmf", inverse_fisher, coupling)
-    matrix = np.diag((signal_weights * signal_share).sum(axis=1)) - np.einsum("kmf,knf->mn", coupling, source_response)
-    right_hand_side = (signal_weights * residual).sum(axis=1) - np.einsum(
-        "kmf,kf->m", source_response, (weight * jacobian * residual).sum(axis=1)
+    level_weights = level_weights / frames_per_cell[cell_indices.ravel()]
+    level_residual = likelihood.level - microphone_array.expected(source_unknowns)[0]
+    signal_weights = level_weights * signal_share
+    source_coupling = signal_weights * jacobian
+    inverse_fisher = _inverse_fisher(np.einsum("kmf,lmf->klf", level_weights * jacobian, jacobian))
+    source_response = np.einsum("klf,lmf->kmf", inverse_fisher, source_coupling)
+    normal_matrix = np.diag((signal_weights * signal_share).sum(axis=1)) - np.einsum(
+        "kmf,knf->mn", source_coupling, source_response
     )
-    return matrix, right_hand_side
+    right_hand_side = (signal_weights * level_residual).sum(axis=1) - np.einsum(
+        "kmf,kf->m", source_response, (level_weights * jacobian * level_residual).sum(axis=1)
+    )
+    return normal_matrix, right_hand_side
 
 
 def _inverse_fisher(fisher) -> np.ndarray:
@@ -277,34 +300,36 @@ def find_setup_changes(
     for fewer than three frames, if one source explains the frames without a change, or if no change explains the
     misfit.
     """
-    loudest_frames = np.argsort(-np.where(use, power, 0.0).sum(axis=1))[:_NUM_FRAMES]
-    changes = SetupChanges([], [])
+    loudest_frames = np.argsort(-np.where(use, power, 0.0).sum(axis=1))[:_NUM_SEARCHED_FRAMES]
+    setup_changes = SetupChanges([], [])
     if len(loudest_frames) < 3:
-        return changes
-    loudest_frames = loudest_frames[np.arange(_NUM_FRAMES) % len(loudest_frames)]
+        return setup_changes
+    loudest_frames = loudest_frames[np.arange(_NUM_SEARCHED_FRAMES) % len(loudest_frames)]
     power, use = np.where(use, power, 0.0)[loudest_frames], use[loudest_frames]
     localiser = Localiser.create(microphone_array)
 
-    def mean_misfit(states: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    def mean_misfit(channel_states: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
         """Mean misfit per degree of freedom for each candidate change, given by the order and the mask of the
         channels."""
-        estimates = localiser(
-            np.concatenate([power[:, channel_order] for channel_order, _ in states]),
-            np.concatenate([use[:, channel_order] & mask for channel_order, mask in states]),
+        source_estimates = localiser(
+            np.concatenate([power[:, channel_order] for channel_order, _ in channel_states]),
+            np.concatenate(
+                [use[:, channel_order] & is_channel_used for channel_order, is_channel_used in channel_states]
+            ),
         )
-        ratio = np.asarray(estimates.misfit) / np.maximum(np.asarray(estimates.freedom), 1)
+        misfit_ratios = np.asarray(source_estimates.misfit) / np.maximum(np.asarray(source_estimates.freedom), 1)
         return (
-            np.minimum(np.nan_to_num(ratio, nan=_CLIPPING_MISFIT), _CLIPPING_MISFIT)
-            .reshape(len(states), -1)
+            np.minimum(np.nan_to_num(misfit_ratios, nan=_CLIPPING_MISFIT), _CLIPPING_MISFIT)
+            .reshape(len(channel_states), -1)
             .mean(axis=1)
         )
 
-    state = np.arange(power.shape[1]), np.ones(power.shape[1], bool)
-    current_misfit = float(mean_misfit([state])[0])
+    channel_state = np.arange(power.shape[1]), np.ones(power.shape[1], bool)
+    current_misfit = float(mean_misfit([channel_state])[0])
     remaining_channels = np.flatnonzero(use.any(axis=0))
     while (
         current_misfit > _SEARCH_MISFIT
-        and len(changes.exchanged_pairs) + len(changes.altered_microphones) < _MAX_SETUP_CHANGES
+        and len(setup_changes.exchanged_pairs) + len(setup_changes.altered_microphones) < _MAX_SETUP_CHANGES
         and remaining_channels.size
     ):
         # Altered microphones come first among the candidate changes, since exchanging an altered microphone may lower
@@ -312,28 +337,32 @@ def find_setup_changes(
         single_channel_candidates = [
             (int(k),) for k in remaining_channels if remaining_channels.size > _MIN_UNCHANGED_MICROPHONES
         ]
-        candidates = single_channel_candidates + [(int(k), int(m)) for k, m in combinations(remaining_channels, 2)]
-        candidate_states = [_apply_change(state, channels) for channels in candidates]
-        misfits = mean_misfit(candidate_states)
-        best_index = int(misfits.argmin())
-        if not misfits[best_index] < _MAX_MISFIT_RATIO * current_misfit:
+        candidate_changes = single_channel_candidates + [
+            (int(k), int(m)) for k, m in combinations(remaining_channels, 2)
+        ]
+        candidate_states = [_apply_change(channel_state, changed_channels) for changed_channels in candidate_changes]
+        candidate_misfits = mean_misfit(candidate_states)
+        best_candidate = int(candidate_misfits.argmin())
+        if not candidate_misfits[best_candidate] < _MAX_MISFIT_RATIO * current_misfit:
             break
-        current_misfit, state = float(misfits[best_index]), candidate_states[best_index]
-        channels = candidates[best_index]
-        if len(channels) == 2:
-            changes.exchanged_pairs.append((channels[0], channels[1]))
+        current_misfit, channel_state = float(candidate_misfits[best_candidate]), candidate_states[best_candidate]
+        changed_channels = candidate_changes[best_candidate]
+        if len(changed_channels) == 2:
+            setup_changes.exchanged_pairs.append((changed_channels[0], changed_channels[1]))
         else:
-            changes.altered_microphones.append(channels[0])
-        remaining_channels = remaining_channels[~np.isin(remaining_channels, channels)]
-    return changes if current_misfit <= _SEARCH_MISFIT else SetupChanges([], [])
+            setup_changes.altered_microphones.append(changed_channels[0])
+        remaining_channels = remaining_channels[~np.isin(remaining_channels, changed_channels)]
+    return setup_changes if current_misfit <= _SEARCH_MISFIT else SetupChanges([], [])
 
 
-def _apply_change(state: tuple[np.ndarray, np.ndarray], channels: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+def _apply_change(
+    channel_state: tuple[np.ndarray, np.ndarray], changed_channels: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the order and the mask of the microphones' channels after exchanging two channels, or leaving out one
     channel."""
-    channel_order, mask = (array.copy() for array in state)
-    if len(channels) == 2:
-        channel_order[list(channels)] = channel_order[list(channels[::-1])]
+    channel_order, is_channel_used = (state_array.copy() for state_array in channel_state)
+    if len(changed_channels) == 2:
+        channel_order[list(changed_channels)] = channel_order[list(changed_channels[::-1])]
     else:
-        mask[channels[0]] = False
-    return channel_order, mask
+        is_channel_used[changed_channels[0]] = False
+    return channel_order, is_channel_used

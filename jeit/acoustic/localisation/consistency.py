@@ -60,9 +60,15 @@ class Consistency(Module):
         """Create the loss from intensities `power`. Intensities outside the mask `use` are ignored and may be NaN."""
         xp = namespace(power, use)
         used_power = xp.where(use, power, 0.0)
-        scale = xp.max(used_power, axis=0)
+        loudest_power = xp.max(used_power, axis=0)
         loudest_microphones = xp.argmax(used_power, axis=0)
-        return cls(used_power / xp.where(scale > 0, scale, 1.0), loudest_microphones, scale, use, microphone_array)
+        return cls(
+            used_power / xp.where(loudest_power > 0, loudest_power, 1.0),
+            loudest_microphones,
+            loudest_power,
+            use,
+            microphone_array,
+        )
 
     @property
     def frames(self) -> tuple[Array, ...]:
@@ -72,10 +78,10 @@ class Consistency(Module):
     def differences(self, chart: Float[Array, "2 F"]) -> Float[Array, "M F"]:
         """Differences I_k g_k − I_i g_i between the strengths that the loudest microphone k and microphone i indicate;
         0 where intensities are not used."""
-        estimates = self.power / self.microphone_array.response(chart)
-        xp = namespace(self, estimates)
-        loudest_estimate = xp.take_along_axis(estimates, self.loudest[None], axis=0)
-        return xp.where(self.use, loudest_estimate - estimates, 0.0)
+        strength_estimates = self.power / self.microphone_array.response(chart)
+        xp = namespace(self, strength_estimates)
+        loudest_estimate = xp.take_along_axis(strength_estimates, self.loudest[None], axis=0)
+        return xp.where(self.use, loudest_estimate - strength_estimates, 0.0)
 
     def cost(self, chart: Float[Array, "2 F"]) -> Float[Array, " F"]:
         """Consistency loss L (F,) divided by the square of the highest intensity."""
@@ -84,15 +90,15 @@ class Consistency(Module):
     def expand(self, chart: Float[Array, "2 F"]) -> tuple[Array, Array, Array]:
         """Loss (F,), gradient (2, F) of the loss with respect to the chart coordinates, and Gauss-Newton matrix (2, 2,
         F)."""
-        differences, derivatives = computed_once(slopes(self.differences, chart))
+        differences, loss_derivatives = computed_once(slopes(self.differences, chart))
         gradient = 2 * namespace(differences).stack(
-            [(differences * derivative).sum(axis=0) for derivative in derivatives]
+            [(differences * loss_derivative).sum(axis=0) for loss_derivative in loss_derivatives]
         )
-        rows = [
-            [2 * (derivative_k * derivative_l).sum(axis=0) for derivative_l in derivatives[: k + 1]]
-            for k, derivative_k in enumerate(derivatives)
+        matrix_rows = [
+            [2 * (derivative_k * derivative_l).sum(axis=0) for derivative_l in loss_derivatives[: k + 1]]
+            for k, derivative_k in enumerate(loss_derivatives)
         ]
-        return (differences**2).sum(axis=0), gradient, symmetric_small(rows)
+        return (differences**2).sum(axis=0), gradient, symmetric_small(matrix_rows)
 
     def start(self, chart: Float[Array, "2 F"]) -> Float[Array, "2 F"]:
         """Initial unknowns of a minimisation of the loss: the chart coordinates."""
@@ -123,30 +129,38 @@ class Consistency(Module):
         is computed as the product of its coefficients and the features.
         """
         xp = namespace(self, features)
-        num_used = xp.sum(self.use, axis=0)
+        num_used_microphones = xp.sum(self.use, axis=0)
         if not isinstance(self.microphone_array.decay, InverseSquare):
-            inverse = 1 / features
-            loudest_strengths = xp.take(inverse, self.loudest, axis=0)
-            return (num_used[:, None] * loudest_strengths - 2 * (self.power.T @ inverse)) * loudest_strengths + (
-                self.power.T**2
-            ) @ inverse**2
-        decay, positions = self.microphone_array.decay, self.microphone_array.microphones
-        constant_term = xp.sum(positions**2, axis=1) + decay.b
-        quadratic_term = xp.column_stack([xp.ones(len(positions)), -2 * positions, constant_term]) / decay.a[:, None]
-        estimates = [self.power * column[:, None] for column in quadratic_term.T]
-        loudest_strengths = [xp.take_along_axis(estimate, self.loudest[None], axis=0)[0] for estimate in estimates]
-        weighted_sums = [xp.sum(estimate, axis=0) for estimate in estimates]
-        coefficients = []
-        for i in range(len(estimates)):
+            inverse_response = 1 / features
+            loudest_strengths = xp.take(inverse_response, self.loudest, axis=0)
+            return (
+                num_used_microphones[:, None] * loudest_strengths - 2 * (self.power.T @ inverse_response)
+            ) * loudest_strengths + (self.power.T**2) @ inverse_response**2
+        decay_model, microphone_positions = self.microphone_array.decay, self.microphone_array.microphones
+        constant_term = xp.sum(microphone_positions**2, axis=1) + decay_model.b
+        quadratic_term = (
+            xp.column_stack([xp.ones(len(microphone_positions)), -2 * microphone_positions, constant_term])
+            / decay_model.a[:, None]
+        )
+        strength_estimates = [self.power * coefficient_column[:, None] for coefficient_column in quadratic_term.T]
+        loudest_strengths = [
+            xp.take_along_axis(strength_estimate, self.loudest[None], axis=0)[0]
+            for strength_estimate in strength_estimates
+        ]
+        weighted_sums = [xp.sum(strength_estimate, axis=0) for strength_estimate in strength_estimates]
+        polynomial_coefficients = []
+        for i in range(len(strength_estimates)):
             for j in range(i + 1):
-                coefficient = (
-                    num_used * loudest_strengths[i] * loudest_strengths[j]
+                polynomial_coefficient = (
+                    num_used_microphones * loudest_strengths[i] * loudest_strengths[j]
                     - loudest_strengths[i] * weighted_sums[j]
                     - loudest_strengths[j] * weighted_sums[i]
                 )
-                coefficient = coefficient + xp.sum(estimates[i] * estimates[j], axis=0)
-                coefficients.append(coefficient if i == j else 2 * coefficient)
-        return xp.stack(coefficients, axis=1) @ features
+                polynomial_coefficient = polynomial_coefficient + xp.sum(
+                    strength_estimates[i] * strength_estimates[j], axis=0
+                )
+                polynomial_coefficients.append(polynomial_coefficient if i == j else 2 * polynomial_coefficient)
+        return xp.stack(polynomial_coefficients, axis=1) @ features
 
     def covariance(self, chart: Float[Array, "2 F"], strength: Float[Array, " F"]) -> Float[Array, "2 2 F"]:
         """Covariance (2, 2, F) of the position u of the minimum, from the variances of the intensities: Σ_i
@@ -155,27 +169,29 @@ class Consistency(Module):
         The implicit function theorem gives the derivative of u, ∂u/∂I = −H⁻¹ ∂²L/∂u∂I, where H is the Hessian of the
         loss L. Second derivatives are approximated for small differences I_k g_k − I_i g_i.
         """
-        estimates, derivatives = slopes(lambda u: 1 / self.microphone_array.response(u), chart)
-        xp = namespace(self, estimates)
-        gradients = xp.stack(derivatives) * self.power
-        loudest_gradient = xp.take_along_axis(gradients, self.loudest[None, None], axis=1)
-        difference_gradients = xp.where(self.use, loudest_gradient - gradients, 0.0)
-        matrix = xp.einsum("kmf,lmf->klf", difference_gradients, difference_gradients)
+        strength_estimates, derivatives = slopes(lambda u: 1 / self.microphone_array.response(u), chart)
+        xp = namespace(self, strength_estimates)
+        estimate_gradients = xp.stack(derivatives) * self.power
+        loudest_gradient = xp.take_along_axis(estimate_gradients, self.loudest[None, None], axis=1)
+        difference_gradients = xp.where(self.use, loudest_gradient - estimate_gradients, 0.0)
+        gauss_newton_matrix = xp.einsum("kmf,lmf->klf", difference_gradients, difference_gradients)
         # Derivative of ½ ∂L/∂u with respect to I_i: −g_i times the gradient of the difference of microphone i. For the
         # loudest microphone k, the derivative is g_k times the sum of these gradients over all microphones.
-        is_loudest = xp.arange(estimates.shape[0])[:, None] == self.loudest
+        is_loudest = xp.arange(strength_estimates.shape[0])[:, None] == self.loudest
         mixed_derivatives = xp.where(
             is_loudest,
-            xp.sum(difference_gradients, axis=1, keepdims=True) * estimates,
-            -estimates * difference_gradients,
+            xp.sum(difference_gradients, axis=1, keepdims=True) * strength_estimates,
+            -strength_estimates * difference_gradients,
         )
-        received_power = strength / estimates
-        variance = self.microphone_array.noise.variance(received_power) / xp.where(self.scale > 0, self.scale, 1.0) ** 2
+        received_power = strength / strength_estimates
+        power_variance = (
+            self.microphone_array.noise.variance(received_power) / xp.where(self.scale > 0, self.scale, 1.0) ** 2
+        )
         gradient_covariance = xp.einsum(
-            "kmf,lmf,mf->klf", mixed_derivatives, mixed_derivatives, xp.where(self.use, variance, 0.0)
+            "kmf,lmf,mf->klf", mixed_derivatives, mixed_derivatives, xp.where(self.use, power_variance, 0.0)
         )
-        inverse = inverse_small(matrix)
-        return xp.einsum("ijf,jkf,klf->ilf", inverse, gradient_covariance, inverse)
+        inverse_matrix = inverse_small(gauss_newton_matrix)
+        return xp.einsum("ijf,jkf,klf->ilf", inverse_matrix, gradient_covariance, inverse_matrix)
 
 
 # Number of candidate positions along the outline of the skin.
@@ -187,9 +203,9 @@ _NUM_TRIAL_STEPS = 8
 # Maximum difference of cost for which the minimisation in the second valley continues.
 _MAX_COST_DIFFERENCE = 8.0
 # Maximum number of steps of a minimisation.
-_MAX_STEPS = 30
+_MAX_MINIMISATION_STEPS = 30
 # Tolerance of the minimisation: predicted decrease of the cost in the next step, relative to 1 + |cost|.
-_TOLERANCE = 1e-12
+_MINIMISATION_TOLERANCE = 1e-12
 
 
 def find_minima(objective, first_start, second_start, has_second_start):
@@ -203,67 +219,73 @@ def find_minima(objective, first_start, second_start, has_second_start):
     """
     surface = objective.microphone_array.surface
     first_minimum = _minimise_in_plane(objective, objective.start(first_start), None)
-    unknowns, converged = first_minimum.x, first_minimum.converged
+    unknowns, has_converged = first_minimum.x, first_minimum.converged
     xp = namespace(objective, unknowns)
-    value = xp.where(xp.isfinite(first_minimum.value), first_minimum.value, xp.inf)
-    is_inside = surface.outline.contains(unknowns[:2].T)
-    second_minimum_excess, lowest_cost = xp.full(value.shape, xp.inf), value
+    lowest_value = xp.where(xp.isfinite(first_minimum.value), first_minimum.value, xp.inf)
+    is_inside_outline = surface.outline.contains(unknowns[:2].T)
+    second_minimum_excess, lowest_cost = xp.full(lowest_value.shape, xp.inf), lowest_value
     if has_second_start is not None:
         # After a few steps, the minimisation continues only in promising second valleys.
         trial_minimum = _minimise_in_plane(
             objective, objective.start(second_start), ~has_second_start, max_steps=_NUM_TRIAL_STEPS
         )
-        has_second_start = has_second_start & (trial_minimum.value < value + _MAX_COST_DIFFERENCE)
+        has_second_start = has_second_start & (trial_minimum.value < lowest_value + _MAX_COST_DIFFERENCE)
         second_minimum = _minimise_in_plane(objective, trial_minimum.x, ~has_second_start)
         second_cost = xp.where(has_second_start & xp.isfinite(second_minimum.value), second_minimum.value, xp.inf)
-        second_is_inside = surface.outline.contains(second_minimum.x[:2].T)
-        is_distinct = xp.linalg.norm(
+        is_second_inside = surface.outline.contains(second_minimum.x[:2].T)
+        is_distinct_minimum = xp.linalg.norm(
             second_minimum.x[:2] - unknowns[:2], axis=0
         ) > _MIN_DISTANCE_OF_MINIMA * longer_side(surface)
         second_minimum_excess = xp.where(
-            is_distinct & has_second_start & is_inside & second_is_inside, xp.abs(second_cost - value), xp.inf
+            is_distinct_minimum & has_second_start & is_inside_outline & is_second_inside,
+            xp.abs(second_cost - lowest_value),
+            xp.inf,
         )
-        lowest_cost = xp.minimum(value, second_cost)
+        lowest_cost = xp.minimum(lowest_value, second_cost)
         # If one of the two minima is outside the outline, the minimum inside is selected. A position on the outline may
         # still have a lower cost.
-        second_is_better = xp.where(
-            second_is_inside == is_inside, second_cost < value, second_is_inside & xp.isfinite(second_cost)
+        is_second_better = xp.where(
+            is_second_inside == is_inside_outline,
+            second_cost < lowest_value,
+            is_second_inside & xp.isfinite(second_cost),
         )
-        unknowns = xp.where(second_is_better, second_minimum.x, unknowns)
-        converged = xp.where(second_is_better, second_minimum.converged, converged)
-        value, is_inside = (
-            xp.where(second_is_better, second_cost, value),
-            xp.where(second_is_better, second_is_inside, is_inside),
+        unknowns = xp.where(is_second_better, second_minimum.x, unknowns)
+        has_converged = xp.where(is_second_better, second_minimum.converged, has_converged)
+        lowest_value, is_inside_outline = (
+            xp.where(is_second_better, second_cost, lowest_value),
+            xp.where(is_second_better, is_second_inside, is_inside_outline),
         )
     # Minima outside the outline are replaced by the best position on the outline. A minimum inside is also compared
     # with the best position on the outline, if the other minimum is outside and has a lower cost.
-    try_outline = xp.isfinite(value) & (~is_inside | (lowest_cost < value))
-    undefined_sides = xp.full((2, 2, value.size), xp.nan)
+    needs_outline = xp.isfinite(lowest_value) & (~is_inside_outline | (lowest_cost < lowest_value))
+    undefined_sides = xp.full((2, 2, lowest_value.size), xp.nan)
 
     def move_to_outline(_):
-        outline_minimum, outline_side = _minimise_on_outline(objective, ~try_outline)
-        is_outline_better = try_outline & (~is_inside | (outline_minimum.value < value))
+        outline_minimum, outline_side = _minimise_on_outline(objective, ~needs_outline)
+        is_outline_better = needs_outline & (~is_inside_outline | (outline_minimum.value < lowest_value))
         return (
             xp.where(is_outline_better, outline_minimum.x, unknowns),
-            xp.where(try_outline, xp.where(is_outline_better, outline_minimum.value, value) - lowest_cost, 0.0),
-            xp.where(is_outline_better, outline_minimum.converged, converged),
+            xp.where(
+                needs_outline, xp.where(is_outline_better, outline_minimum.value, lowest_value) - lowest_cost, 0.0
+            ),
+            xp.where(is_outline_better, outline_minimum.converged, has_converged),
             xp.where(is_outline_better, outline_side, undefined_sides),
         )
 
     def keep_minimum_inside(_):
-        return unknowns, xp.zeros_like(value), converged, undefined_sides
+        return unknowns, xp.zeros_like(lowest_value), has_converged, undefined_sides
 
-    needs_outline_search = xp.any(try_outline)
-    minima = (
+    needs_outline_search = xp.any(needs_outline)
+    final_minima = (
         (move_to_outline(None) if needs_outline_search else keep_minimum_inside(None))
         if xp is np
         else jax.lax.cond(needs_outline_search, move_to_outline, keep_minimum_inside, None)
     )
-    unknowns, excess_cost, converged, outline_side = minima
-    return unknowns, excess_cost, second_minimum_excess, converged, outline_side
+    unknowns, excess_cost, has_converged, outline_side = final_minima
+    return unknowns, excess_cost, second_minimum_excess, has_converged, outline_side
 
 
-def _minimise_in_plane(objective, start, is_skipped, *, max_steps: int | None = None) -> Minimum:
+def _minimise_in_plane(objective, initial_unknowns, is_skipped_frame, *, max_steps: int | None = None) -> Minimum:
     """Minimise the objective within the bounding box of the outline, extended by its longer side in all directions. A
     step is at most a quarter of the longer side, and a factor of ten in strength.
 
@@ -271,9 +293,9 @@ def _minimise_in_plane(objective, start, is_skipped, *, max_steps: int | None = 
     Hessian of the objective.
     """
     surface = objective.microphone_array.surface
-    low, high = bounding_box(surface)
-    xp = namespace(objective, start)
-    infinite_bounds = xp.full(start.shape[0] - 2, xp.inf)
+    lower_corner, upper_corner = bounding_box(surface)
+    xp = namespace(objective, initial_unknowns)
+    infinite_bounds = xp.full(initial_unknowns.shape[0] - 2, xp.inf)
     skin_size = longer_side(surface)
 
     def expand_frames(frames):
@@ -281,15 +303,15 @@ def _minimise_in_plane(objective, start, is_skipped, *, max_steps: int | None = 
 
     return minimise_small(
         lambda x, frames: expand_frames(frames).expand(x),
-        start,
+        initial_unknowns,
         objective.frames,
         finish=None if max_steps is not None else lambda x, frames: _expand_exactly(expand_frames(frames), x),
-        max_steps=max_steps or _MAX_STEPS,
-        lower=xp.concatenate([low - skin_size, -infinite_bounds])[:, None],
-        upper=xp.concatenate([high + skin_size, infinite_bounds])[:, None],
+        max_steps=max_steps or _MAX_MINIMISATION_STEPS,
+        lower=xp.concatenate([lower_corner - skin_size, -infinite_bounds])[:, None],
+        upper=xp.concatenate([upper_corner + skin_size, infinite_bounds])[:, None],
         largest_step=xp.concatenate([xp.full(2, skin_size / 4), xp.full_like(infinite_bounds, 2.3)])[:, None],
-        tolerance=_TOLERANCE,
-        skip=is_skipped,
+        tolerance=_MINIMISATION_TOLERANCE,
+        skip=is_skipped_frame,
     )
 
 
@@ -297,62 +319,80 @@ def _expand_exactly(objective, x) -> tuple[Array, Array, Array]:
     """Value, gradient and Hessian of the objective at the unknowns `x`. The Hessian is exact where the exact Hessian is
     positive definite, and approximate elsewhere. With the exact Hessian, few steps are needed near a minimum even if
     the misfit is large."""
-    value, gradient, model = objective.expand(x)
-    hessian = hessian_small(objective.cost, x)
-    return value, gradient, namespace(hessian).where(definite_small(hessian), hessian, model)
+    objective_value, objective_gradient, approximate_hessian = objective.expand(x)
+    exact_hessian = hessian_small(objective.cost, x)
+    return (
+        objective_value,
+        objective_gradient,
+        namespace(exact_hessian).where(definite_small(exact_hessian), exact_hessian, approximate_hessian),
+    )
 
 
-def _minimise_on_outline(objective, is_skipped) -> tuple[Minimum, Array]:
+def _minimise_on_outline(objective, is_skipped_frame) -> tuple[Minimum, Array]:
     """Find the best position on the outline: the best of many candidates, refined along its side of the outline. Frames
-    in the mask `is_skipped` (F,) are left out. Also returns the start and end of the side (2, 2, F).
+    in the mask `is_skipped_frame` (F,) are left out. Also returns the start and end of the side (2, 2, F).
     """
-    start, end = outline_sides(objective.microphone_array.surface)
-    xp = namespace(objective, start)
-    length = xp.linalg.norm(end - start, axis=0)
+    side_starts, side_stops = outline_sides(objective.microphone_array.surface)
+    xp = namespace(objective, side_starts)
+    side_lengths = xp.linalg.norm(side_stops - side_starts, axis=0)
     # Candidate positions are equally spaced along the outline. Each candidate is specified by a side and a fraction of
     # the side's length.
-    arc_lengths = xp.concatenate([xp.zeros(1), xp.cumsum(length)])
+    arc_lengths = xp.concatenate([xp.zeros(1), xp.cumsum(side_lengths)])
     candidate_arc_lengths = arc_lengths[-1] * (xp.arange(_NUM_OUTLINE_CANDIDATES) + 0.5) / _NUM_OUTLINE_CANDIDATES
-    side_indices = xp.clip(xp.searchsorted(arc_lengths, candidate_arc_lengths, side="right") - 1, 0, length.size - 1)
-    side_fractions = (candidate_arc_lengths - arc_lengths[side_indices]) / length[side_indices]
-    chart = start[:, side_indices] + side_fractions * (end - start)[:, side_indices]
-    maps = objective.screen(type(objective).features(objective.microphone_array, chart))
-    best_candidates = xp.argmin(xp.where(xp.isnan(maps), xp.inf, maps), axis=1)
-    origin, directions = start[:, side_indices[best_candidates]], (end - start)[:, side_indices[best_candidates]]
-    log_strengths = objective.start(chart[:, best_candidates])[2:]
+    side_indices = xp.clip(
+        xp.searchsorted(arc_lengths, candidate_arc_lengths, side="right") - 1, 0, side_lengths.size - 1
+    )
+    side_fractions = (candidate_arc_lengths - arc_lengths[side_indices]) / side_lengths[side_indices]
+    candidate_positions = side_starts[:, side_indices] + side_fractions * (side_stops - side_starts)[:, side_indices]
+    candidate_costs = objective.screen(type(objective).features(objective.microphone_array, candidate_positions))
+    best_candidates = xp.argmin(xp.where(xp.isnan(candidate_costs), xp.inf, candidate_costs), axis=1)
+    side_origins, side_directions = (
+        side_starts[:, side_indices[best_candidates]],
+        (side_stops - side_starts)[:, side_indices[best_candidates]],
+    )
+    log_strengths = objective.start(candidate_positions[:, best_candidates])[2:]
 
-    def side_to_plane_unknowns(side_unknowns, origin, directions):
-        return xp.concatenate([origin + side_unknowns[0] * directions, side_unknowns[1:]])
+    def side_to_plane_unknowns(side_unknowns, side_origins, side_directions):
+        return xp.concatenate([side_origins + side_unknowns[0] * side_directions, side_unknowns[1:]])
 
-    def expand(side_unknowns, data):
-        origin, directions, frames = data
+    def expand_on_side(side_unknowns, side_data):
+        side_origins, side_directions, frames = side_data
         frame_objective = type(objective)(*frames, objective.microphone_array)
-        value, gradient, matrix = frame_objective.expand(side_to_plane_unknowns(side_unknowns, origin, directions))
-        projected_gradient = xp.concatenate([xp.sum(directions * gradient[:2], axis=0)[None], gradient[2:]])
-        rows = xp.concatenate([xp.einsum("kf,klf->lf", directions, matrix[:2])[None], matrix[2:]])
-        projected_matrix = xp.concatenate(
-            [xp.einsum("klf,lf->kf", rows[:, :2], directions)[:, None], rows[:, 2:]], axis=1
+        objective_value, objective_gradient, objective_matrix = frame_objective.expand(
+            side_to_plane_unknowns(side_unknowns, side_origins, side_directions)
         )
-        return value, projected_gradient, projected_matrix
+        projected_gradient = xp.concatenate(
+            [xp.sum(side_directions * objective_gradient[:2], axis=0)[None], objective_gradient[2:]]
+        )
+        projected_rows = xp.concatenate(
+            [xp.einsum("kf,klf->lf", side_directions, objective_matrix[:2])[None], objective_matrix[2:]]
+        )
+        projected_matrix = xp.concatenate(
+            [xp.einsum("klf,lf->kf", projected_rows[:, :2], side_directions)[:, None], projected_rows[:, 2:]], axis=1
+        )
+        return objective_value, projected_gradient, projected_matrix
 
     num_strengths = log_strengths.shape[0]
-    minimum = minimise_small(
-        expand,
+    side_minimum = minimise_small(
+        expand_on_side,
         xp.concatenate([side_fractions[best_candidates][None], log_strengths]),
-        (origin, directions, objective.frames),
+        (side_origins, side_directions, objective.frames),
         lower=xp.array([0.0] + num_strengths * [-xp.inf])[:, None],
         upper=xp.array([1.0] + num_strengths * [xp.inf])[:, None],
         largest_step=xp.array([0.5] + num_strengths * [2.3])[:, None],
-        tolerance=_TOLERANCE,
-        skip=is_skipped,
+        tolerance=_MINIMISATION_TOLERANCE,
+        skip=is_skipped_frame,
     )
-    side_ends = origin + directions
-    is_in_corner = (minimum.x[0] <= 0) | (minimum.x[0] >= 1)
+    side_ends = side_origins + side_directions
+    is_in_corner = (side_minimum.x[0] <= 0) | (side_minimum.x[0] >= 1)
     # A position in a corner of the outline cannot move along a side, so its side is replaced by a side of length zero.
-    side = xp.stack([origin, xp.where(is_in_corner, origin, side_ends)])
+    active_side = xp.stack([side_origins, xp.where(is_in_corner, side_origins, side_ends)])
     return Minimum(
-        side_to_plane_unknowns(minimum.x, origin, directions), minimum.value, minimum.converged, minimum.steps
-    ), side
+        side_to_plane_unknowns(side_minimum.x, side_origins, side_directions),
+        side_minimum.value,
+        side_minimum.converged,
+        side_minimum.steps,
+    ), active_side
 
 
 def differentiable_minima(objective, unknowns, side, skin_size):
@@ -363,25 +403,29 @@ def differentiable_minima(objective, unknowns, side, skin_size):
     start and end of the side of the outline on which the minimum lies; NaN inside the outline. `skin_size`: size of the
     skin in metres.
     """
-    minimum, xp = undifferentiated(unknowns), namespace(objective, unknowns)
+    constant_minimum, xp = undifferentiated(unknowns), namespace(objective, unknowns)
 
-    def finite_cost(minimum):
-        cost = objective.cost(minimum)
-        return xp.where(xp.isfinite(cost), cost, 0.0)
+    def finite_cost(constant_minimum):
+        objective_cost = objective.cost(constant_minimum)
+        return xp.where(xp.isfinite(objective_cost), objective_cost, 0.0)
 
-    hessian = hessian_small(undifferentiated(objective).cost, minimum)
-    gradient = gradient_small(finite_cost, minimum)
+    hessian = hessian_small(undifferentiated(objective).cost, constant_minimum)
+    objective_gradient = gradient_small(finite_cost, constant_minimum)
     # Positions on the outline can move only along their side, so the step is projected onto the side.
     is_on_outline = ~xp.isnan(side[0, 0])
-    direction = xp.where(is_on_outline, side[1] - side[0], 0.0)
-    length = xp.linalg.norm(xp.where(direction == 0, 1e-300, direction), axis=0)
-    direction = xp.where(length > 1e-12 * skin_size, direction / length, 0.0)
-    tangent_projector = xp.where(is_on_outline, direction[:, None] * direction[None], xp.eye(2)[:, :, None])
-    projector = set_at(xp.zeros_like(hessian) + xp.eye(len(minimum))[:, :, None], np.s_[:2, :2], tangent_projector)
-    gradient = xp.einsum("klf,lf->kf", projector, gradient)
-    projected_hessian = xp.einsum("klf,lmf,mnf->knf", projector, hessian, projector)
+    side_direction = xp.where(is_on_outline, side[1] - side[0], 0.0)
+    side_length = xp.linalg.norm(xp.where(side_direction == 0, 1e-300, side_direction), axis=0)
+    side_direction = xp.where(side_length > 1e-12 * skin_size, side_direction / side_length, 0.0)
+    tangent_projector = xp.where(is_on_outline, side_direction[:, None] * side_direction[None], xp.eye(2)[:, :, None])
+    unknowns_projector = set_at(
+        xp.zeros_like(hessian) + xp.eye(len(constant_minimum))[:, :, None], np.s_[:2, :2], tangent_projector
+    )
+    objective_gradient = xp.einsum("klf,lf->kf", unknowns_projector, objective_gradient)
+    projected_hessian = xp.einsum("klf,lmf,mnf->knf", unknowns_projector, hessian, unknowns_projector)
     hessian_trace = xp.maximum(xp.einsum("kkf->f", projected_hessian), 1e-300)
-    hessian = projected_hessian + (xp.eye(len(minimum))[:, :, None] - projector) * hessian_trace
-    step = solve_small(hessian, gradient)
-    is_small_step = xp.all(xp.isfinite(step), axis=0) & (xp.max(xp.abs(step[:2]), axis=0) < 1e-3 * skin_size)
-    return minimum - xp.where(is_small_step, step, 0.0)
+    hessian = projected_hessian + (xp.eye(len(constant_minimum))[:, :, None] - unknowns_projector) * hessian_trace
+    newton_step = solve_small(hessian, objective_gradient)
+    is_small_step = xp.all(xp.isfinite(newton_step), axis=0) & (
+        xp.max(xp.abs(newton_step[:2]), axis=0) < 1e-3 * skin_size
+    )
+    return constant_minimum - xp.where(is_small_step, newton_step, 0.0)

@@ -51,9 +51,9 @@ class Likelihood(Module):
 
     def cost(self, unknowns: Float[Array, "n F"]) -> Float[Array, " F"]:
         """Negative log-likelihood (F,) of each frame, up to a constant."""
-        mean, variance = self.microphone_array.expected(unknowns)
-        xp = namespace(self, mean)
-        likelihood_terms = 0.5 * (self.level - mean) ** 2 / variance + 0.5 * xp.log(variance)
+        expected_levels, level_variances = self.microphone_array.expected(unknowns)
+        xp = namespace(self, expected_levels)
+        likelihood_terms = 0.5 * (self.level - expected_levels) ** 2 / level_variances + 0.5 * xp.log(level_variances)
         return xp.sum(xp.where(self.use, likelihood_terms, 0.0), axis=0)
 
     def misfit(self, unknowns: Float[Array, "n F"]) -> Float[Array, " F"]:
@@ -64,35 +64,42 @@ class Likelihood(Module):
 
     def residual(self, unknowns: Float[Array, "n F"]) -> Float[Array, "M F"]:
         """Standardised residuals (y − m) / √v of the levels y for expected levels m of variance v; 0 where not used."""
-        mean, variance = self.microphone_array.expected(unknowns)
-        xp = namespace(self, mean)
-        return xp.where(self.use, (self.level - mean) / xp.sqrt(variance), 0.0)
+        expected_levels, level_variances = self.microphone_array.expected(unknowns)
+        xp = namespace(self, expected_levels)
+        return xp.where(self.use, (self.level - expected_levels) / xp.sqrt(level_variances), 0.0)
 
     def expand(self, unknowns: Float[Array, "n F"]) -> tuple[Array, Array, Array]:
         """Negative log-likelihood (F,), its gradient (n, F) with respect to the n unknowns, and the Fisher matrix (n,
         n, F)."""
-        (mean, variance), derivatives = slopes(self.microphone_array.expected, unknowns)
+        (expected_levels, level_variances), level_derivatives = slopes(self.microphone_array.expected, unknowns)
         # `computed_once` makes the compiler compute these arrays once for all sums below. In the sums, `dv` is the
         # derivative of log v.
-        mean, variance, derivatives = computed_once((mean, variance, [(dm, dv / variance) for dm, dv in derivatives]))
-        xp = namespace(self, mean)
-        use_weights = xp.where(self.use, 1.0, 0.0)
-        residual = self.level - mean
-        weight = use_weights / variance
-        weighted_residual = residual * weight
-        cost = 0.5 * xp.sum(weighted_residual * residual + use_weights * xp.log(variance), axis=0)
-        variance_terms = 0.5 * (use_weights - weighted_residual * residual)
-        weight, weighted_residual, variance_terms, use_weights = computed_once(
-            (weight, weighted_residual, variance_terms, use_weights)
+        expected_levels, level_variances, level_derivatives = computed_once(
+            (expected_levels, level_variances, [(dm, dv / level_variances) for dm, dv in level_derivatives])
         )
-        gradient = xp.stack([xp.sum(variance_terms * dv - weighted_residual * dm, axis=0) for dm, dv in derivatives])
-        matrix = symmetric_small(
+        xp = namespace(self, expected_levels)
+        usage_weights = xp.where(self.use, 1.0, 0.0)
+        level_residuals = self.level - expected_levels
+        level_weights = usage_weights / level_variances
+        weighted_residual = level_residuals * level_weights
+        cost = 0.5 * xp.sum(weighted_residual * level_residuals + usage_weights * xp.log(level_variances), axis=0)
+        variance_terms = 0.5 * (usage_weights - weighted_residual * level_residuals)
+        level_weights, weighted_residual, variance_terms, usage_weights = computed_once(
+            (level_weights, weighted_residual, variance_terms, usage_weights)
+        )
+        cost_gradient = xp.stack(
+            [xp.sum(variance_terms * dv - weighted_residual * dm, axis=0) for dm, dv in level_derivatives]
+        )
+        fisher_matrix = symmetric_small(
             [
-                [xp.sum(weight * dm * em + 0.5 * use_weights * dv * ev, axis=0) for em, ev in derivatives[: k + 1]]
-                for k, (dm, dv) in enumerate(derivatives)
+                [
+                    xp.sum(level_weights * dm * em + 0.5 * usage_weights * dv * ev, axis=0)
+                    for em, ev in level_derivatives[: k + 1]
+                ]
+                for k, (dm, dv) in enumerate(level_derivatives)
             ]
         )
-        return cost, gradient, matrix
+        return cost, cost_gradient, fisher_matrix
 
     def start(self, chart: Float[Array, "2 F"]) -> Float[Array, "3 F"]:
         """Initial unknowns of a minimisation: chart coordinates, and logarithm of the best-fitting strength at these
@@ -104,8 +111,10 @@ class Likelihood(Module):
     def strength(self, response: Float[Array, "M F"]) -> Float[Array, " F"]:
         """Strength (F,) of sources with the responses f = `response`, by least squares with weights from the observed
         power. The strength is positive."""
-        weight, xp = self._power_weights(), namespace(self, response)
-        fitted_strength = xp.sum(weight * self.power * response, axis=0) / xp.sum(weight * response**2, axis=0)
+        power_weights, xp = self._power_weights(), namespace(self, response)
+        fitted_strength = xp.sum(power_weights * self.power * response, axis=0) / xp.sum(
+            power_weights * response**2, axis=0
+        )
         max_strength = xp.max(xp.where(self.use, self.power / response, 0.0), axis=0)
         return xp.maximum(fitted_strength, 1e-6 * max_strength)
 
@@ -118,10 +127,10 @@ class Likelihood(Module):
         """Half the weighted residual sum of squares (F, P) at candidate positions with responses f and the best-fitting
         strength: ½ (Σ w p² − (Σ w p f)² / Σ w f²), with observed powers p and weights w derived from p. This sum
         approximates the cost, and requires two matrix products for all frames and positions."""
-        weight, xp = self._power_weights(), namespace(self, response)
-        weighted_power = weight * self.power
-        explained_sum = xp.maximum(weighted_power.T @ response, 0.0) ** 2 / (weight.T @ response**2)
-        return 0.5 * (xp.sum(self.power * weighted_power, axis=0)[:, None] - explained_sum)
+        power_weights, xp = self._power_weights(), namespace(self, response)
+        weighted_power = power_weights * self.power
+        explained_power = xp.maximum(weighted_power.T @ response, 0.0) ** 2 / (power_weights.T @ response**2)
+        return 0.5 * (xp.sum(self.power * weighted_power, axis=0)[:, None] - explained_power)
 
     def _power_weights(self) -> Float[Array, "M F"]:
         xp = namespace(self)
@@ -165,10 +174,16 @@ def cramer_rao(
 def _bound_covariance(microphone_array: MicrophoneArray, position, strength, used_microphones) -> Float[Array, "N d d"]:
     xp = namespace(microphone_array, position, strength, used_microphones)
     position = xp.asarray(position, float)
-    chart = microphone_array.surface.project(position.T)
-    num_sources = chart.shape[1]
-    unknowns = xp.concatenate([chart, xp.log(xp.broadcast_to(xp.asarray(strength, float), (num_sources,)))[None]])
-    use = xp.broadcast_to(xp.asarray(used_microphones, bool)[:, None], (len(used_microphones), num_sources))
+    chart_positions = microphone_array.surface.project(position.T)
+    num_sources = chart_positions.shape[1]
+    unknowns = xp.concatenate(
+        [chart_positions, xp.log(xp.broadcast_to(xp.asarray(strength, float), (num_sources,)))[None]]
+    )
+    is_used_microphone = xp.broadcast_to(
+        xp.asarray(used_microphones, bool)[:, None], (len(used_microphones), num_sources)
+    )
     # The Fisher matrix does not depend on the measured intensities.
-    _, _, matrix = Likelihood.create(xp.ones(use.shape), use, microphone_array).expand(unknowns)
-    return to_three_dimensions(microphone_array.surface, chart, inverse_small(matrix)[:2, :2])[1]
+    _, _, fisher_matrix = Likelihood.create(
+        xp.ones(is_used_microphone.shape), is_used_microphone, microphone_array
+    ).expand(unknowns)
+    return to_three_dimensions(microphone_array.surface, chart_positions, inverse_small(fisher_matrix)[:2, :2])[1]

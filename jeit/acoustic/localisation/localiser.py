@@ -109,18 +109,18 @@ class Localiser(Module):
         """
         check_array(microphone_array)
         check_name("method", method, METHODS)
-        low, high = bounding_box(on_host(microphone_array.surface))
-        bounding_box_lengths = np.asarray(high - low)
-        spacing = np.sqrt(np.prod(bounding_box_lengths) / _NUM_COARSE_PIXELS)
-        counts = [max(3, round(side / spacing)) for side in bounding_box_lengths]
-        coarse_grid = Pixels.create(microphone_array.surface, *counts)
+        lower_corner, upper_corner = bounding_box(on_host(microphone_array.surface))
+        bounding_box_lengths = np.asarray(upper_corner - lower_corner)
+        pixel_spacing = np.sqrt(np.prod(bounding_box_lengths) / _NUM_COARSE_PIXELS)
+        pixel_counts = [max(3, round(side_length / pixel_spacing)) for side_length in bounding_box_lengths]
+        coarse_pixels = Pixels.create(microphone_array.surface, *pixel_counts)
         if map_shape is None:
-            return cls(microphone_array, coarse_grid, None, None, method, compiled)
+            return cls(microphone_array, coarse_pixels, None, None, method, compiled)
         if np.shape(map_shape) != (2,) or min(map_shape) < 2:
             raise ValueError(f"map_shape must be (rows, columns) of at least two each; it is {map_shape!r}.")
         pixels = Pixels.create(microphone_array.surface, int(map_shape[1]), int(map_shape[0]))
         features = _compute_features(METHODS[method], microphone_array, pixels.chart)
-        return cls(microphone_array, coarse_grid, pixels, features, method, compiled)
+        return cls(microphone_array, coarse_pixels, pixels, features, method, compiled)
 
     def __call__(self, power: ArrayLike, use: ArrayLike | None = None) -> SourceEstimate:
         """Locate the source of each frame. `power` (F, M): intensities minus the noise floor. `use` (F, M): mask of the
@@ -145,49 +145,53 @@ class Localiser(Module):
         """Compute both the estimated source and the map of each frame. Raises `ValueError` as `maps` does."""
         return self(power, use), self.maps(power, use)
 
-    def _call_validated(self, function, power, use):
-        """Validate the intensities `power` and the mask `use`, and call `function` with the localiser and both
+    def _call_validated(self, frame_function, power, use):
+        """Validate the intensities `power` and the mask `use`, and call `frame_function` with the localiser and both
         arrays."""
-        use_numpy = not self.compiled and has_values(self, power, use)
-        xp = np if use_numpy else jnp
+        computes_in_numpy = not self.compiled and has_values(self, power, use)
+        xp = np if computes_in_numpy else jnp
         power = xp.asarray(power, float)
-        finite = xp.isfinite(power)
-        use = finite if use is None else finite & xp.asarray(use, bool)
+        is_finite_power = xp.isfinite(power)
+        use = is_finite_power if use is None else is_finite_power & xp.asarray(use, bool)
         if power.ndim != 2 or power.shape != use.shape or power.shape[1] != len(self.microphone_array.microphones):
             raise ValueError(
                 f"power has shape {power.shape} and use {use.shape}; give (frames, microphones) with "
                 f"{len(self.microphone_array.microphones)} microphones."
             )
         if not len(power):  # for no frames, the result of an unusable frame has the structure of the output
-            padded_result = self._call_validated(function, np.full((1, power.shape[1]), np.nan), None)
-            return jax.tree.map(lambda array: array[:0], padded_result)
+            padded_result = self._call_validated(frame_function, np.full((1, power.shape[1]), np.nan), None)
+            return jax.tree.map(lambda result_array: result_array[:0], padded_result)
         return (
-            on_device(evaluate_in_numpy(function, self, power, use))
-            if use_numpy
-            else _call_compiled(function, self, power, use)
+            on_device(evaluate_in_numpy(frame_function, self, power, use))
+            if computes_in_numpy
+            else _call_compiled(frame_function, self, power, use)
         )
 
 
 @eqx.filter_jit
-def _call_compiled(function, localiser: Localiser, power, use):
-    return function(localiser, power, use)
+def _call_compiled(frame_function, localiser: Localiser, power, use):
+    return frame_function(localiser, power, use)
 
 
-def _apply_in_chunks(function, max_frames: int, *arrays):
-    """Call `function` for at most `max_frames` frames at a time. The `arrays` (F, M) are split into chunks, padded, and
-    transposed to (M, F). In the results, frames are the leading axis."""
-    num_frames = arrays[0].shape[0]
+def _apply_in_chunks(frame_function, max_frames: int, *frame_arrays):
+    """Call `frame_function` for at most `max_frames` frames at a time. The `frame_arrays` (F, M) are split into chunks,
+    padded, and transposed to (M, F). In the results, frames are the leading axis."""
+    num_frames = frame_arrays[0].shape[0]
     chunk_size = min(max_frames, max(num_frames, 1))
     num_chunks = -(-num_frames // chunk_size)
-    padding = ((0, num_chunks * chunk_size - num_frames), (0, 0))
+    frame_padding = ((0, num_chunks * chunk_size - num_frames), (0, 0))
 
-    xp = namespace(arrays)
+    xp = namespace(frame_arrays)
 
-    def split_array(array):
-        return xp.pad(array, padding).reshape(num_chunks, chunk_size, -1).transpose(0, 2, 1)
+    def split_array(frame_array):
+        return xp.pad(frame_array, frame_padding).reshape(num_chunks, chunk_size, -1).transpose(0, 2, 1)
 
-    _, results = scan(lambda _, chunk: (None, function(*chunk)), None, tuple(split_array(array) for array in arrays))
-    return jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:])[:num_frames], results)
+    _, chunk_results = scan(
+        lambda _, frame_chunk: (None, frame_function(*frame_chunk)),
+        None,
+        tuple(split_array(frame_array) for frame_array in frame_arrays),
+    )
+    return jax.tree.map(lambda frame_array: frame_array.reshape(-1, *frame_array.shape[2:])[:num_frames], chunk_results)
 
 
 @numpy_or_compiled
@@ -207,8 +211,10 @@ def _compute_maps(localiser: Localiser, power, use) -> Array:
     """Compute the maps of all frames (F, rows, columns) at once by matrix products."""
     pixels, features = _map_raster(localiser, localiser.microphone_array)
     use = _usable_readings(localiser, power, use)
-    maps = METHODS[localiser.method].create(power.T, use.T, localiser.microphone_array).screen(features)
-    return (maps if pixels.full else namespace(maps).where(pixels.inside, maps, np.nan)).reshape(-1, *pixels.shape)
+    objective_maps = METHODS[localiser.method].create(power.T, use.T, localiser.microphone_array).screen(features)
+    return (
+        objective_maps if pixels.full else namespace(objective_maps).where(pixels.inside, objective_maps, np.nan)
+    ).reshape(-1, *pixels.shape)
 
 
 def _starting_positions(localiser: Localiser, power, use):
@@ -219,14 +225,14 @@ def _starting_positions(localiser: Localiser, power, use):
     # The valleys of a very accurate decay model are narrower than the grid spacing, so a minimum relative error is
     # assumed.
     constant_array = eqx.tree_at(
-        lambda tree: tree.noise.relative,
+        lambda array_to_change: array_to_change.noise.relative,
         constant_array,
         namespace(constant_array).maximum(constant_array.noise.relative, _MIN_SCREENING_RELATIVE_ERROR),
     )
 
     def screen_chunk(power, use):
-        maps = METHODS[localiser.method].create(power, use, constant_array).screen(features)
-        first_start, second_start, has_second_start = find_two_lowest_minima(maps, pixels)
+        objective_maps = METHODS[localiser.method].create(power, use, constant_array).screen(features)
+        first_start, second_start, has_second_start = find_two_lowest_minima(objective_maps, pixels)
         return first_start.T, second_start.T, has_second_start
 
     max_frames = _MAX_CHUNK_FRAMES if localiser.pixels is None else _MAX_MAP_FRAMES
@@ -258,12 +264,12 @@ def _refine_positions(localiser: Localiser, power, use, first_start, second_star
     constant_array = undifferentiated(microphone_array)
     constant_objective = METHODS[localiser.method].create(undifferentiated(power), use, constant_array)
     # If there are maps, the minimisation starts from the best pixel only.
-    unknowns, excess_cost, cost_difference, converged, side = find_minima(
+    unknowns, excess_cost, cost_difference, converged, outline_side = find_minima(
         constant_objective, first_start, second_start, has_second_start if localiser.pixels is None else None
     )
     likelihood = Likelihood.create(power, use, microphone_array)
     objective = likelihood if localiser.method == "likelihood" else Consistency.create(power, use, microphone_array)
-    unknowns = differentiable_minima(objective, unknowns, side, longer_side(constant_array.surface))
+    unknowns = differentiable_minima(objective, unknowns, outline_side, longer_side(constant_array.surface))
     return _source_estimate(objective, likelihood, unknowns, excess_cost, cost_difference, converged)
 
 
@@ -280,14 +286,14 @@ def _source_estimate(
         chart_covariance = objective.covariance(chart, strength)
     misfit = likelihood.misfit(xp.concatenate([chart, xp.log(strength)[None]]))
     position, covariance = to_three_dimensions(surface, chart, chart_covariance)
-    num_used = xp.sum(likelihood.use, axis=0)
-    has_position = (num_used >= 3) & xp.all(xp.isfinite(unknowns), axis=0)
+    num_used_microphones = xp.sum(likelihood.use, axis=0)
+    has_position = (num_used_microphones >= 3) & xp.all(xp.isfinite(unknowns), axis=0)
     return SourceEstimate(
         position=xp.where(has_position[:, None], position, xp.nan),
         covariance=xp.where(has_position[:, None, None], covariance, xp.nan),
         strength=xp.where(has_position, strength, xp.nan),
         misfit=xp.where(has_position, misfit, xp.nan),
-        freedom=xp.maximum(num_used - 3, 0),
+        freedom=xp.maximum(num_used_microphones - 3, 0),
         excess=xp.where(has_position, 2 * excess_cost, xp.nan),
         rival=xp.where(has_position, 2 * cost_difference, xp.nan),
         converged=converged & has_position,

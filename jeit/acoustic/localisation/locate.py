@@ -106,7 +106,7 @@ def locate(
     num_frames, dimension = len(intensities.times), calibration.microphone_array.microphones.shape[1]
     status = np.where(has_touch, LocationStatus.TOUCH, LocationStatus.NO_TOUCH).astype(object)
     status[~has_enough_readings] = LocationStatus.UNUSABLE
-    result = {
+    locations = {
         "position": np.full((num_frames, dimension), np.nan),
         "covariance": np.full((num_frames, dimension, dimension), np.nan),
         "strength": np.full(num_frames, np.nan),
@@ -115,29 +115,31 @@ def locate(
         "second": np.full((num_frames, dimension), np.nan),
         "second_strength": np.full(num_frames, np.nan),
     }
-    notes = list(intensities.notes)
+    location_notes = list(intensities.notes)
     if is_located.any():
-        settings = _Settings(method, map_shape, gain_drift, compiled)
+        location_settings = _LocationSettings(method, map_shape, gain_drift, compiled)
         frames_in_use = intensities.power[is_located], use[is_located]
-        status[is_located], frame_results, changes = _locate_frames(microphone_array, *frames_in_use, settings)
-        for key, values in frame_results.items():
-            result[key][is_located] = values
-        result["covariance"] *= calibration.widening
-        _limit_uncertainty(status, result, float(longer_side(on_host(microphone_array.surface))))
-        notes += [*_gain_note(changes), *_setup_notes(status, intensities, use, microphone_array)]
+        status[is_located], frame_results, gain_changes = _locate_frames(
+            microphone_array, *frames_in_use, location_settings
+        )
+        for field_name, field_values in frame_results.items():
+            locations[field_name][is_located] = field_values
+        locations["covariance"] *= calibration.widening
+        _limit_uncertainty(status, locations, float(longer_side(on_host(microphone_array.surface))))
+        location_notes += [*_gain_note(gain_changes), *_setup_notes(status, intensities, use, microphone_array)]
     return Locations(
         np.asarray(intensities.times),
-        **result,
+        **locations,
         status=status.astype(str),
         used=use,
         overlap=intensities.overlap,
         faults=faults,
-        notes=(*notes, *_unit_note(result["strength"], intensities, use, calibration)),
+        notes=(*location_notes, *_unit_note(locations["strength"], intensities, use, calibration)),
         name=intensities.name,
     )
 
 
-class _Settings(NamedTuple):
+class _LocationSettings(NamedTuple):
     """Arguments of `locate` that determine how the sources of frames are located."""
 
     method: str
@@ -147,57 +149,71 @@ class _Settings(NamedTuple):
 
 
 def _locate_frames(
-    microphone_array: MicrophoneArray, power: np.ndarray, use: np.ndarray, settings: _Settings
+    microphone_array: MicrophoneArray, power: np.ndarray, use: np.ndarray, settings: _LocationSettings
 ) -> tuple[np.ndarray, dict[str, np.ndarray], GainChanges]:
     """Locate the sources of F frames with a touch. Returns the status (F,), a dictionary of the results by the names of
     the fields of `Locations`, and the gain changes with which the results were computed."""
     compiled, num_frames = settings.compiled, len(power)
     padded_frames = _pad_frames(power, use, compiled)
 
-    def estimate(array: MicrophoneArray, method: str, map_shape: tuple[int, int] | None) -> SourceEstimate:
-        localiser = Localiser.create(array, method=method, map_shape=map_shape, compiled=compiled)
-        return jax.tree.map(lambda values: np.array(values)[:num_frames], localiser(*padded_frames))
+    def estimate_sources(
+        changed_array: MicrophoneArray, method: str, map_shape: tuple[int, int] | None
+    ) -> SourceEstimate:
+        localiser = Localiser.create(changed_array, method=method, map_shape=map_shape, compiled=compiled)
+        return jax.tree.map(lambda source_values: np.array(source_values)[:num_frames], localiser(*padded_frames))
 
-    def locate_most_likely(array: MicrophoneArray) -> tuple[SourceEstimate, np.ndarray]:
-        likelihood_estimate = estimate(array, "likelihood", None)
+    def locate_most_likely(changed_array: MicrophoneArray) -> tuple[SourceEstimate, np.ndarray]:
+        likelihood_estimate = estimate_sources(changed_array, "likelihood", None)
         return likelihood_estimate, _initial_status(likelihood_estimate, likelihood_estimate) == LocationStatus.TOUCH
 
     *possible_changes, last_changes = estimate_gain_changes(
         microphone_array, power, use, settings.gain_drift, locate_most_likely
     )
 
-    def locate_after_changes(changes: GainChanges) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        array = changes.apply(microphone_array)
+    def locate_after_changes(gain_changes: GainChanges) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        changed_array = gain_changes.apply(microphone_array)
         # The status of a frame is always determined from the likelihood, even if the position is estimated from the
         # consistency loss.
-        likelihood_estimate, _ = locate_most_likely(array)
+        likelihood_estimate, _ = locate_most_likely(changed_array)
         is_default_method = settings.method == "likelihood" and settings.map_shape is None
         more_likely_estimate = (
-            likelihood_estimate if is_default_method else estimate(array, settings.method, settings.map_shape)
+            likelihood_estimate
+            if is_default_method
+            else estimate_sources(changed_array, settings.method, settings.map_shape)
         )
-        result = {key: np.array(getattr(more_likely_estimate, key)) for key in ("position", "covariance", "strength")}
-        result |= {key: np.array(getattr(likelihood_estimate, key)) for key in ("misfit", "freedom")}
-        result |= {"second": np.full_like(result["position"], np.nan), "second_strength": np.full(num_frames, np.nan)}
+        locations = {
+            field_name: np.array(getattr(more_likely_estimate, field_name))
+            for field_name in ("position", "covariance", "strength")
+        }
+        locations |= {
+            field_name: np.array(getattr(likelihood_estimate, field_name)) for field_name in ("misfit", "freedom")
+        }
+        locations |= {
+            "second": np.full_like(locations["position"], np.nan),
+            "second_strength": np.full(num_frames, np.nan),
+        }
         if settings.method == "likelihood":
-            result["covariance"] = covariance_with_gains(microphone_array, power, use, more_likely_estimate, changes)
+            locations["covariance"] = covariance_with_gains(
+                microphone_array, power, use, more_likely_estimate, gain_changes
+            )
         status = _initial_status(likelihood_estimate, more_likely_estimate)
-        _fit_two_sources(status, result, power, use, array, compiled)
+        _fit_two_sources(status, locations, power, use, changed_array, compiled)
         excess_cost = np.asarray(likelihood_estimate.excess)
         status[(status == LocationStatus.MISFIT) & (excess_cost > _MIN_OUTSIDE_LIKELIHOOD_GAIN)] = (
             LocationStatus.OUTSIDE
         )
-        return status, result
+        return status, locations
 
-    for changes in possible_changes:
-        status, result = locate_after_changes(changes)
+    for gain_changes in possible_changes:
+        status, locations = locate_after_changes(gain_changes)
         if np.mean(status != LocationStatus.MISFIT) > _MIN_EXPLAINED_FRAMES:
-            return status, result, changes
+            return status, locations, gain_changes
     return *locate_after_changes(last_changes), last_changes
 
 
-def _initial_status(most_likely: SourceEstimate, estimate: SourceEstimate) -> np.ndarray:
+def _initial_status(most_likely: SourceEstimate, source_estimate: SourceEstimate) -> np.ndarray:
     """Status of the frames with a touch, before a fit of two sources is tried. `most_likely`: maximum-likelihood
-    estimates, which determine the status; `estimate`: estimates of the selected method."""
+    estimates, which determine the status; `source_estimate`: estimates of the selected method."""
     misfit, degrees_of_freedom = np.asarray(most_likely.misfit), np.asarray(most_likely.freedom)
     excess_cost = np.asarray(most_likely.excess)
     has_rival = np.asarray(most_likely.rival) < _MAX_AMBIGUOUS_LIKELIHOOD_DIFFERENCE
@@ -208,7 +224,7 @@ def _initial_status(most_likely: SourceEstimate, estimate: SourceEstimate) -> np
     status[(excess_cost > _MIN_OUTSIDE_LIKELIHOOD_GAIN) & ~_exceeds_noise(misfit - excess_cost, degrees_of_freedom)] = (
         LocationStatus.OUTSIDE
     )
-    status[~np.isfinite(np.asarray(estimate.position)).all(axis=1)] = LocationStatus.UNUSABLE
+    status[~np.isfinite(np.asarray(source_estimate.position)).all(axis=1)] = LocationStatus.UNUSABLE
     return status
 
 
@@ -219,14 +235,14 @@ def _exceeds_noise(misfit: np.ndarray, degrees_of_freedom: np.ndarray) -> np.nda
 
 def _fit_two_sources(
     status: np.ndarray,
-    result: dict[str, np.ndarray],
+    locations: dict[str, np.ndarray],
     power,
     use,
     microphone_array: MicrophoneArray,
     compiled: bool,
 ) -> None:
     """Fit two sources to the frames that one source does not explain, and enlarge the position covariances of the
-    frames that two sources do not explain either. Modifies `status` and `result` in place."""
+    frames that two sources do not explain either. Modifies `status` and `locations` in place."""
     tried_frames = np.flatnonzero((status == LocationStatus.MISFIT) & (use.sum(axis=1) > 6))
     if tried_frames.size:
         two_sources = locate_two(
@@ -237,7 +253,7 @@ def _fit_two_sources(
             np.asarray(two_sources.freedom)[: tried_frames.size],
         )
         stronger_strengths, weaker_strengths = np.asarray(two_sources.strength)[: tried_frames.size].T
-        is_much_better = (misfit < _MAX_MISFIT_RATIO * result["misfit"][tried_frames]) & (
+        is_much_better = (misfit < _MAX_MISFIT_RATIO * locations["misfit"][tried_frames]) & (
             misfit < _MAX_MISFIT * degrees_of_freedom
         )
         is_accepted = (~_exceeds_noise(misfit, degrees_of_freedom) | is_much_better) & (
@@ -245,44 +261,47 @@ def _fit_two_sources(
         )
         accepted_frames, accepted_indices = tried_frames[is_accepted], np.flatnonzero(is_accepted)
         status[accepted_frames] = LocationStatus.TWO_TOUCHES
-        result["misfit"][accepted_frames], result["freedom"][accepted_frames] = (
+        locations["misfit"][accepted_frames], locations["freedom"][accepted_frames] = (
             misfit[is_accepted],
             degrees_of_freedom[is_accepted],
         )
-        position, strength = (
+        pair_positions, pair_strengths = (
             np.asarray(two_sources.position)[accepted_indices],
             np.asarray(two_sources.strength)[accepted_indices],
         )
-        result["position"][accepted_frames], result["second"][accepted_frames] = position[:, 0], position[:, 1]
-        result["strength"][accepted_frames], result["second_strength"][accepted_frames] = strength.T
-        result["covariance"][accepted_frames] = np.asarray(two_sources.covariance)[accepted_indices, 0]
+        locations["position"][accepted_frames], locations["second"][accepted_frames] = (
+            pair_positions[:, 0],
+            pair_positions[:, 1],
+        )
+        locations["strength"][accepted_frames], locations["second_strength"][accepted_frames] = pair_strengths.T
+        locations["covariance"][accepted_frames] = np.asarray(two_sources.covariance)[accepted_indices, 0]
     misfit_frames = np.flatnonzero(status == LocationStatus.MISFIT)
-    variance_factors = result["misfit"][misfit_frames] / np.maximum(result["freedom"][misfit_frames], 1)
-    result["covariance"][misfit_frames] *= np.maximum(variance_factors, 1.0)[:, None, None]
+    variance_factors = locations["misfit"][misfit_frames] / np.maximum(locations["freedom"][misfit_frames], 1)
+    locations["covariance"][misfit_frames] *= np.maximum(variance_factors, 1.0)[:, None, None]
 
 
-def _limit_uncertainty(status: np.ndarray, result: dict[str, np.ndarray], skin_size: float) -> None:
+def _limit_uncertainty(status: np.ndarray, locations: dict[str, np.ndarray], skin_size: float) -> None:
     """Mark touches as ambiguous if the standard deviation of their position exceeds a fourth of the skin's size, and
-    replace covariances whose standard deviation exceeds the skin's size. Modifies `status` and `result` in place."""
-    has_position = np.isfinite(result["position"]).all(axis=1)
-    is_finite = np.isfinite(result["covariance"]).all(axis=(1, 2))
-    deviation = np.zeros(len(status))
-    deviation[is_finite] = np.sqrt(np.abs(np.linalg.eigvalsh(result["covariance"][is_finite])).max(axis=1))
-    is_uncertain = has_position & (status == LocationStatus.TOUCH) & (~is_finite | (deviation > skin_size / 4))
+    replace covariances whose standard deviation exceeds the skin's size. Modifies `status` and `locations` in place."""
+    has_position = np.isfinite(locations["position"]).all(axis=1)
+    is_finite = np.isfinite(locations["covariance"]).all(axis=(1, 2))
+    position_deviation = np.zeros(len(status))
+    position_deviation[is_finite] = np.sqrt(np.abs(np.linalg.eigvalsh(locations["covariance"][is_finite])).max(axis=1))
+    is_uncertain = has_position & (status == LocationStatus.TOUCH) & (~is_finite | (position_deviation > skin_size / 4))
     status[is_uncertain] = LocationStatus.AMBIGUOUS
-    deviation_exceeds_skin = has_position & (~is_finite | (deviation > skin_size))
-    result["covariance"][deviation_exceeds_skin] = (skin_size / 2) ** 2 * np.eye(result["covariance"].shape[1])
+    deviation_exceeds_skin = has_position & (~is_finite | (position_deviation > skin_size))
+    locations["covariance"][deviation_exceeds_skin] = (skin_size / 2) ** 2 * np.eye(locations["covariance"].shape[1])
 
 
-def _gain_note(changes: GainChanges) -> list[str]:
+def _gain_note(gain_changes: GainChanges) -> list[str]:
     """Note on the estimated changes of the microphones' gains; an empty list if no changes are applied."""
-    factor = np.exp(changes.logarithm)
-    if (factor == 1).all():
+    gain_factors = np.exp(gain_changes.logarithm)
+    if (gain_factors == 1).all():
         return []
-    most_changed_microphone = int(np.abs(changes.logarithm).argmax())
+    most_changed_microphone = int(np.abs(gain_changes.logarithm).argmax())
     return [
         "gains have changed since the calibration, and the places are corrected for it: most that of microphone "
-        f"{most_changed_microphone}, by {100 * (factor[most_changed_microphone] - 1):+.0f} % of its intensity."
+        f"{most_changed_microphone}, by {100 * (gain_factors[most_changed_microphone] - 1):+.0f} % of its intensity."
     ]
 
 
@@ -291,30 +310,30 @@ def _setup_notes(
 ) -> list[str]:
     """Notes on changes of the setup since the calibration. Such changes are searched for if there are many frames that
     one source does not explain."""
-    notes = []
+    setup_notes = []
     has_touch = ~np.isin(status, [LocationStatus.NO_TOUCH, LocationStatus.UNUSABLE])
     is_unexplained = np.isin(status, [LocationStatus.MISFIT, LocationStatus.OUTSIDE, LocationStatus.TWO_TOUCHES])
     if is_unexplained.sum() > _MAX_UNEXPLAINED_FRAMES * has_touch.sum():
-        exchanged, altered_microphones = find_setup_changes(
+        exchanged_pairs, altered_microphones = find_setup_changes(
             microphone_array, intensities.power[has_touch], use[has_touch]
         )
-        notes += [
+        setup_notes += [
             f"microphones {microphone} and {other_microphone} look exchanged since the calibration: exchanged back, "
             "their intensities fit one source. The places are not corrected: exchange the channels and locate again."
-            for microphone, other_microphone in exchanged
+            for microphone, other_microphone in exchanged_pairs
         ]
-        notes += [
+        setup_notes += [
             f"microphone {microphone} does not measure as when it was calibrated: without it, one source explains the "
             "others. The places are not corrected: make its channel NaN and locate again, or calibrate anew."
             for microphone in altered_microphones
         ]
         if (
-            not exchanged
+            not exchanged_pairs
             and not altered_microphones
             and (status == LocationStatus.MISFIT).sum() > 2 * _MAX_UNEXPLAINED_FRAMES * has_touch.sum()
         ):
-            notes.append("most touches fit no single source: is this the calibration of this array?")
-    return notes
+            setup_notes.append("most touches fit no single source: is this the calibration of this array?")
+    return setup_notes
 
 
 def _unit_note(strength: np.ndarray, intensities: Intensities, use: np.ndarray, calibration: Calibration) -> list[str]:
@@ -323,23 +342,25 @@ def _unit_note(strength: np.ndarray, intensities: Intensities, use: np.ndarray, 
     gain_and_unit_question = "do the recording and the taps have the same gain and unit?"
     if np.isfinite(strength).any():
         median_strength = float(np.nanmedian(strength))
-        ratio = median_strength / np.clip(
+        strength_ratio = median_strength / np.clip(
             median_strength, *(calibration.strengths or (median_strength, median_strength))
         )
-        if max(ratio, 1 / ratio) > _MAX_PLAUSIBLE_STRENGTH_RATIO:
-            return [f"touches are {ratio:.3g} times as strong as the calibration's taps: {gain_and_unit_question}"]
+        if max(strength_ratio, 1 / strength_ratio) > _MAX_PLAUSIBLE_STRENGTH_RATIO:
+            return [
+                f"touches are {strength_ratio:.3g} times as strong as the calibration's taps: {gain_and_unit_question}"
+            ]
         return []
     # Without a touch and without a known noise floor, the intensities are compared with the noise of the calibration.
-    deviation = np.asarray(calibration.microphone_array.noise.deviation)
-    has_noise = use.any(axis=0) & (deviation > 0)
+    noise_deviation = np.asarray(calibration.microphone_array.noise.deviation)
+    has_noise = use.any(axis=0) & (noise_deviation > 0)
     if intensities.floor.any() or not has_noise.any():
         return []
-    ratio = float(
-        np.median(np.where(use, np.abs(intensities.power), 0.0).max(axis=0)[has_noise] / deviation[has_noise])
+    strength_ratio = float(
+        np.median(np.where(use, np.abs(intensities.power), 0.0).max(axis=0)[has_noise] / noise_deviation[has_noise])
     )
-    is_quiet = ratio < 1 / _MAX_PLAUSIBLE_STRENGTH_RATIO
+    is_quiet = strength_ratio < 1 / _MAX_PLAUSIBLE_STRENGTH_RATIO
     return (
-        [f"the sound is {ratio:.3g} times as loud as the calibration's noise: {gain_and_unit_question}"]
+        [f"the sound is {strength_ratio:.3g} times as loud as the calibration's noise: {gain_and_unit_question}"]
         if is_quiet
         else []
     )
@@ -355,8 +376,12 @@ def microphones_in_use(
     """
     use = np.asarray(intensities.usable) & calibration.usable
     faults = tuple(
-        "; ".join(text for text in (fault, reason and f"not calibrated: {reason}") if text)
-        for fault, reason in zip(intensities.faults, calibration.reasons, strict=True)
+        "; ".join(
+            fault_text
+            for fault_text in (fault, calibration_reason and f"not calibrated: {calibration_reason}")
+            if fault_text
+        )
+        for fault, calibration_reason in zip(intensities.faults, calibration.reasons, strict=True)
     )
     if use.any(axis=0).sum() < 3:
         raise ValueError(
@@ -373,16 +398,19 @@ def microphones_in_use(
         )
     else:
         # Negative intensities are due to noise, which may be larger in the recording than in the calibration.
-        deviation = np.maximum(
+        noise_deviation = np.maximum(
             noise_from_negative_powers(intensities.power, use), np.asarray(calibrated_noise.deviation)
         )
         noise = eqx.tree_at(
-            lambda tree: (tree.deviation, tree.floor),
+            lambda noise_to_change: (noise_to_change.deviation, noise_to_change.floor),
             calibrated_noise,
             (
-                as_array(deviation),
+                as_array(noise_deviation),
                 as_array(
-                    np.maximum(calibrated_noise.floor, IntensityNoise.create(len(deviation), deviation=deviation).floor)
+                    np.maximum(
+                        calibrated_noise.floor,
+                        IntensityNoise.create(len(noise_deviation), deviation=noise_deviation).floor,
+                    )
                 ),
             ),
         )
@@ -396,17 +424,17 @@ def microphones_in_use(
 def _detected_frames(intensities: Intensities, noise: IntensityNoise, use: np.ndarray) -> np.ndarray:
     """Mask (F,) of the frames in which the intensity of at least one microphone exceeds the detection threshold of
     touches."""
-    power = np.where(use, intensities.power, -np.inf)
+    used_power = np.where(use, intensities.power, -np.inf)
     if np.any(intensities.floor > 0) and np.isfinite(intensities.freedom):
-        threshold = intensities.floor * (
+        detection_threshold = intensities.floor * (
             chdtri(intensities.freedom, _DETECTION_FALSE_ALARM_PROBABILITY / use.shape[1]) / intensities.freedom - 1
         )
     else:
-        max_power = power.max(initial=0.0)
-        threshold = np.maximum(
+        max_power = used_power.max(initial=0.0)
+        detection_threshold = np.maximum(
             _DETECTION_DEVIATIONS_OF_NOISE * np.asarray(noise.deviation), _MIN_RELATIVE_INTENSITY * max_power
         )
-    return np.asarray((power > threshold).any(axis=1))
+    return np.asarray((used_power > detection_threshold).any(axis=1))
 
 
 def _pad_frames(power: np.ndarray, use: np.ndarray, compiled: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -78,8 +78,10 @@ class Locations(Module):
     @property
     def located(self) -> Bool[np.ndarray, " F"]:
         """Former name of `has_position`, which will be removed in the next version."""
-        text = "Locations.located is now Locations.has_position; the old name goes with the next version."
-        warnings.warn(text, DeprecationWarning, stacklevel=2)
+        deprecation_message = (
+            "Locations.located is now Locations.has_position; the old name goes with the next version."
+        )
+        warnings.warn(deprecation_message, DeprecationWarning, stacklevel=2)
         return self.has_position
 
     def counts(self) -> dict[str, int]:

@@ -33,11 +33,11 @@ class Pixels(Module):
     def create(cls, surface, columns: int, rows: int) -> "Pixels":
         """Create a raster of rows × columns pixels, bottom row first. Raises `ValueError` if no pixel lies inside the
         outline."""
-        centres, is_inside = chart_grid(surface, columns, rows)
+        pixel_centres, is_inside = chart_grid(surface, columns, rows)
         if not is_inside.any():
             raise ValueError(f"shape: none of {columns} × {rows} pixels has its middle inside the outline; take more.")
         return cls(
-            as_array(centres.reshape(2, -1)), as_array(is_inside.ravel()), (rows, columns), bool(is_inside.all())
+            as_array(pixel_centres.reshape(2, -1)), as_array(is_inside.ravel()), (rows, columns), bool(is_inside.all())
         )
 
 
@@ -50,9 +50,9 @@ def find_two_lowest_minima(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[A
     rows, columns = pixels.shape
     is_inside, xp = pixels.inside.reshape(rows, columns), namespace(maps, pixels)
 
-    def fill_outside(values, is_inside):
-        is_valid = ~xp.isnan(values) if pixels.full else is_inside & ~xp.isnan(values)
-        return xp.where(is_valid, values, xp.inf)
+    def fill_outside(map_values, is_inside):
+        is_valid_pixel = ~xp.isnan(map_values) if pixels.full else is_inside & ~xp.isnan(map_values)
+        return xp.where(is_valid_pixel, map_values, xp.inf)
 
     # The row of the minimum is found first, and then the pixel in this row, which is faster than a single search.
     rasters = maps.reshape(-1, rows, columns)
@@ -63,18 +63,20 @@ def find_two_lowest_minima(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[A
     if rows * columns > _MAX_VALLEY_PIXELS:  # fine rasters have spurious local minima
         return best_chart_positions, best_chart_positions, xp.zeros(best_pixels.shape, bool)
     rasters = fill_outside(rasters, is_inside)
-    values = rasters.reshape(len(best_pixels), -1)
+    map_values = rasters.reshape(len(best_pixels), -1)
     padded_rasters = xp.pad(rasters, ((0, 0), (1, 1), (1, 1)), constant_values=xp.inf)
     neighbour_values = [
         padded_rasters[:, i : i + rows, j : j + columns] for i in range(3) for j in range(3) if (i, j) != (1, 1)
     ]
     is_local_minimum = xp.isfinite(rasters)
-    for neighbour in neighbour_values:
-        is_local_minimum &= rasters <= neighbour
-    is_local_minimum = set_at(is_local_minimum.reshape(values.shape), (xp.arange(len(best_pixels)), best_pixels), False)
-    other_minima = xp.where(is_local_minimum, values, xp.inf)
+    for neighbour_raster in neighbour_values:
+        is_local_minimum &= rasters <= neighbour_raster
+    is_local_minimum = set_at(
+        is_local_minimum.reshape(map_values.shape), (xp.arange(len(best_pixels)), best_pixels), False
+    )
+    other_minima = xp.where(is_local_minimum, map_values, xp.inf)
     second_pixels = xp.argmin(other_minima, axis=1)
-    best_values, second_values = xp.min(values, axis=1), xp.min(other_minima, axis=1)
+    best_values, second_values = xp.min(map_values, axis=1), xp.min(other_minima, axis=1)
     return (
         best_chart_positions,
         pixels.chart[:, second_pixels],
@@ -107,28 +109,30 @@ def map_brightness(
     print(bright.max())  # 1
     ```
     """
-    values = np.asarray(maps, float)
-    if values.ndim != 3:
-        raise ValueError(f"maps has shape {values.shape}; give (frames, rows, columns).")
+    map_values = np.asarray(maps, float)
+    if map_values.ndim != 3:
+        raise ValueError(f"maps has shape {map_values.shape}; give (frames, rows, columns).")
     if method not in ("likelihood", "consistency"):
         raise ValueError(f"method must be likelihood or consistency; it is {method!r}.")
     if not 0 < share < 1:
         raise ValueError(f"share must be between 0 and 1; it is {share}.")
-    flat_maps = np.where(np.isnan(values), np.inf, values).reshape(len(values), -1)
-    minimum = flat_maps.min(axis=1, keepdims=True)
-    has_finite_minimum = np.isfinite(minimum)
-    minimum = np.where(has_finite_minimum, minimum, 0.0)
-    scale = 1.0
+    flat_maps = np.where(np.isnan(map_values), np.inf, map_values).reshape(len(map_values), -1)
+    map_minimum = flat_maps.min(axis=1, keepdims=True)
+    has_finite_minimum = np.isfinite(map_minimum)
+    map_minimum = np.where(has_finite_minimum, map_minimum, 0.0)
+    brightness_scale = 1.0
     if method == "consistency":
         rank_of_darkest = max(1, int(share * np.isfinite(flat_maps).sum(axis=1).max(initial=1)))
-        scale = (
+        brightness_scale = (
             np.partition(flat_maps, min(rank_of_darkest, flat_maps.shape[1] - 1), axis=1)[
                 :, [min(rank_of_darkest, flat_maps.shape[1] - 1)]
             ]
-            - minimum
+            - map_minimum
         )
-        scale = np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)
-    return np.where(has_finite_minimum, np.exp(-(flat_maps - minimum) / scale), 0.0).reshape(values.shape)
+        brightness_scale = np.where(np.isfinite(brightness_scale) & (brightness_scale > 0), brightness_scale, 1.0)
+    return np.where(has_finite_minimum, np.exp(-(flat_maps - map_minimum) / brightness_scale), 0.0).reshape(
+        map_values.shape
+    )
 
 
 def overlay_images(
@@ -154,21 +158,21 @@ def overlay_images(
     faded = overlay_images(bright, times=[0.0, 0.1])
     ```
     """
-    frames, frame_times = np.nan_to_num(np.asarray(images, float)), np.asarray(times, float)
-    if frames.ndim != 3 or frame_times.shape != (len(frames),) or not len(frames):
+    image_frames, frame_times = np.nan_to_num(np.asarray(images, float)), np.asarray(times, float)
+    if image_frames.ndim != 3 or frame_times.shape != (len(image_frames),) or not len(image_frames):
         raise ValueError(
-            f"images has shape {frames.shape} and times {frame_times.shape}; give (F, rows, columns) and (F,)."
+            f"images has shape {image_frames.shape} and times {frame_times.shape}; give (F, rows, columns) and (F,)."
         )
     if not (np.diff(frame_times) > 0).all():
         raise ValueError("times must increase, in seconds.")
     if not (np.isfinite(time_constant) and time_constant > 0):
         raise ValueError(f"time_constant must be positive, in seconds; it is {time_constant}.")
-    result = np.empty_like(frames)
-    overlay = np.zeros_like(frames[0])
+    overlaid_images = np.empty_like(image_frames)
+    current_overlay = np.zeros_like(image_frames[0])
     for frame_index, fade_factor in enumerate(np.exp(-np.diff(frame_times, prepend=frame_times[0]) / time_constant)):
-        overlay = np.maximum(fade_factor * overlay, frames[frame_index])
-        result[frame_index] = overlay
-    return result
+        current_overlay = np.maximum(fade_factor * current_overlay, image_frames[frame_index])
+        overlaid_images[frame_index] = current_overlay
+    return overlaid_images
 
 
 def last_overlay_image(
@@ -180,5 +184,5 @@ def last_overlay_image(
     parts.
     """
     time_since_frame = np.maximum(time - np.asarray(times, float), 0.0)
-    weight = np.exp(-time_since_frame / time_constant)
-    return np.max(np.nan_to_num(np.asarray(images, float)) * weight[:, None, None], axis=0)
+    fade_weights = np.exp(-time_since_frame / time_constant)
+    return np.max(np.nan_to_num(np.asarray(images, float)) * fade_weights[:, None, None], axis=0)

@@ -17,9 +17,9 @@ from jeit_solvers.engines import evaluate_in_numpy, has_values, namespace, on_de
 from jeit_solvers.module import Module
 
 # Approximate number of grid positions, all pairs of which are screened.
-_NUM_PIXELS = 150
+_NUM_GRID_PIXELS = 150
 # Number of pairs of positions that are refined.
-_NUM_STARTS = 3
+_NUM_STARTING_PAIRS = 3
 
 
 class TwoSources(Module):
@@ -63,109 +63,123 @@ def locate_two(
     print(pair.position.shape)
     ```
     """
-    use_numpy = not compiled and np.size(power) > 0 and has_values(microphone_array, power, use)
-    xp = np if use_numpy else jnp
+    computes_in_numpy = not compiled and np.size(power) > 0 and has_values(microphone_array, power, use)
+    xp = np if computes_in_numpy else jnp
     power = xp.asarray(power, float)
     use = xp.isfinite(power) if use is None else xp.isfinite(power) & xp.asarray(use, bool)
-    low, high = bounding_box(on_host(microphone_array.surface))
-    spacing = np.sqrt(np.prod(high - low) / _NUM_PIXELS)
-    columns, rows = (max(3, round(side / spacing)) for side in high - low)
-    pixels = Pixels.create(microphone_array.surface, columns, rows)
-    arguments = microphone_array, pixels, power.T, use.T
+    lower_corner, upper_corner = bounding_box(on_host(microphone_array.surface))
+    grid_spacing = np.sqrt(np.prod(upper_corner - lower_corner) / _NUM_GRID_PIXELS)
+    num_columns, num_rows = (max(3, round(side_length / grid_spacing)) for side_length in upper_corner - lower_corner)
+    pixels = Pixels.create(microphone_array.surface, num_columns, num_rows)
+    source_arguments = microphone_array, pixels, power.T, use.T
     return (
-        on_device(evaluate_in_numpy(_locate_two_sources, *arguments))
-        if use_numpy
-        else jax.jit(_locate_two_sources)(*arguments)
+        on_device(evaluate_in_numpy(_locate_two_sources, *source_arguments))
+        if computes_in_numpy
+        else jax.jit(_locate_two_sources)(*source_arguments)
     )
 
 
-def _locate_two_sources(microphone_array: MicrophoneArray, pixels: Pixels, power, use) -> TwoSources:
-    use = use & (power + microphone_array.noise.floor[:, None] > 0)
-    likelihood = Likelihood.create(power, use, microphone_array)
-    response = microphone_array.response(pixels.chart)
-    xp = namespace(response, power)
+def _locate_two_sources(microphone_array: MicrophoneArray, pixels: Pixels, power, is_used_reading) -> TwoSources:
+    is_used_reading = is_used_reading & (power + microphone_array.noise.floor[:, None] > 0)
+    likelihood = Likelihood.create(power, is_used_reading, microphone_array)
+    grid_response = microphone_array.response(pixels.chart)
+    xp = namespace(grid_response, power)
 
-    def screen(_, frame):
-        power, use = frame
-        return None, _best_pairs(power, use, response, pixels, microphone_array)
+    def screen_frame(_, frame_readings):
+        power, is_used_reading = frame_readings
+        return None, _best_pairs(power, is_used_reading, grid_response, pixels, microphone_array)
 
-    _, pair_unknowns = scan(screen, None, (power.T, use.T))
-    start = pair_unknowns.transpose(2, 1, 0).reshape(6, -1)  # (6, starts · F)
-    low, high = bounding_box(microphone_array.surface)
+    _, pair_unknowns = scan(screen_frame, None, (power.T, is_used_reading.T))
+    initial_unknowns = pair_unknowns.transpose(2, 1, 0).reshape(6, -1)  # (6, starts · F)
+    lower_corner, upper_corner = bounding_box(microphone_array.surface)
     skin_size = longer_side(microphone_array.surface)
     infinite_bound = xp.full(1, xp.inf)
-    minimum = minimise_small(
-        lambda unknowns, data: Likelihood(data[0], data[1], data[2], microphone_array).expand(unknowns),
-        start,
-        jax.tree.map(lambda array: xp.tile(array, _NUM_STARTS), likelihood.frames),
-        lower=xp.concatenate([low, -infinite_bound, low, -infinite_bound])[:, None],
-        upper=xp.concatenate([high, infinite_bound, high, infinite_bound])[:, None],
+    pair_minimum = minimise_small(
+        lambda unknowns, frame_data: Likelihood(frame_data[0], frame_data[1], frame_data[2], microphone_array).expand(
+            unknowns
+        ),
+        initial_unknowns,
+        jax.tree.map(lambda frame_array: xp.tile(frame_array, _NUM_STARTING_PAIRS), likelihood.frames),
+        lower=xp.concatenate([lower_corner, -infinite_bound, lower_corner, -infinite_bound])[:, None],
+        upper=xp.concatenate([upper_corner, infinite_bound, upper_corner, infinite_bound])[:, None],
         largest_step=xp.tile(xp.array([0.1, 0.1, 2.3]) * xp.array([skin_size, skin_size, 1.0]), 2)[:, None],
         max_steps=60,
         tolerance=1e-10,
     )
     num_frames = power.shape[1]
-    values = xp.where(xp.isfinite(minimum.value), minimum.value, xp.inf).reshape(_NUM_STARTS, num_frames)
-    best_indices = xp.argmin(values, axis=0) * num_frames + xp.arange(num_frames)
-    unknowns, converged = minimum.x[:, best_indices], minimum.converged[best_indices]
+    lowest_costs = xp.where(xp.isfinite(pair_minimum.value), pair_minimum.value, xp.inf).reshape(
+        _NUM_STARTING_PAIRS, num_frames
+    )
+    best_start_indices = xp.argmin(lowest_costs, axis=0) * num_frames + xp.arange(num_frames)
+    unknowns, has_converged = pair_minimum.x[:, best_start_indices], pair_minimum.converged[best_start_indices]
     unknowns = xp.where(unknowns[5] > unknowns[2], xp.roll(unknowns, 3, axis=0), unknowns)
-    _, _, matrix = likelihood.expand(unknowns)
-    unknowns_covariance = inverse_small(matrix)
-    num_used = xp.sum(use, axis=0)
-    has_positions = (num_used >= 6) & xp.isfinite(xp.min(values, axis=0))
-    sources = [
+    _, _, fisher_matrix = likelihood.expand(unknowns)
+    unknowns_covariance = inverse_small(fisher_matrix)
+    num_used_microphones = xp.sum(is_used_reading, axis=0)
+    has_positions = (num_used_microphones >= 6) & xp.isfinite(xp.min(lowest_costs, axis=0))
+    source_estimates = [
         to_three_dimensions(microphone_array.surface, unknowns[k : k + 2], unknowns_covariance[k : k + 2, k : k + 2])
         for k in (0, 3)
     ]
 
-    def mask_unlocated(array):
-        return xp.where(has_positions.reshape(-1, *(1,) * (array.ndim - 1)), array, xp.nan)
+    def mask_unlocated(frame_array):
+        return xp.where(has_positions.reshape(-1, *(1,) * (frame_array.ndim - 1)), frame_array, xp.nan)
 
     return TwoSources(
-        position=mask_unlocated(xp.stack([position for position, _ in sources], axis=1)),
-        covariance=mask_unlocated(xp.stack([covariance for _, covariance in sources], axis=1)),
+        position=mask_unlocated(xp.stack([position for position, _ in source_estimates], axis=1)),
+        covariance=mask_unlocated(xp.stack([covariance for _, covariance in source_estimates], axis=1)),
         strength=mask_unlocated(xp.exp(unknowns[2::3]).T),
         misfit=mask_unlocated(likelihood.misfit(unknowns)),
-        freedom=xp.maximum(num_used - 6, 0),
-        converged=converged & has_positions,
+        freedom=xp.maximum(num_used_microphones - 6, 0),
+        converged=has_converged & has_positions,
     )
 
 
-def _best_pairs(power, use, response, pixels: Pixels, microphone_array: MicrophoneArray) -> Float[Array, "starts 6"]:
+def _best_pairs(
+    power, is_used_reading, grid_response, pixels: Pixels, microphone_array: MicrophoneArray
+) -> Float[Array, "starts 6"]:
     """Find the pairs of grid positions with the lowest weighted residuals of a frame, each pair with its best-fitting
     strengths. Pairs that are neighbours of a better pair are excluded. Returns the unknowns (starts, 6) of the best
     pairs."""
-    xp = namespace(response, power)
-    weight = xp.where(use, 1 / microphone_array.noise.variance(xp.maximum(power, 0.0)), 0.0)
+    xp = namespace(grid_response, power)
+    power_weights = xp.where(is_used_reading, 1 / microphone_array.noise.variance(xp.maximum(power, 0.0)), 0.0)
     # The unit of intensities is arbitrary, so intensities are divided by the highest intensity of the frame.
-    scale = xp.max(xp.where(use, power, 0.0))
-    weight = weight * scale**2
-    scaled_power = xp.where(use, power, 0.0) / scale
-    gram_matrix = (weight[:, None] * response).T @ response
-    weighted_moment = (weight * scaled_power) @ response
-    diagonal = xp.diag(gram_matrix)
-    determinant = diagonal[:, None] * diagonal - gram_matrix**2
-    first_strengths = (diagonal * weighted_moment[:, None] - gram_matrix * weighted_moment) / determinant
+    max_power = xp.max(xp.where(is_used_reading, power, 0.0))
+    power_weights = power_weights * max_power**2
+    scaled_power = xp.where(is_used_reading, power, 0.0) / max_power
+    gram_matrix = (power_weights[:, None] * grid_response).T @ grid_response
+    weighted_moment = (power_weights * scaled_power) @ grid_response
+    gram_diagonal = xp.diag(gram_matrix)
+    pair_determinants = gram_diagonal[:, None] * gram_diagonal - gram_matrix**2
+    first_strengths = (gram_diagonal * weighted_moment[:, None] - gram_matrix * weighted_moment) / pair_determinants
     second_strengths = first_strengths.T
-    is_valid = (first_strengths > 0) & (second_strengths > 0) & (determinant > 1e-9 * diagonal[:, None] * diagonal)
-    is_valid = is_valid & pixels.inside[:, None] & pixels.inside
-    residual_decrease = xp.where(
-        is_valid, first_strengths * weighted_moment[:, None] + second_strengths * weighted_moment, -xp.inf
+    is_valid_pair = (
+        (first_strengths > 0)
+        & (second_strengths > 0)
+        & (pair_determinants > 1e-9 * gram_diagonal[:, None] * gram_diagonal)
     )
-    chart = pixels.chart
-    distances = xp.linalg.norm(chart[:, :, None] - chart[:, None], axis=0)
-    is_neighbour = distances < 1.6 * xp.sort(distances[0])[1]
-    pairs = []
-    for _ in range(_NUM_STARTS):
-        first_index, second_index = xp.unravel_index(xp.argmax(residual_decrease), residual_decrease.shape)
+    is_valid_pair = is_valid_pair & pixels.inside[:, None] & pixels.inside
+    residual_decrease = xp.where(
+        is_valid_pair, first_strengths * weighted_moment[:, None] + second_strengths * weighted_moment, -xp.inf
+    )
+    grid_positions = pixels.chart
+    grid_distances = xp.linalg.norm(grid_positions[:, :, None] - grid_positions[:, None], axis=0)
+    is_neighbour = grid_distances < 1.6 * xp.sort(grid_distances[0])[1]
+    best_pairs = []
+    for _ in range(_NUM_STARTING_PAIRS):
+        first_pixel, second_pixel = xp.unravel_index(xp.argmax(residual_decrease), residual_decrease.shape)
         log_strengths = xp.log(
             xp.maximum(
-                scale
-                * xp.stack([first_strengths[first_index, second_index], second_strengths[first_index, second_index]]),
+                max_power
+                * xp.stack([first_strengths[first_pixel, second_pixel], second_strengths[first_pixel, second_pixel]]),
                 1e-300,
             )
         )
-        pairs.append(xp.stack([*chart[:, first_index], log_strengths[0], *chart[:, second_index], log_strengths[1]]))
-        is_similar = is_neighbour[first_index][:, None] & is_neighbour[second_index]
-        residual_decrease = xp.where(is_similar | is_similar.T, -xp.inf, residual_decrease)
-    return xp.stack(pairs)
+        best_pairs.append(
+            xp.stack(
+                [*grid_positions[:, first_pixel], log_strengths[0], *grid_positions[:, second_pixel], log_strengths[1]]
+            )
+        )
+        is_similar_pair = is_neighbour[first_pixel][:, None] & is_neighbour[second_pixel]
+        residual_decrease = xp.where(is_similar_pair | is_similar_pair.T, -xp.inf, residual_decrease)
+    return xp.stack(best_pairs)

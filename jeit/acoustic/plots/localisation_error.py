@@ -16,7 +16,7 @@ from jeit.arguments import check_kind, check_name
 from jeit.plot.axes import draw_horizontal_grid, get_or_create_axes, style_graph_axes
 from jeit.plot.colours import DARK_GREY, SERIES_COLOURS, SERIES_MARKERS
 
-_STATISTICS = {
+_ERROR_STATISTICS = {
     "median": lambda errors: np.nanmedian(errors, axis=1),
     "mean": lambda errors: np.nanmean(errors, axis=1),
     "rms": lambda errors: np.sqrt(np.nanmean(errors**2, axis=1)),
@@ -54,16 +54,16 @@ def plot_position_errors(
     ax = plot_position_errors(true, true + 2e-3, skin.microphones, calibration)
     ```
     """
-    view = create_view(surface, microphones)
-    true_points, estimated_points = view.chart(true, "true"), view.chart(found, "found")
+    surface_view = create_view(surface, microphones)
+    true_points, estimated_points = surface_view.chart(true, "true"), surface_view.chart(found, "found")
     if true_points.shape != estimated_points.shape:
         raise ValueError(
             f"true has {len(true_points)} places and found {len(estimated_points)}; give them pair by pair."
         )
     has_estimate = np.isfinite(estimated_points).all(axis=1)
-    error = 1e3 * np.linalg.norm(np.asarray(found, float) - np.asarray(true, float), axis=1)[has_estimate]
+    errors_mm = 1e3 * np.linalg.norm(np.asarray(found, float) - np.asarray(true, float), axis=1)[has_estimate]
     ax = get_or_create_axes(ax)
-    handles = draw_surface(ax, view)
+    legend_handles = draw_surface(ax, surface_view)
     ax.add_collection(
         LineCollection(
             list(np.stack([true_points, estimated_points], axis=1)[has_estimate]),
@@ -73,11 +73,11 @@ def plot_position_errors(
         )
     )
     marker_style = {"marker": "o", "linestyle": "none", "markersize": 4.2}
-    handles += ax.plot(
+    legend_handles += ax.plot(
         *true_points[has_estimate].T, color=DARK_GREY, markeredgewidth=0, zorder=4, label="true", **marker_style
     )
     if not has_estimate.all():
-        handles += ax.plot(
+        legend_handles += ax.plot(
             *true_points[~has_estimate].T,
             color=DARK_GREY,
             fillstyle="none",
@@ -85,7 +85,7 @@ def plot_position_errors(
             label="not found",
             **marker_style,
         )
-    handles += ax.plot(
+    legend_handles += ax.plot(
         *estimated_points[has_estimate].T,
         color=ESTIMATE_COLOUR,
         markeredgewidth=0,
@@ -93,9 +93,9 @@ def plot_position_errors(
         label="estimated",
         **marker_style,
     )
-    draw_legend(ax, handles)
+    draw_legend(ax, legend_handles)
     if title is None:
-        title = f"{error.mean():.1f} ± {error.std():.1f} mm" if error.size else "none found"
+        title = f"{errors_mm.mean():.1f} ± {errors_mm.std():.1f} mm" if errors_mm.size else "none found"
     ax.set_title(title)
     return ax
 
@@ -145,23 +145,36 @@ def plot_error_curve(
     check_kind("errors", errors, Mapping, "{name: errors}")
     if not 1 <= len(errors) <= len(SERIES_COLOURS):
         raise ValueError(f"errors has {len(errors)} methods; give 1 to {len(SERIES_COLOURS)}, {{name: errors}}.")
-    check_name("statistic", statistic, _STATISTICS)
-    error_rows = {name: _errors_in_millimetres(array, f"errors['{name}']", x.size) for name, array in errors.items()}
-    bound_values = None if bound is None else _STATISTICS[statistic](_errors_in_millimetres(bound, "bound", x.size))
+    check_name("statistic", statistic, _ERROR_STATISTICS)
+    errors_by_method = {
+        method_name: _errors_in_millimetres(method_errors, f"errors['{method_name}']", x.size)
+        for method_name, method_errors in errors.items()
+    }
+    bound_values = (
+        None if bound is None else _ERROR_STATISTICS[statistic](_errors_in_millimetres(bound, "bound", x.size))
+    )
     sort_order = np.argsort(x)
     ax = get_or_create_axes(ax, (5.8, 4.2))
     ax.set_yscale("log")
-    for (name, rows), colour, marker in zip(error_rows.items(), SERIES_COLOURS, SERIES_MARKERS, strict=False):
-        line_style = {"color": colour, "marker": marker, "markersize": 5, "linewidth": 1.8, "zorder": 3}
-        ax.plot(x[sort_order], _STATISTICS[statistic](rows)[sort_order], label=name, **line_style)
-        if rows.shape[1] > 1:
-            low, high = np.nanquantile(rows, [0.25, 0.75], axis=1)
+    for (method_name, error_rows), method_colour, method_marker in zip(
+        errors_by_method.items(), SERIES_COLOURS, SERIES_MARKERS, strict=False
+    ):
+        line_style = {"color": method_colour, "marker": method_marker, "markersize": 5, "linewidth": 1.8, "zorder": 3}
+        ax.plot(x[sort_order], _ERROR_STATISTICS[statistic](error_rows)[sort_order], label=method_name, **line_style)
+        if error_rows.shape[1] > 1:
+            lower_quartile, upper_quartile = np.nanquantile(error_rows, [0.25, 0.75], axis=1)
             ax.fill_between(
-                x[sort_order], low[sort_order], high[sort_order], color=colour, alpha=0.18, linewidth=0, zorder=2
+                x[sort_order],
+                lower_quartile[sort_order],
+                upper_quartile[sort_order],
+                color=method_colour,
+                alpha=0.18,
+                linewidth=0,
+                zorder=2,
             )
     if bound_values is not None:
-        style = {"color": DARK_GREY, "linewidth": 1.4, "linestyle": (0, (4, 3)), "zorder": 4}
-        ax.plot(x[sort_order], bound_values[sort_order], label="Cramér-Rao bound", **style)
+        bound_style = {"color": DARK_GREY, "linewidth": 1.4, "linestyle": (0, (4, 3)), "zorder": 4}
+        ax.plot(x[sort_order], bound_values[sort_order], label="Cramér-Rao bound", **bound_style)
     ax.set_xlabel(quantity, color=DARK_GREY)
     ax.set_ylabel({"rms": "RMS error (mm)"}.get(statistic, f"{statistic.capitalize()} error (mm)"), color=DARK_GREY)
     ax.set_title(title or "")
@@ -170,28 +183,32 @@ def plot_error_curve(
     return ax
 
 
-def _mark_axes(ax: Axes, x: np.ndarray, logarithmic: bool) -> None:
+def _mark_axes(ax: Axes, x: np.ndarray, is_logarithmic: bool) -> None:
     """Set the ticks and grid lines of the axes of an error curve with abscissae `x`."""
-    if logarithmic:
+    if is_logarithmic:
         ax.set_xscale("log", base=2)
         ax.set_xticks(x)
         ax.minorticks_off()
-        ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        ax.xaxis.set_major_formatter(lambda tick_value, _: f"{tick_value:g}")
     else:
         ax.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 2.5, 5, 10]))
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    ax.yaxis.set_major_formatter(lambda tick_value, _: f"{tick_value:g}")
     ax.yaxis.set_minor_formatter(NullFormatter())
     style_graph_axes(ax)
     draw_horizontal_grid(ax)
 
 
-def _errors_in_millimetres(errors: ArrayLike, name: str, num_values: int) -> np.ndarray:
+def _errors_in_millimetres(errors: ArrayLike, argument_name: str, num_values: int) -> np.ndarray:
     """Convert errors in metres, (K,) or (K, N), to an array (K, N) in millimetres, and check its shape and values."""
-    array = np.asarray(errors, float)
-    rows = array[:, None] if array.ndim == 1 else array
-    if rows.ndim != 2 or len(rows) != num_values or not rows.shape[1]:
-        raise ValueError(f"{name} has shape {array.shape}; give ({num_values},) or ({num_values}, places), in metres.")
-    if (rows < 0).any() or not np.isfinite(rows).any(axis=1).all():
-        raise ValueError(f"{name}: errors are distances, not negative, and every row needs one that is finite.")
-    return 1e3 * rows
+    error_array = np.asarray(errors, float)
+    error_rows = error_array[:, None] if error_array.ndim == 1 else error_array
+    if error_rows.ndim != 2 or len(error_rows) != num_values or not error_rows.shape[1]:
+        raise ValueError(
+            f"{argument_name} has shape {error_array.shape}; give ({num_values},) or ({num_values}, places), in metres."
+        )
+    if (error_rows < 0).any() or not np.isfinite(error_rows).any(axis=1).all():
+        raise ValueError(
+            f"{argument_name}: errors are distances, not negative, and every row needs one that is finite."
+        )
+    return 1e3 * error_rows

@@ -42,8 +42,8 @@ class View(NamedTuple):
     @property
     def extent(self) -> tuple[float, float, float, float]:
         """Bounding box (x_min, x_max, y_min, y_max) of the surface's outline in metres."""
-        (left, bottom), (right, top) = bounding_box(self.surface)
-        return float(left), float(right), float(bottom), float(top)
+        (x_min, y_min), (x_max, y_max) = bounding_box(self.surface)
+        return float(x_min), float(x_max), float(y_min), float(y_max)
 
     def chart(self, points: ArrayLike, name: str) -> np.ndarray:
         """Chart coordinates (n, 2) of `points` (n, d) in metres. Raises `ValueError` for other shapes; `name` is the
@@ -65,12 +65,12 @@ class View(NamedTuple):
 
         Raises `ValueError` for a different shape; `name` is the argument's name in the message.
         """
-        matrix, dimension = np.asarray(covariance, float), self.surface.dimension
-        if matrix.shape != (dimension, dimension):
-            raise ValueError(f"{name} has shape {matrix.shape}; give ({dimension}, {dimension}) in m².")
-        _, derivatives = slopes(self.surface.project, np.asarray(point, float)[:, None])
-        jacobian = np.concatenate(derivatives, axis=1)
-        return jacobian @ matrix @ jacobian.T
+        space_covariance, dimension = np.asarray(covariance, float), self.surface.dimension
+        if space_covariance.shape != (dimension, dimension):
+            raise ValueError(f"{name} has shape {space_covariance.shape}; give ({dimension}, {dimension}) in m².")
+        _, chart_derivatives = slopes(self.surface.project, np.asarray(point, float)[:, None])
+        jacobian = np.concatenate(chart_derivatives, axis=1)
+        return jacobian @ space_covariance @ jacobian.T
 
 
 def create_view(surface: AnySurface, microphones: ArrayLike | None = None, usable: ArrayLike | None = None) -> View:
@@ -86,13 +86,15 @@ def create_view(surface: AnySurface, microphones: ArrayLike | None = None, usabl
         microphones = surface.microphones if microphones is None else microphones
         surface = surface.surface
     host_surface: AbstractSurface = on_host(surface if isinstance(surface, AbstractSurface) else make_surface(surface))
-    positions = np.zeros((0, 2)) if microphones is None else project_to_chart(host_surface, microphones, "microphones")
-    usable_mask = np.ones(len(positions), bool) if usable is None else np.asarray(usable, bool)
-    if usable_mask.shape != (len(positions),):
+    microphone_positions = (
+        np.zeros((0, 2)) if microphones is None else project_to_chart(host_surface, microphones, "microphones")
+    )
+    is_usable = np.ones(len(microphone_positions), bool) if usable is None else np.asarray(usable, bool)
+    if is_usable.shape != (len(microphone_positions),):
         raise ValueError(
-            f"usable has shape {usable_mask.shape}; give one for each of the {len(positions)} microphones."
+            f"usable has shape {is_usable.shape}; give one for each of the {len(microphone_positions)} microphones."
         )
-    return View(host_surface, positions, usable_mask)
+    return View(host_surface, microphone_positions, is_usable)
 
 
 def project_to_chart(surface: AbstractSurface, points: ArrayLike, name: str) -> np.ndarray:
@@ -106,8 +108,11 @@ def project_to_chart(surface: AbstractSurface, points: ArrayLike, name: str) -> 
 
 def outline_path(view: View) -> Path:
     """Path of the surface's outline and its holes in chart coordinates."""
-    loops = (Path(np.concatenate([loop, loop[:1]]), closed=True) for loop in view.surface.outline.loops())
-    return Path.make_compound_path(*loops)
+    closed_loops = (
+        Path(np.concatenate([outline_loop, outline_loop[:1]]), closed=True)
+        for outline_loop in view.surface.outline.loops()
+    )
+    return Path.make_compound_path(*closed_loops)
 
 
 def draw_surface(ax: Axes, view: View, *, microphones: bool = True, is_faint: bool = False) -> list[Line2D]:
@@ -119,18 +124,18 @@ def draw_surface(ax: Axes, view: View, *, microphones: bool = True, is_faint: bo
     # Microphones may lie outside the outline.
     shown_points = np.concatenate([np.reshape(view.extent, (2, 2)).T, view.microphones])
     x_min, x_max, y_min, y_max = extent_of(shown_points)
-    margin = 0.06 * max(x_max - x_min, y_max - y_min)
+    axes_margin = 0.06 * max(x_max - x_min, y_max - y_min)
     hide_axes(ax, (x_min, x_max, y_min, y_max))
     # The scale bar is closer to the outline than in plots of electrodes, since no labels are drawn outside the outline.
-    draw_scale_bar(ax, (x_min + margin, x_max, y_min + margin, y_max))
-    ax.set_xlim(x_min - 0.5 * margin, x_max + 0.5 * margin)
-    ax.set_ylim(y_min - 2 * margin, y_max + 0.5 * margin)
+    draw_scale_bar(ax, (x_min + axes_margin, x_max, y_min + axes_margin, y_max))
+    ax.set_xlim(x_min - 0.5 * axes_margin, x_max + 0.5 * axes_margin)
+    ax.set_ylim(y_min - 2 * axes_margin, y_max + 0.5 * axes_margin)
     if not microphones:
         return []
-    handles = []
-    style = {"marker": "o", "linestyle": "none", "markersize": 6.5, "zorder": 2.5, "label": "microphone"}
-    style |= {"markerfacecolor": "none", "markeredgewidth": 1.0} if is_faint else {"markeredgewidth": 0.8}
-    style |= (
+    legend_handles = []
+    dot_style = {"marker": "o", "linestyle": "none", "markersize": 6.5, "zorder": 2.5, "label": "microphone"}
+    dot_style |= {"markerfacecolor": "none", "markeredgewidth": 1.0} if is_faint else {"markeredgewidth": 0.8}
+    dot_style |= (
         {"markeredgecolor": LIGHT_GREY}
         if is_faint
         else {"markerfacecolor": MICROPHONE_COLOUR, "markeredgecolor": "white"}
@@ -144,21 +149,21 @@ def draw_surface(ax: Axes, view: View, *, microphones: bool = True, is_faint: bo
         "zorder": 2.6,
     }
     if view.usable.any():
-        handles += ax.plot(*view.microphones[view.usable].T, **style)
+        legend_handles += ax.plot(*view.microphones[view.usable].T, **dot_style)
     if not view.usable.all():
-        handles += ax.plot(*view.microphones[~view.usable].T, **cross_style, label="not usable")
-    return handles
+        legend_handles += ax.plot(*view.microphones[~view.usable].T, **cross_style, label="not usable")
+    return legend_handles
 
 
 def draw_ellipse(ax: Axes, centre: np.ndarray, covariance: np.ndarray, *, colour: str = ESTIMATE_COLOUR) -> None:
     """Draw the 95 % ellipse of a normal distribution with mean `centre` (2,) in metres and `covariance` (2, 2) in
     m²."""
-    variances, axes = np.linalg.eigh(covariance)
-    major_axis, minor_axis = 2 * _ELLIPSE_RADIUS * np.sqrt(np.maximum(variances[::-1], 0))
-    angle = np.degrees(np.arctan2(axes[1, 1], axes[0, 1]))
+    axis_variances, principal_axes = np.linalg.eigh(covariance)
+    major_axis, minor_axis = 2 * _ELLIPSE_RADIUS * np.sqrt(np.maximum(axis_variances[::-1], 0))
+    rotation_degrees = np.degrees(np.arctan2(principal_axes[1, 1], principal_axes[0, 1]))
     x, y = centre
     ellipse = Ellipse(
-        (x, y), major_axis, minor_axis, angle=angle, fill=False, edgecolor=colour, linewidth=1.4, zorder=4
+        (x, y), major_axis, minor_axis, angle=rotation_degrees, fill=False, edgecolor=colour, linewidth=1.4, zorder=4
     )
     ellipse.set_path_effects([*HALO])
     ax.add_patch(ellipse)
@@ -170,14 +175,16 @@ def draw_legend(ax: Axes, handles: list) -> None:
     if not handles:
         return
     # A legend entry takes 0.45 inches for a marker with its gaps, and 0.065 inches for each letter.
-    widths = [0.45 + 0.065 * len(str(handle.get_label())) for handle in handles]
+    entry_widths = [0.45 + 0.065 * len(str(legend_handle.get_label())) for legend_handle in handles]
     available_width = ax.bbox.width / ax.figure.dpi
-    columns = len(handles) if sum(widths) <= available_width else max(1, int(available_width / max(widths)))
+    num_columns = (
+        len(handles) if sum(entry_widths) <= available_width else max(1, int(available_width / max(entry_widths)))
+    )
     ax.legend(
         handles=handles,
         loc="upper center",
         bbox_to_anchor=(0.5, 0.0),
-        ncols=columns,
+        ncols=num_columns,
         frameon=False,
         borderpad=0,
         borderaxespad=0,

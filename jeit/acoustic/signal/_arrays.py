@@ -24,8 +24,8 @@ def alternative_array_name(arrays: dict[str, np.ndarray], first_name: str, secon
     if first_name in arrays and second_name in arrays:
         raise ValueError(f"it holds both '{first_name}' and '{second_name}'; keep the one to use.")
     if second_name not in arrays and first_name not in arrays:
-        names = ", ".join(str(name) for name in arrays[""][:12]) or "nothing"
-        raise ValueError(f"there is neither '{second_name}' nor '{first_name}'; the file holds {names}.")
+        names_text = ", ".join(str(array_name) for array_name in arrays[""][:12]) or "nothing"
+        raise ValueError(f"there is neither '{second_name}' nor '{first_name}'; the file holds {names_text}.")
     return first_name if first_name in arrays else second_name
 
 
@@ -41,36 +41,38 @@ def convert_to_real_array(value, label: str, axes: str) -> np.ndarray:
     not real, a different number of axes, and empty arrays.
     """
     try:
-        array = np.asarray(value)
+        converted_array = np.asarray(value)
     except ValueError:
         raise ValueError(f"{label}: rows differ in length; give one array ({axes}).") from None
-    if array.dtype.kind not in "fiu":
-        raise ValueError(f"{label} is {array.dtype}; give real numbers.")
-    if array.ndim != axes.count(",") + 1:
-        raise ValueError(f"{label} has shape {array.shape}; give ({axes}).")
-    if array.size == 0:
-        raise ValueError(f"{label} is empty: its shape is {array.shape}.")
-    return array if array.dtype == np.float32 else array.astype(float, copy=False)
+    if converted_array.dtype.kind not in "fiu":
+        raise ValueError(f"{label} is {converted_array.dtype}; give real numbers.")
+    if converted_array.ndim != axes.count(",") + 1:
+        raise ValueError(f"{label} has shape {converted_array.shape}; give ({axes}).")
+    if converted_array.size == 0:
+        raise ValueError(f"{label} is empty: its shape is {converted_array.shape}.")
+    return converted_array if converted_array.dtype == np.float32 else converted_array.astype(float, copy=False)
 
 
 def real_number(value, label: str) -> float:
     """Convert a number, or an array with one element, to a float. Raises `ValueError` for other values."""
-    array = np.asarray(value)
-    if array.dtype.kind not in "fiu" or array.size != 1:
-        raise ValueError(f"{label} must be one real number; it is {array.dtype} of shape {array.shape}.")
-    return float(array.reshape(()))
+    converted_array = np.asarray(value)
+    if converted_array.dtype.kind not in "fiu" or converted_array.size != 1:
+        raise ValueError(
+            f"{label} must be one real number; it is {converted_array.dtype} of shape {converted_array.shape}."
+        )
+    return float(converted_array.reshape(()))
 
 
 def sampling_rate(value) -> float:
     """Return the sampling rate in Hz as a float. Raises `ValueError` if the rate is not a finite number, or too low to
     record touches."""
-    rate = real_number(value, "rate")
-    if not np.isfinite(rate) or rate < MIN_RATE:
+    rate_hz = real_number(value, "rate")
+    if not np.isfinite(rate_hz) or rate_hz < MIN_RATE:
         raise ValueError(
-            f"rate is {rate:g}; give the samples a second of each microphone in Hz (40000, not 40 kHz or 25 µs): "
+            f"rate is {rate_hz:g}; give the samples a second of each microphone in Hz (40000, not 40 kHz or 25 µs): "
             f"finite and at least {MIN_RATE:g}."
         )
-    return rate
+    return rate_hz
 
 
 def check_full_scale(value) -> float | None:
@@ -91,20 +93,22 @@ def check_coordinates(value, label: str, dimension: tuple[int, ...]) -> np.ndarr
             f"{label} has shape {points.shape}; give one row of 2 or 3 coordinates each, as many for microphones, "
             "outline and positions."
         )
-    invalid_rows = np.flatnonzero(~(np.abs(points) < _MAX_COORDINATE).all(axis=1))
-    if invalid_rows.size:
-        row = points[invalid_rows[0]].tolist()
-        raise ValueError(f"{label}: row {invalid_rows[0]} is {row}; every coordinate must be finite, in metres.")
+    invalid_points = np.flatnonzero(~(np.abs(points) < _MAX_COORDINATE).all(axis=1))
+    if invalid_points.size:
+        invalid_point = points[invalid_points[0]].tolist()
+        raise ValueError(
+            f"{label}: row {invalid_points[0]} is {invalid_point}; every coordinate must be finite, in metres."
+        )
     return points
 
 
 def check_extent(points: np.ndarray, label: str) -> None:
     """Raise `ValueError` if the extent of points (n, d) along an axis exceeds the maximum plausible length of a
     skin."""
-    largest_side = np.ptp(points, axis=0).max()
-    if largest_side > MAX_SKIN_LENGTH:
+    largest_extent = np.ptp(points, axis=0).max()
+    if largest_extent > MAX_SKIN_LENGTH:
         raise ValueError(
-            f"{label} spread over {largest_side:.4g}: are these metres? Divide millimetres by 1000; no side may be "
+            f"{label} spread over {largest_extent:.4g}: are these metres? Divide millimetres by 1000; no side may be "
             f"longer than {MAX_SKIN_LENGTH:g} m."
         )
 
@@ -112,35 +116,38 @@ def check_extent(points: np.ndarray, label: str) -> None:
 def check_microphones(positions: np.ndarray, skin: np.ndarray) -> None:
     """Raise `ValueError` if two microphones with `positions` (M, d) coincide, or if a microphone is farther from the
     bounding box of the points `skin` (n, d) than the length of this box. All coordinates are in metres."""
-    low, high = skin.min(axis=0), skin.max(axis=0)
-    largest_side = (high - low).max()
-    distances = np.linalg.norm(positions - np.clip(positions, low, high), axis=1)
-    farthest_index = int(distances.argmax())
-    if distances[farthest_index] > largest_side:
+    lowest_coordinates, highest_coordinates = skin.min(axis=0), skin.max(axis=0)
+    largest_skin_side = (highest_coordinates - lowest_coordinates).max()
+    distances_from_skin = np.linalg.norm(
+        positions - np.clip(positions, lowest_coordinates, highest_coordinates), axis=1
+    )
+    farthest_microphone = int(distances_from_skin.argmax())
+    if distances_from_skin[farthest_microphone] > largest_skin_side:
         raise ValueError(
-            f"microphones: number {farthest_index} at {positions[farthest_index].tolist()} is "
-            f"{distances[farthest_index]:.3g} m away from a skin that is only {largest_side:.3g} m long: are these "
-            "metres, in the outline's coordinates? Divide millimetres by 1000."
+            f"microphones: number {farthest_microphone} at {positions[farthest_microphone].tolist()} is "
+            f"{distances_from_skin[farthest_microphone]:.3g} m away from a skin that is only {largest_skin_side:.3g} m "
+            "long: are these metres, in the outline's coordinates? Divide millimetres by 1000."
         )
-    pairs = sorted(KDTree(positions).query_pairs(_MIN_SPACING))
-    if pairs:
-        first_index, second_index = pairs[0]
+    coincident_pairs = sorted(KDTree(positions).query_pairs(_MIN_SPACING))
+    if coincident_pairs:
+        first_microphone, second_microphone = coincident_pairs[0]
         raise ValueError(
-            f"microphones: numbers {first_index} and {second_index} are at the same place, "
-            f"{positions[first_index].tolist()}; give each its own."
+            f"microphones: numbers {first_microphone} and {second_microphone} are at the same place, "
+            f"{positions[first_microphone].tolist()}; give each its own."
         )
 
 
 def check_taps(positions: np.ndarray, outline: np.ndarray) -> None:
     """Raise `ValueError` if one of the taps at `positions` (T, 2) is outside the `outline` (K, 2) by more than 5 % of
     the skin's length."""
-    largest_side = np.ptp(outline, axis=0).max()
-    indices_outside = np.flatnonzero(~is_inside_loops(positions, [outline]))
-    distances = distance(positions[indices_outside], outline, np.roll(outline, -1, axis=0)).min(axis=1)
-    if indices_outside.size and distances.max() > _MAX_RELATIVE_DISTANCE_OUTSIDE * largest_side:
-        row = int(indices_outside[distances.argmax()])
+    largest_skin_side = np.ptp(outline, axis=0).max()
+    taps_outside = np.flatnonzero(~is_inside_loops(positions, [outline]))
+    distances_from_outline = distance(positions[taps_outside], outline, np.roll(outline, -1, axis=0)).min(axis=1)
+    if taps_outside.size and distances_from_outline.max() > _MAX_RELATIVE_DISTANCE_OUTSIDE * largest_skin_side:
+        farthest_tap = int(taps_outside[distances_from_outline.argmax()])
         raise ValueError(
-            f"positions: row {row}, {positions[row].tolist()}, is {1e3 * distances.max():.3g} mm outside the outline; "
-            f"taps must be on the skin, or within {1e3 * _MAX_RELATIVE_DISTANCE_OUTSIDE * largest_side:.3g} mm of it. "
-            "Correct the place, or leave the tap out."
+            f"positions: row {farthest_tap}, {positions[farthest_tap].tolist()}, is "
+            f"{1e3 * distances_from_outline.max():.3g} mm outside the outline; taps must be on the skin, or within "
+            f"{1e3 * _MAX_RELATIVE_DISTANCE_OUTSIDE * largest_skin_side:.3g} mm of it. Correct the place, or leave the "
+            "tap out."
         )

@@ -41,13 +41,13 @@ def sample_faults(
     rate in Hz. `full_scale`: largest possible magnitude of a sample, or None if unknown.
     """
     fault_codes = np.zeros(samples.shape, np.uint8)
-    is_finite = np.isfinite(samples)
-    has_only_finite_samples = bool(is_finite.all())
+    is_finite_sample = np.isfinite(samples)
+    has_only_finite_samples = bool(is_finite_sample.all())
     if not has_only_finite_samples:
-        fault_codes[~is_finite] = NOT_FINITE
-        if not is_finite.any():
+        fault_codes[~is_finite_sample] = NOT_FINITE
+        if not is_finite_sample.any():
             return fault_codes, "dead: every sample is NaN or infinite"
-        samples = np.where(is_finite, samples, np.nan)
+        samples = np.where(is_finite_sample, samples, np.nan)
     min_sample, max_sample = np.fmin.reduce(samples), np.fmax.reduce(samples)
     if min_sample == max_sample:
         return fault_codes, f"dead: every {'' if has_only_finite_samples else 'finite '}sample is {min_sample:g}"
@@ -71,97 +71,104 @@ def window_faults(
     along the last axis. A window with at least one faulty sample is not usable.
     """
     num_windows = 1 + (fault_codes.shape[-1] - length) // hop
-    usable = np.ones((*fault_codes.shape[:-1], num_windows), bool)
+    is_usable_window = np.ones((*fault_codes.shape[:-1], num_windows), bool)
     if dead_reason:
-        return np.zeros_like(usable), dead_reason
+        return np.zeros_like(is_usable_window), dead_reason
     if not fault_codes.any():
-        return usable, ""
+        return is_usable_window, ""
     window_starts = hop * np.arange(num_windows)
-    reasons = []
-    for code, fault_name in _FAULT_DESCRIPTIONS.items():
-        counts = np.cumsum(fault_codes == code, axis=-1)
-        counts = np.concatenate([np.zeros((*fault_codes.shape[:-1], 1), int), counts], axis=-1)
-        is_faulty = counts[..., window_starts + length] > counts[..., window_starts]
-        if is_faulty.any():
-            usable &= ~is_faulty
-            reasons.append(f"{fault_name} in {_format_share(is_faulty)} windows")
-    return usable, "; ".join(reasons)
+    fault_texts = []
+    for fault_code, fault_name in _FAULT_DESCRIPTIONS.items():
+        fault_counts = np.cumsum(fault_codes == fault_code, axis=-1)
+        fault_counts = np.concatenate([np.zeros((*fault_codes.shape[:-1], 1), int), fault_counts], axis=-1)
+        is_faulty_window = fault_counts[..., window_starts + length] > fault_counts[..., window_starts]
+        if is_faulty_window.any():
+            is_usable_window &= ~is_faulty_window
+            fault_texts.append(f"{fault_name} in {_format_share(is_faulty_window)} windows")
+    return is_usable_window, "; ".join(fault_texts)
 
 
 def intensity_faults(power: Float[np.ndarray, "F M"]) -> tuple[Bool[np.ndarray, "F M"], tuple[str, ...]]:
     """Return the mask of the usable intensities and a description of each channel's fault, for intensities `power`
     given without samples. Faults are NaN, infinity, and channels that contain only zeros."""
-    finite = np.isfinite(power)
-    dead_channels = ~(finite & (power != 0)).any(axis=0)
-    reasons = []
-    for channel, is_dead in zip(finite.T, dead_channels, strict=True):
-        if is_dead and channel.any():
-            reasons.append(f"dead: every {'' if channel.all() else 'finite '}intensity is 0")
+    is_finite_power = np.isfinite(power)
+    is_dead_channel = ~(is_finite_power & (power != 0)).any(axis=0)
+    fault_texts = []
+    for is_finite_channel, is_dead in zip(is_finite_power.T, is_dead_channel, strict=True):
+        if is_dead and is_finite_channel.any():
+            fault_texts.append(f"dead: every {'' if is_finite_channel.all() else 'finite '}intensity is 0")
         elif is_dead:
-            reasons.append("dead: every intensity is NaN or infinite")
+            fault_texts.append("dead: every intensity is NaN or infinite")
         else:
-            reasons.append("" if channel.all() else f"NaN or infinite in {_format_share(~channel)} windows")
-    return finite & ~dead_channels, tuple(reasons)
+            fault_texts.append(
+                "" if is_finite_channel.all() else f"NaN or infinite in {_format_share(~is_finite_channel)} windows"
+            )
+    return is_finite_power & ~is_dead_channel, tuple(fault_texts)
 
 
 def describe_faults(reasons: Sequence[str]) -> str:
     """Summarise the fault of each microphone ("" for none) in a line such as "microphones 0-2, 5: dead; microphone 3:
     …"."""
-    groups: dict[str, list[int]] = {}
-    for k, reason in enumerate(reasons):
-        if reason:
-            groups.setdefault(reason, []).append(k)
+    microphones_by_reason: dict[str, list[int]] = {}
+    for k, fault_reason in enumerate(reasons):
+        if fault_reason:
+            microphones_by_reason.setdefault(fault_reason, []).append(k)
     return "; ".join(
-        f"{'microphone' if len(indices) == 1 else 'microphones'} {_format_ranges(np.array(indices))}: {reason}"
-        for reason, indices in groups.items()
+        f"{'microphone' if len(microphone_indices) == 1 else 'microphones'} "
+        f"{_format_ranges(np.array(microphone_indices))}: {fault_reason}"
+        for fault_reason, microphone_indices in microphones_by_reason.items()
     )
 
 
-def _format_ranges(numbers: np.ndarray) -> str:
+def _format_ranges(increasing_numbers: np.ndarray) -> str:
     """Format increasing integers as ranges: 0, 1, 2, 5 as "0-2, 5"."""
-    runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
-    return ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
+    number_runs = np.split(increasing_numbers, np.flatnonzero(np.diff(increasing_numbers) > 1) + 1)
+    return ", ".join(
+        f"{number_run[0]}-{number_run[-1]}" if len(number_run) > 1 else f"{number_run[0]}" for number_run in number_runs
+    )
 
 
-def _format_share(mask: np.ndarray) -> str:
-    return f"all {mask.size}" if mask.all() else f"{int(mask.sum())} of {mask.size}"
+def _format_share(has_fault: np.ndarray) -> str:
+    return f"all {has_fault.size}" if has_fault.all() else f"{int(has_fault.sum())} of {has_fault.size}"
 
 
-def _true_runs(mask: Bool[np.ndarray, " S"]) -> Shaped[np.ndarray, "2 R"]:
-    """Start and end indices (2, R) of the R runs of True in `mask`; the end is exclusive."""
-    change = np.flatnonzero(np.diff(mask, prepend=False, append=False))
-    return np.stack([change[::2], change[1::2]])
+def _true_runs(is_in_run: Bool[np.ndarray, " S"]) -> Shaped[np.ndarray, "2 R"]:
+    """Start and end indices (2, R) of the R runs of True in `is_in_run`; the end is exclusive."""
+    change_indices = np.flatnonzero(np.diff(is_in_run, prepend=False, append=False))
+    return np.stack([change_indices[::2], change_indices[1::2]])
 
 
 def _converter_step(samples: np.ndarray) -> float:
     """Step of the analogue-to-digital converter: the smallest nonzero difference between successive samples."""
-    change = np.abs(np.diff(samples))
-    return float(np.fmin.reduce(np.where(change > 0, change, np.inf)))
+    sample_changes = np.abs(np.diff(samples))
+    return float(np.fmin.reduce(np.where(sample_changes > 0, sample_changes, np.inf)))
 
 
 def _stuck_samples(samples: np.ndarray, rate: float, sample_range: float) -> Bool[np.ndarray, " S"] | None:
     """Mask of the stuck samples, those in long constant stretches; None if no sample is stuck, or if the signal also
     comes to rest elsewhere. `sample_range`: difference between the largest and smallest sample."""
-    min_length = max(_MIN_STUCK_SAMPLES, round(_MIN_STUCK_DURATION * rate))
+    min_stuck_length = max(_MIN_STUCK_SAMPLES, round(_MIN_STUCK_DURATION * rate))
     # A stuck stretch covers at least two whole blocks. Stretches are searched for only if a block is constant, which
     # saves time.
-    block = min_length // 4
-    blocks = samples[: samples.size // block * block].reshape(-1, block)
-    block_ranges = blocks.max(axis=1) - blocks.min(axis=1)
+    block_length = min_stuck_length // 4
+    sample_blocks = samples[: samples.size // block_length * block_length].reshape(-1, block_length)
+    block_ranges = sample_blocks.max(axis=1) - sample_blocks.min(axis=1)
     if not (block_ranges == 0).any():
         return None
     # Each flag stands for a pair of equal successive samples, so a run of n flags is a stretch of n + 1 samples.
     run_starts, run_ends = _true_runs(samples[1:] == samples[:-1])
-    is_long_run = run_ends - run_starts + 1 >= min_length
+    is_long_run = run_ends - run_starts + 1 >= min_stuck_length
     if not is_long_run.any():
         return None
     is_stuck = np.zeros(samples.shape, bool)
-    for first_flag, last_flag in zip(run_starts[is_long_run], run_ends[is_long_run], strict=True):
-        is_stuck[first_flag : last_flag + 1] = True
+    for first_stuck_sample, last_stuck_sample in zip(run_starts[is_long_run], run_ends[is_long_run], strict=True):
+        is_stuck[first_stuck_sample : last_stuck_sample + 1] = True
     # Silence can be constant too: with a coarse converter, or in a simulation without noise. The sound then fades into
     # silence, so that some other blocks are almost constant. In a stuck channel with noise, no other block is almost
     # constant.
-    is_varying_block = ~is_stuck[: blocks.size].reshape(blocks.shape).any(axis=1) & np.isfinite(block_ranges)
+    is_varying_block = ~is_stuck[: sample_blocks.size].reshape(sample_blocks.shape).any(axis=1) & np.isfinite(
+        block_ranges
+    )
     max_resting_range = max(
         _MAX_SILENCE_CONVERTER_STEPS * _converter_step(samples), _MAX_RELATIVE_SILENCE_RANGE * sample_range
     )
@@ -173,49 +180,56 @@ def _clipped_samples(samples: np.ndarray, full_scale: float | None) -> Bool[np.n
     is cut off."""
     min_sample, max_sample = np.fmin.reduce(samples), np.fmax.reduce(samples)
     is_clipped = None
-    step = samples_per_value = 0.0
-    for sign, peak in ((1.0, max_sample), (-1.0, -min_sample)):
+    converter_step = samples_per_value = 0.0
+    for peak_sign, peak_magnitude in ((1.0, max_sample), (-1.0, -min_sample)):
         ranges_below_top = [_RELATIVE_DISTANCE_FROM_TOP * (max_sample - min_sample)]
-        if full_scale is not None and peak >= (1 - _FULL_SCALE_DISTANCE_FROM_TOP) * full_scale:
-            ranges_below_top.append(peak - (1 - _FULL_SCALE_DISTANCE_FROM_TOP) * full_scale)
-        distance_below_top = peak - sign * samples
+        if full_scale is not None and peak_magnitude >= (1 - _FULL_SCALE_DISTANCE_FROM_TOP) * full_scale:
+            ranges_below_top.append(peak_magnitude - (1 - _FULL_SCALE_DISTANCE_FROM_TOP) * full_scale)
+        distance_below_top = peak_magnitude - peak_sign * samples
         # Most channels need no further test, since they have too few samples near the end of the range to be clipped.
         if np.count_nonzero(distance_below_top <= max(ranges_below_top)) < _MIN_CLIPPED_PEAK_VALUES:
             continue
         if not samples_per_value:
-            step, samples_per_value = _converter_step(samples), _samples_per_value(samples)
+            converter_step, samples_per_value = _converter_step(samples), _samples_per_value(samples)
         for range_below_top in ranges_below_top:
-            is_near_top = distance_below_top <= range_below_top + step
-            if _has_clipped_peak(distance_below_top, is_near_top, range_below_top + 2 * step, samples_per_value):
+            is_near_top = distance_below_top <= range_below_top + converter_step
+            if _has_clipped_peak(
+                distance_below_top, is_near_top, range_below_top + 2 * converter_step, samples_per_value
+            ):
                 is_clipped = is_near_top if is_clipped is None else is_clipped | is_near_top
     return is_clipped
 
 
 def _has_clipped_peak(
-    distance_below_top: np.ndarray, is_near_top: Bool[np.ndarray, " S"], height: float, samples_per_value: float
+    distance_below_top: np.ndarray, is_near_top: Bool[np.ndarray, " S"], peak_height: float, samples_per_value: float
 ) -> bool:
     """Whether any run of samples in the mask `is_near_top` is a clipped peak.
 
     `distance_below_top` (S,): distance of each sample below the top. `samples_per_value`: number of samples per
-    converted value. An unclipped peak is nearly a parabola: if n successive converted values stay within `height` of
-    the top, then k values later the peak has fallen by at most `height` · ((n - 1 + 2k) / (n - 1))². A clipped peak
-    falls by much more, about the height that was cut off. Slow or loud peaks are thus accepted, however many samples
-    are near the top, and so is a single value that the converter holds for several samples.
+    converted value. An unclipped peak is nearly a parabola: if n successive converted values stay within `peak_height`
+    of the top, then k values later the peak has fallen by at most `peak_height` · ((n - 1 + 2k) / (n - 1))². A clipped
+    peak falls by much more, about the height that was cut off. Slow or loud peaks are thus accepted, however many
+    samples are near the top, and so is a single value that the converter holds for several samples.
     """
     run_starts, run_ends = _true_runs(is_near_top)
     values_per_run = (run_ends - run_starts) / samples_per_value
     for run_index in np.flatnonzero(values_per_run >= _MIN_CLIPPED_PEAK_VALUES):
-        num_values, run_start, run_end = values_per_run[run_index], run_starts[run_index], run_ends[run_index]
-        num_values_beyond = max(1, int(num_values) // 2)
+        num_peak_values, run_start, run_end = values_per_run[run_index], run_starts[run_index], run_ends[run_index]
+        num_values_beyond = max(1, int(num_peak_values) // 2)
         num_samples_beyond = int(num_values_beyond * samples_per_value)
-        sides = (
+        samples_beside_run = (
             distance_below_top[max(0, run_start - num_samples_beyond) : run_start],
             distance_below_top[run_end : run_end + num_samples_beyond],
         )
-        smallest_fall = min(np.fmax.reduce(side) if side.size else np.inf for side in sides)
+        smallest_fall = min(
+            np.fmax.reduce(samples_on_side) if samples_on_side.size else np.inf
+            for samples_on_side in samples_beside_run
+        )
         if (
             smallest_fall
-            > _MIN_CLIPPED_PEAK_FALL_RATIO * height * ((num_values - 1 + 2 * num_values_beyond) / (num_values - 1)) ** 2
+            > _MIN_CLIPPED_PEAK_FALL_RATIO
+            * peak_height
+            * ((num_peak_values - 1 + 2 * num_values_beyond) / (num_peak_values - 1)) ** 2
         ):
             return True
     return False
@@ -224,5 +238,5 @@ def _has_clipped_peak(
 def _samples_per_value(samples: np.ndarray) -> float:
     """Number of samples for which the converter holds each value, estimated as the 5 % quantile of the lengths of
     constant runs."""
-    lengths = np.diff(np.flatnonzero(samples[1:] != samples[:-1]))
-    return float(np.partition(lengths, lengths.size // 20)[lengths.size // 20]) if lengths.size else 1.0
+    run_lengths = np.diff(np.flatnonzero(samples[1:] != samples[:-1]))
+    return float(np.partition(run_lengths, run_lengths.size // 20)[run_lengths.size // 20]) if run_lengths.size else 1.0

@@ -56,62 +56,66 @@ def window_grid(settings, rate: float, num_samples: int | None, name: str) -> Wi
     `num_samples`: number of samples of the recording, if known; `name`: name of the recording in messages. Raises
     `ValueError` if band, window, rate and number of samples are not compatible.
     """
-    length, hop = round(settings.window * rate), max(1, round(settings.hop * rate))
+    window_length, hop_length = round(settings.window * rate), max(1, round(settings.hop * rate))
     if settings.high > rate / 2:
         raise ValueError(
             f"{name}: the band {settings.low:g} to {settings.high:g} Hz reaches beyond half the rate of {rate:g} Hz; "
             f"set high to {rate / 2:g} Hz or less."
         )
-    num_band_bins = (settings.high - settings.low) * length / rate
+    num_band_bins = (settings.high - settings.low) * window_length / rate
     if num_band_bins < _MIN_BAND_BINS:
         raise ValueError(
             f"{name}: a window of {settings.window:g} s resolves frequencies {1 / settings.window:.3g} Hz apart: too "
             f"few in the band {settings.low:g} to {settings.high:g} Hz. Set window to "
             f"{_MIN_BAND_BINS / (settings.high - settings.low):.2g} s or more, or widen the band."
         )
-    if num_samples is not None and num_samples < length:
+    if num_samples is not None and num_samples < window_length:
         raise ValueError(
             f"{name}: {num_samples} samples at {rate:g} Hz last {num_samples / rate:.3g} s, less than one window of "
             f"{settings.window:g} s. Record longer, or shorten window=."
         )
     # The periodic Hann window is used instead of the symmetric window, since its transform is nonzero in three bins
     # only.
-    taper = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)
-    edges = np.clip((np.arange(length // 2 + 2) - 0.5) * rate / length, 0, rate / 2)
-    clipped_edges = np.clip(edges, settings.low, settings.high)
-    weights = np.diff(clipped_edges) * length / rate
-    (bin_indices,) = np.nonzero(weights)
-    weights = weights[bin_indices[0] : bin_indices[-1] + 1] * 2 / (length * (taper**2).sum())
-    return WindowGrid(length, hop, taper, int(bin_indices[0]), weights)
+    window_taper = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(window_length) / window_length)
+    bin_edges = np.clip((np.arange(window_length // 2 + 2) - 0.5) * rate / window_length, 0, rate / 2)
+    clipped_edges = np.clip(bin_edges, settings.low, settings.high)
+    bin_weights = np.diff(clipped_edges) * window_length / rate
+    (bin_indices,) = np.nonzero(bin_weights)
+    bin_weights = bin_weights[bin_indices[0] : bin_indices[-1] + 1] * 2 / (window_length * (window_taper**2).sum())
+    return WindowGrid(window_length, hop_length, window_taper, int(bin_indices[0]), bin_weights)
 
 
 def band_power(samples: np.ndarray, grid: WindowGrid) -> np.ndarray:
     """Band power (F, M) of the samples (M, S) of M microphones in F windows."""
-    finite = np.isfinite(samples)
-    if not finite.all():
+    is_finite_sample = np.isfinite(samples)
+    if not is_finite_sample.all():
         # The substituted values do not matter, since windows with samples that are not finite are marked as not usable.
-        samples = np.where(finite, samples, 0)
+        samples = np.where(is_finite_sample, samples, 0)
     # A large constant offset of the samples would cost precision. The remaining mean of each window is removed below.
     samples = samples - samples.mean(axis=1, keepdims=True, dtype=float)
-    windows = sliding_window_view(samples, grid.length, axis=-1)[:, :: grid.hop]
-    num_microphones, num_windows = windows.shape[:2]
+    sample_windows = sliding_window_view(samples, grid.length, axis=-1)[:, :: grid.hop]
+    num_microphones, num_windows = sample_windows.shape[:2]
     power = np.empty((num_windows, num_microphones))
     last_bin = grid.first + len(grid.weights)
     chunk_size = max(1, _MAX_CHUNK_SAMPLES // (num_microphones * grid.length))
     taper_spectrum = np.fft.rfft(grid.taper)[grid.first : last_bin]
     tapered_buffer = np.empty(num_microphones * min(chunk_size, num_windows) * grid.length)
-    for start in range(0, num_windows, chunk_size):
-        chunk = windows[:, start : start + chunk_size]
-        tapered_windows = np.multiply(chunk, grid.taper, out=tapered_buffer[: chunk.size].reshape(chunk.shape))
-        spectrum = np.asarray(scipy.fft.rfft(tapered_windows, workers=2))[..., grid.first : last_bin]
+    for first_window in range(0, num_windows, chunk_size):
+        window_chunk = sample_windows[:, first_window : first_window + chunk_size]
+        tapered_windows = np.multiply(
+            window_chunk, grid.taper, out=tapered_buffer[: window_chunk.size].reshape(window_chunk.shape)
+        )
+        window_spectra = np.asarray(scipy.fft.rfft(tapered_windows, workers=2))[..., grid.first : last_bin]
         if grid.first < 2:
             # In bins from 2 on, the transform of the Hann window is zero, and the mean of the window has no effect.
-            spectrum = spectrum - chunk.mean(axis=-1)[..., None] * taper_spectrum
-        power[start : start + chunk_size] = ((np.real(spectrum) ** 2 + np.imag(spectrum) ** 2) @ grid.weights).T
+            window_spectra = window_spectra - window_chunk.mean(axis=-1)[..., None] * taper_spectrum
+        power[first_window : first_window + chunk_size] = (
+            (np.real(window_spectra) ** 2 + np.imag(window_spectra) ** 2) @ grid.weights
+        ).T
     return power
 
 
-def _overlap_trace(grid: WindowGrid, lag_in_samples: int) -> float:
+def _overlap_trace(window_layout: WindowGrid, lag_in_samples: int) -> float:
     """Compute tr(A_0 A_lag) for the band-power matrices A of two windows `lag_in_samples` samples apart. The trace is
     half the covariance of the powers in the two windows for white noise of variance 1.
 
@@ -119,17 +123,17 @@ def _overlap_trace(grid: WindowGrid, lag_in_samples: int) -> float:
     r(d), where r is the autocorrelation of u_n = w_n w_(n+lag) over the overlap of the windows. No N × N matrix has to
     be formed.
     """
-    weights = np.zeros(grid.length // 2 + 1)
-    weights[grid.first : grid.first + len(grid.weights)] = grid.weights
+    spectral_weights = np.zeros(window_layout.length // 2 + 1)
+    spectral_weights[window_layout.first : window_layout.first + len(window_layout.weights)] = window_layout.weights
     # The inverse real transform counts all bins twice except the first and, for even N, the last.
-    weights[1 : (grid.length + 1) // 2] /= 2
-    squared = (grid.length * np.fft.irfft(weights, grid.length)) ** 2
-    taper_product = np.zeros(grid.length)
-    taper_product[: grid.length - lag_in_samples] = (
-        grid.taper[: grid.length - lag_in_samples] * grid.taper[lag_in_samples:]
+    spectral_weights[1 : (window_layout.length + 1) // 2] /= 2
+    squared_kernel = (window_layout.length * np.fft.irfft(spectral_weights, window_layout.length)) ** 2
+    taper_product = np.zeros(window_layout.length)
+    taper_product[: window_layout.length - lag_in_samples] = (
+        window_layout.taper[: window_layout.length - lag_in_samples] * window_layout.taper[lag_in_samples:]
     )
-    correlation = np.fft.irfft(np.abs(np.fft.rfft(taper_product)) ** 2, grid.length)
-    return float((squared * correlation).sum())
+    taper_correlation = np.fft.irfft(np.abs(np.fft.rfft(taper_product)) ** 2, window_layout.length)
+    return float((squared_kernel * taper_correlation).sum())
 
 
 def white_noise_degrees_of_freedom(grid: WindowGrid) -> float:
@@ -144,8 +148,8 @@ def noise_correlation(grid: WindowGrid, num_windows: int) -> Float[np.ndarray, "
     overlapping_lags = range(min(num_windows, -(-grid.length // grid.hop)))
     lag_traces = np.zeros(num_windows)
     lag_traces[: len(overlapping_lags)] = [_overlap_trace(grid, j * grid.hop) for j in overlapping_lags]
-    lags = np.abs(np.arange(num_windows)[:, None] - np.arange(num_windows))
-    return lag_traces[lags] / lag_traces[0]
+    window_lags = np.abs(np.arange(num_windows)[:, None] - np.arange(num_windows))
+    return lag_traces[window_lags] / lag_traces[0]
 
 
 # A tap is audible in a window if the loudness of the window is at least this fraction of the tap's maximum loudness.
@@ -176,17 +180,21 @@ class IntensitySettings(Module):
     hop: float = 0.0125
 
     def __check_init__(self):
-        for name in ("low", "high", "window", "hop"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not np.isfinite(value):
-                raise ValueError(f"{name} must be a finite number; it is {value!r}.")
+        for setting_name in ("low", "high", "window", "hop"):
+            setting_value = getattr(self, setting_name)
+            if (
+                isinstance(setting_value, bool)
+                or not isinstance(setting_value, (int, float, np.number))
+                or not np.isfinite(setting_value)
+            ):
+                raise ValueError(f"{setting_name} must be a finite number; it is {setting_value!r}.")
         if not 0 <= self.low < self.high:
             raise ValueError(
                 f"low= and high= must be a band in Hz, 0 ≤ low < high; they are {self.low} and {self.high}."
             )
-        for name in ("window", "hop"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, in seconds; it is {getattr(self, name)}.")
+        for setting_name in ("window", "hop"):
+            if not getattr(self, setting_name) > 0:
+                raise ValueError(f"{setting_name} must be positive, in seconds; it is {getattr(self, setting_name)}.")
         if self.hop > self.window:
             raise ValueError(
                 f"hop must be no longer than a window, or sound between windows is lost; they are {self.hop} and "
@@ -248,24 +256,31 @@ def intensities(
     check_kind("recording", recording, Recording, "a Recording of samples, as of read_recording(path)")
     check_settings("settings", settings)
     samples, rate = recording.samples, recording.rate
-    grid = window_grid(settings or IntensitySettings(), rate, samples.shape[-1], recording.name)
+    window_layout = window_grid(settings or IntensitySettings(), rate, samples.shape[-1], recording.name)
     fault_results = [
-        window_faults(*sample_faults(channel, rate, recording.full_scale), grid.length, grid.hop) for channel in samples
+        window_faults(
+            *sample_faults(channel_samples, rate, recording.full_scale), window_layout.length, window_layout.hop
+        )
+        for channel_samples in samples
     ]
-    usable = np.stack([usable_windows for usable_windows, _ in fault_results], axis=1)
-    power = band_power(samples, grid)
-    degrees_of_freedom = white_noise_degrees_of_freedom(grid)
-    noise = noise_floor(power, usable, degrees_of_freedom) if floor is None else _check_floor(floor, samples.shape[0])
-    times = (grid.hop * np.arange(len(power)) + grid.length / 2) / rate
-    faults = tuple(reason for _, reason in fault_results)
+    is_usable_window = np.stack([usable_windows for usable_windows, _ in fault_results], axis=1)
+    power = band_power(samples, window_layout)
+    degrees_of_freedom = white_noise_degrees_of_freedom(window_layout)
+    subtracted_floor = (
+        noise_floor(power, is_usable_window, degrees_of_freedom)
+        if floor is None
+        else _check_floor(floor, samples.shape[0])
+    )
+    window_times = (window_layout.hop * np.arange(len(power)) + window_layout.length / 2) / rate
+    fault_texts = tuple(fault_text for _, fault_text in fault_results)
     return Intensities(
-        times,
-        power - noise,
-        floor=noise,
+        window_times,
+        power - subtracted_floor,
+        floor=subtracted_floor,
         freedom=degrees_of_freedom,
-        overlap=grid.length / grid.hop,
-        usable=usable,
-        faults=faults,
+        overlap=window_layout.length / window_layout.hop,
+        usable=is_usable_window,
+        faults=fault_texts,
         name=recording.name,
     )
 
@@ -300,39 +315,50 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     check_settings("settings", settings)
     if taps.samples is None or taps.rate is None:
         assert taps.power is not None
-        usable, faults = intensity_faults(taps.power)
+        is_usable_window, fault_texts = intensity_faults(taps.power)
         num_taps, num_microphones = taps.power.shape
-        return TapIntensities(taps.power, np.zeros(num_microphones), np.full(num_taps, np.inf), usable, faults)
+        return TapIntensities(
+            taps.power, np.zeros(num_microphones), np.full(num_taps, np.inf), is_usable_window, fault_texts
+        )
     samples, rate = taps.samples, taps.rate
-    grid = window_grid(settings or IntensitySettings(), rate, samples.shape[-1], taps.name)
-    usable_masks, faults = [], []
+    window_layout = window_grid(settings or IntensitySettings(), rate, samples.shape[-1], taps.name)
+    usable_masks, fault_texts = [], []
     for m in range(samples.shape[1]):
         # All taps of a microphone are tested for faults together, since range, converter step and silence are
         # properties of the channel.
         fault_codes, dead_reason = sample_faults(samples[:, m].ravel(), rate, taps.full_scale)
-        mask, reason = window_faults(fault_codes.reshape(-1, samples.shape[-1]), dead_reason, grid.length, grid.hop)
-        usable_masks.append(mask)
-        faults.append(reason)
-    usable = np.stack(usable_masks, axis=-1)
-    power = np.stack([band_power(tap, grid) for tap in samples])
+        window_mask, fault_text = window_faults(
+            fault_codes.reshape(-1, samples.shape[-1]), dead_reason, window_layout.length, window_layout.hop
+        )
+        usable_masks.append(window_mask)
+        fault_texts.append(fault_text)
+    is_usable_window = np.stack(usable_masks, axis=-1)
+    power = np.stack([band_power(tap_samples, window_layout) for tap_samples in samples])
     num_taps, num_windows, num_microphones = power.shape
-    degrees_of_freedom = white_noise_degrees_of_freedom(grid)
-    floor = noise_floor(power.reshape(-1, num_microphones), usable.reshape(-1, num_microphones), degrees_of_freedom)
+    degrees_of_freedom = white_noise_degrees_of_freedom(window_layout)
+    estimated_floor = noise_floor(
+        power.reshape(-1, num_microphones), is_usable_window.reshape(-1, num_microphones), degrees_of_freedom
+    )
     # A minimum noise floor prevents a simulated channel without noise from dominating the loudness. Dead channels are
     # ignored.
-    is_alive = usable.any(axis=(0, 1))
-    positive_floor = np.maximum(floor, max(1e-9 * power.max(), np.finfo(float).tiny))
-    loudness = np.where(is_alive, power / positive_floor - floor / positive_floor, 0).sum(axis=-1)
-    is_audible = loudness >= _MIN_RELATIVE_TAP_LOUDNESS * loudness.max(axis=1, keepdims=True)
-    # The loudest window of a tap is always included, even if no window is above the noise floor.
-    is_audible |= loudness == loudness.max(axis=1, keepdims=True)
-    mean = np.einsum("tf,tfm->tm", is_audible, power) / is_audible.sum(axis=1)[:, None]
-    correlation = noise_correlation(grid, num_windows)
-    tap_freedom = np.array(
-        [degrees_of_freedom * mask.sum() ** 2 / correlation[np.ix_(mask, mask)].sum() for mask in is_audible]
+    is_living_microphone = is_usable_window.any(axis=(0, 1))
+    positive_floor = np.maximum(estimated_floor, max(1e-9 * power.max(), np.finfo(float).tiny))
+    window_loudness = np.where(is_living_microphone, power / positive_floor - estimated_floor / positive_floor, 0).sum(
+        axis=-1
     )
-    all_usable = (usable | ~is_audible[..., None]).all(axis=1)
-    return TapIntensities(mean - floor, floor, tap_freedom, all_usable, tuple(faults))
+    is_audible_window = window_loudness >= _MIN_RELATIVE_TAP_LOUDNESS * window_loudness.max(axis=1, keepdims=True)
+    # The loudest window of a tap is always included, even if no window is above the noise floor.
+    is_audible_window |= window_loudness == window_loudness.max(axis=1, keepdims=True)
+    mean_power = np.einsum("tf,tfm->tm", is_audible_window, power) / is_audible_window.sum(axis=1)[:, None]
+    window_correlation = noise_correlation(window_layout, num_windows)
+    tap_freedom = np.array(
+        [
+            degrees_of_freedom * window_mask.sum() ** 2 / window_correlation[np.ix_(window_mask, window_mask)].sum()
+            for window_mask in is_audible_window
+        ]
+    )
+    is_usable_tap = (is_usable_window | ~is_audible_window[..., None]).all(axis=1)
+    return TapIntensities(mean_power - estimated_floor, estimated_floor, tap_freedom, is_usable_tap, tuple(fault_texts))
 
 
 def noise_floor(
@@ -370,24 +396,30 @@ def noise_floor(
     sorted_power = np.sort(np.where(usable, power, np.inf), axis=0)
     # Rank of the median power of the quietest `share` of the windows.
     floor_rank = np.clip(np.floor(0.5 * share * num_usable).astype(int), 0, max(len(power) - 1, 0))
-    floor = np.take_along_axis(sorted_power, floor_rank[None], axis=0)[0] if len(power) else np.zeros(power.shape[1])
-    floor = np.where(num_usable > 0, floor, 0.0)
+    estimated_floor = (
+        np.take_along_axis(sorted_power, floor_rank[None], axis=0)[0] if len(power) else np.zeros(power.shape[1])
+    )
+    estimated_floor = np.where(num_usable > 0, estimated_floor, 0.0)
     if np.isinf(degrees_of_freedom):
-        return floor
+        return estimated_floor
     half_degrees_of_freedom = degrees_of_freedom / 2
     # Quantiles of χ²_ν / ν, and the mean of χ²_ν / ν below the cut-off c: ∫_0^c y p(y) dy is the distribution function
     # of χ² with ν + 2 degrees of freedom, at ν c.
-    floor = floor / (gammaincinv(half_degrees_of_freedom, 0.5 * share) / half_degrees_of_freedom)
-    cutoff = gammaincinv(half_degrees_of_freedom, 0.9) / half_degrees_of_freedom
-    mean_below_cutoff = gammainc(half_degrees_of_freedom + 1, half_degrees_of_freedom * cutoff) / 0.9
+    estimated_floor = estimated_floor / (gammaincinv(half_degrees_of_freedom, 0.5 * share) / half_degrees_of_freedom)
+    quiet_cutoff = gammaincinv(half_degrees_of_freedom, 0.9) / half_degrees_of_freedom
+    mean_below_cutoff = gammainc(half_degrees_of_freedom + 1, half_degrees_of_freedom * quiet_cutoff) / 0.9
     for _ in range(50):
-        is_quiet = usable & (power <= cutoff * floor)
-        mean = np.where(is_quiet, power, 0).sum(axis=0) / np.maximum(is_quiet.sum(axis=0), 1) / mean_below_cutoff
-        new_floor = np.where(is_quiet.any(axis=0), mean, floor)
-        if np.allclose(new_floor, floor, rtol=1e-6, atol=0):
+        is_quiet_window = usable & (power <= quiet_cutoff * estimated_floor)
+        quiet_mean = (
+            np.where(is_quiet_window, power, 0).sum(axis=0)
+            / np.maximum(is_quiet_window.sum(axis=0), 1)
+            / mean_below_cutoff
+        )
+        updated_floor = np.where(is_quiet_window.any(axis=0), quiet_mean, estimated_floor)
+        if np.allclose(updated_floor, estimated_floor, rtol=1e-6, atol=0):
             break
-        floor = new_floor
-    return floor
+        estimated_floor = updated_floor
+    return estimated_floor
 
 
 def degrees_of_freedom(settings: IntensitySettings, rate: float) -> float:
@@ -397,14 +429,14 @@ def degrees_of_freedom(settings: IntensitySettings, rate: float) -> float:
 
 
 def _check_floor(floor, num_microphones: int) -> Float[np.ndarray, " M"]:
-    values = np.asarray(floor)
+    floor_values = np.asarray(floor)
     if (
-        values.dtype.kind not in "fiu"
-        or values.shape != (num_microphones,)
-        or not (np.isfinite(values) & (values >= 0)).all()
+        floor_values.dtype.kind not in "fiu"
+        or floor_values.shape != (num_microphones,)
+        or not (np.isfinite(floor_values) & (floor_values >= 0)).all()
     ):
         raise ValueError(
             f"floor must be finite and not negative, one for each of the {num_microphones} microphones; it is "
-            f"{values.dtype} of shape {values.shape}."
+            f"{floor_values.dtype} of shape {floor_values.shape}."
         )
-    return values.astype(float)
+    return floor_values.astype(float)

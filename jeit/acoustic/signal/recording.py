@@ -68,9 +68,11 @@ class Recording(Module):
     ):
         """Raises `ValueError` for samples that are not real, have a shape other than (M, S) or look transposed, and for
         an implausible sampling rate."""
-        array = convert_to_real_array(samples, "samples", "microphones, samples")
-        is_too_large = np.abs(array) > _MAX_SAMPLE_MAGNITUDE if array.dtype.kind == "f" else np.zeros(0, bool)
-        self.samples = np.where(is_too_large, np.inf, array) if is_too_large.any() else array
+        sample_array = convert_to_real_array(samples, "samples", "microphones, samples")
+        is_too_large = (
+            np.abs(sample_array) > _MAX_SAMPLE_MAGNITUDE if sample_array.dtype.kind == "f" else np.zeros(0, bool)
+        )
+        self.samples = np.where(is_too_large, np.inf, sample_array) if is_too_large.any() else sample_array
         num_microphones, num_samples = self.samples.shape
         if num_microphones > num_samples:
             raise ValueError(
@@ -137,18 +139,18 @@ class Intensities(Module):
             convert_to_real_array(times, "times", "windows"),
             convert_to_real_array(power, "intensity", "windows, microphones"),
         )
-        shape, num_windows = self.power.shape, len(self.times)
-        if shape[0] != num_windows:
-            shape_hint = " It looks transposed: give (windows, microphones)." if shape[1] == num_windows else ""
+        power_shape, num_windows = self.power.shape, len(self.times)
+        if power_shape[0] != num_windows:
+            shape_hint = " It looks transposed: give (windows, microphones)." if power_shape[1] == num_windows else ""
             raise ValueError(
-                f"intensity has shape {shape}, but there are {num_windows} times, one a window.{shape_hint}"
+                f"intensity has shape {power_shape}, but there are {num_windows} times, one a window.{shape_hint}"
             )
         if not np.isfinite(self.times).all() or (np.diff(self.times) <= 0).any():
             raise ValueError("times must be finite and increasing, in seconds: the middle of each window.")
-        self.floor = np.zeros(shape[1]) if floor is None else convert_to_real_array(floor, "floor", "microphones")
-        if self.floor.shape != shape[1:] or not (np.isfinite(self.floor) & (self.floor >= 0)).all():
+        self.floor = np.zeros(power_shape[1]) if floor is None else convert_to_real_array(floor, "floor", "microphones")
+        if self.floor.shape != power_shape[1:] or not (np.isfinite(self.floor) & (self.floor >= 0)).all():
             raise ValueError(
-                f"floor must be finite and not negative, one for each of the {shape[1]} microphones; it is "
+                f"floor must be finite and not negative, one for each of the {power_shape[1]} microphones; it is "
                 f"{short_text(self.floor)}. Leave it out when it is not known."
             )
         self.freedom = real_number(freedom, "freedom")
@@ -160,13 +162,13 @@ class Intensities(Module):
                 f"overlap must be at least 1 and no more than the {num_windows} windows: how many of them share a "
                 f"sample (window / hop); it is {self.overlap:g}."
             )
-        default_usable, reasons = intensity_faults(self.power)
+        default_usable, default_faults = intensity_faults(self.power)
         usable_mask = default_usable if usable is None else np.asarray(usable)
-        self.faults = reasons if faults is None else tuple(str(reason) for reason in faults)
-        if usable_mask.shape != shape or usable_mask.dtype != bool or len(self.faults) != shape[1]:
+        self.faults = default_faults if faults is None else tuple(str(fault_text) for fault_text in faults)
+        if usable_mask.shape != power_shape or usable_mask.dtype != bool or len(self.faults) != power_shape[1]:
             raise ValueError(
                 f"usable is {usable_mask.dtype} of shape {usable_mask.shape} with {len(self.faults)} faults; give "
-                f"booleans of shape {shape}, and one string a microphone."
+                f"booleans of shape {power_shape}, and one string a microphone."
             )
         self.usable, self.name, self.notes = usable_mask & np.isfinite(self.power), name, tuple(notes)
 
@@ -227,12 +229,12 @@ class Taps(Module):
             self.outline = check_loop(self.outline, "outline", clockwise=False)
         elif len(self.outline) < 3:
             raise ValueError(f"outline: expected at least three vertices, got {len(self.outline)}.")
-        for label, points in (
+        for array_label, array_points in (
             ("outline", self.outline),
             ("microphones", self.microphones),
             ("positions", self.positions),
         ):
-            check_extent(np.concatenate([self.outline, points]), label)
+            check_extent(np.concatenate([self.outline, array_points]), array_label)
         is_plane_outline = self.outline.shape[1] == 2
         check_microphones(
             self.microphones, self.outline if is_plane_outline else np.vstack([self.outline, self.positions])
@@ -247,17 +249,17 @@ class Taps(Module):
         self.samples = (
             None if samples is None else convert_to_real_array(samples, "samples", "taps, microphones, samples")
         )
-        label, values = ("intensity", self.power) if self.samples is None else ("samples", self.samples)
-        assert values is not None
-        if values.shape[:2] != expected_shape:
-            transposed = values.shape == expected_shape[::-1] or (
-                values.ndim == 3 and values.shape[::2] == expected_shape
+        array_label, tap_array = ("intensity", self.power) if self.samples is None else ("samples", self.samples)
+        assert tap_array is not None
+        if tap_array.shape[:2] != expected_shape:
+            looks_transposed = tap_array.shape == expected_shape[::-1] or (
+                tap_array.ndim == 3 and tap_array.shape[::2] == expected_shape
             )
-            shape_hint = " It looks transposed." if transposed else ""
+            shape_hint = " It looks transposed." if looks_transposed else ""
             raise ValueError(
-                f"{label} has shape {values.shape}, but there are {expected_shape[0]} positions and "
-                f"{expected_shape[1]} microphones: give (taps, microphones{', samples' if values.ndim == 3 else ''})."
-                f"{shape_hint}"
+                f"{array_label} has shape {tap_array.shape}, but there are {expected_shape[0]} positions and "
+                f"{expected_shape[1]} microphones: give (taps, "
+                f"microphones{', samples' if tap_array.ndim == 3 else ''}).{shape_hint}"
             )
         if self.samples is not None and rate is None:
             raise ValueError("rate is missing: samples need the samples a second of each microphone, in Hz.")
@@ -288,23 +290,32 @@ def read_recording(path: str | Path) -> Recording | Intensities:
     """
     path = Path(path)
     try:
-        sound = read_sound(path)
-        if sound is not None:
-            samples, rate, full_scale = sound
+        sound_data = read_sound(path)
+        if sound_data is not None:
+            samples, rate, full_scale = sound_data
             return Recording(samples, rate, full_scale=full_scale, name=path.stem)
-        optional_keys = ("floor", "freedom", "overlap")
-        arrays = npz_arrays(
-            path, "samples", "rate", "full_scale", "intensity", "times", *optional_keys, otherwise=_UNKNOWN_FORMAT
+        optional_names = ("floor", "freedom", "overlap")
+        stored_arrays = npz_arrays(
+            path, "samples", "rate", "full_scale", "intensity", "times", *optional_names, otherwise=_UNKNOWN_FORMAT
         )
-        array_name = alternative_array_name(arrays, "intensity", "samples")
+        array_name = alternative_array_name(stored_arrays, "intensity", "samples")
         if array_name == "samples":
-            if arrays["samples"].ndim == 3:
+            if stored_arrays["samples"].ndim == 3:
                 raise ValueError("samples has three axes, as a file of taps has: read that with read_taps.")
-            require_arrays(arrays, "rate")
-            return Recording(arrays["samples"], arrays["rate"], full_scale=arrays.get("full_scale"), name=path.stem)
-        require_arrays(arrays, "times")
-        optional_arrays = {key: arrays[key] for key in optional_keys if key in arrays}
-        return Intensities(arrays["times"], arrays["intensity"], **optional_arrays, name=path.stem)
+            require_arrays(stored_arrays, "rate")
+            return Recording(
+                stored_arrays["samples"],
+                stored_arrays["rate"],
+                full_scale=stored_arrays.get("full_scale"),
+                name=path.stem,
+            )
+        require_arrays(stored_arrays, "times")
+        optional_arrays = {
+            optional_name: stored_arrays[optional_name]
+            for optional_name in optional_names
+            if optional_name in stored_arrays
+        }
+        return Intensities(stored_arrays["times"], stored_arrays["intensity"], **optional_arrays, name=path.stem)
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from None
 
@@ -329,18 +340,23 @@ def read_taps(path: str | Path) -> Taps:
     ```
     """
     path = Path(path)
-    geometry = ("microphones", "outline", "positions")
+    geometry_names = ("microphones", "outline", "positions")
     try:
-        keys = (*geometry, "intensity", "samples", "rate", "full_scale")
-        arrays = npz_arrays(path, *keys, otherwise=_UNKNOWN_FORMAT)
-        require_arrays(arrays, *geometry)
-        array_name = alternative_array_name(arrays, "intensity", "samples")
-        arguments = {"power" if array_name == "intensity" else "samples": arrays[array_name]}
+        array_names = (*geometry_names, "intensity", "samples", "rate", "full_scale")
+        stored_arrays = npz_arrays(path, *array_names, otherwise=_UNKNOWN_FORMAT)
+        require_arrays(stored_arrays, *geometry_names)
+        array_name = alternative_array_name(stored_arrays, "intensity", "samples")
+        tap_arguments = {"power" if array_name == "intensity" else "samples": stored_arrays[array_name]}
         if array_name == "samples":
-            require_arrays(arrays, "rate")
-            arguments |= {"rate": arrays["rate"]}
-        full_scale = arrays.get("full_scale")
-        return Taps(*(arrays[key] for key in geometry), **arguments, full_scale=full_scale, name=path.stem)
+            require_arrays(stored_arrays, "rate")
+            tap_arguments |= {"rate": stored_arrays["rate"]}
+        full_scale = stored_arrays.get("full_scale")
+        return Taps(
+            *(stored_arrays[geometry_name] for geometry_name in geometry_names),
+            **tap_arguments,
+            full_scale=full_scale,
+            name=path.stem,
+        )
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from None
 
@@ -363,8 +379,10 @@ def write_recording(path: str | Path, recording: Recording | Intensities) -> Non
     if isinstance(recording, Recording):
         _write_npz(path, samples=recording.samples, rate=recording.rate, full_scale=recording.full_scale)
     else:
-        fields = {key: getattr(recording, key) for key in ("times", "floor", "freedom", "overlap")}
-        _write_npz(path, intensity=np.where(recording.usable, recording.power, np.nan), **fields)
+        intensity_fields = {
+            field_name: getattr(recording, field_name) for field_name in ("times", "floor", "freedom", "overlap")
+        }
+        _write_npz(path, intensity=np.where(recording.usable, recording.power, np.nan), **intensity_fields)
 
 
 def write_taps(path: str | Path, taps: Taps) -> None:
@@ -382,10 +400,16 @@ def write_taps(path: str | Path, taps: Taps) -> None:
     same = read_taps("taps.npz")
     ```
     """
-    geometry = {"microphones": taps.microphones, "outline": taps.outline, "positions": taps.positions}
-    _write_npz(path, **geometry, intensity=taps.power, samples=taps.samples, rate=taps.rate, full_scale=taps.full_scale)
+    geometry_arrays = {"microphones": taps.microphones, "outline": taps.outline, "positions": taps.positions}
+    _write_npz(
+        path, **geometry_arrays, intensity=taps.power, samples=taps.samples, rate=taps.rate, full_scale=taps.full_scale
+    )
 
 
 def _write_npz(path: str | Path, **arrays) -> None:
-    with atomically_written_file(path) as file:
-        np.savez(file, allow_pickle=False, **{key: value for key, value in arrays.items() if value is not None})
+    with atomically_written_file(path) as npz_file:
+        np.savez(
+            npz_file,
+            allow_pickle=False,
+            **{array_name: array_value for array_name, array_value in arrays.items() if array_value is not None},
+        )

@@ -110,11 +110,11 @@ class SoundingPerson(Module):
         """Raises `ValueError` if the names of the traits are not those in `SOUND_MANNERS`, or the traits are not
         positive numbers."""
         check_kind("medians", self.medians, Mapping, "traits by modality, such as of SoundingPerson.draw(key)")
-        for name, traits in SOUND_MANNERS.items():
-            if set(self.medians.get(name, {})) != set(traits):
-                raise ValueError(f"medians['{name}'] must have {', '.join(traits) or 'no traits'}.")
-            for trait, value in self.medians[name].items():
-                check_positive(f"medians['{name}']['{trait}']", value)
+        for modality_name, trait_names in SOUND_MANNERS.items():
+            if set(self.medians.get(modality_name, {})) != set(trait_names):
+                raise ValueError(f"medians['{modality_name}'] must have {', '.join(trait_names) or 'no traits'}.")
+            for trait_name, trait_median in self.medians[modality_name].items():
+                check_positive(f"medians['{modality_name}']['{trait_name}']", trait_median)
 
     @classmethod
     def draw(cls, key: Array) -> "SoundingPerson":
@@ -123,14 +123,18 @@ class SoundingPerson(Module):
         check_key(key)
         rng = _numpy_generator(key)
         medians = {}
-        for name, traits in SOUND_MANNERS.items():
-            medians[name] = {}
-            for trait, distribution in traits.items():
-                normal = rng.normal()
-                if trait == "slope":
-                    medians[name][trait] = max(distribution.median + distribution.spread * normal, 0.1)
+        for modality_name, trait_distributions in SOUND_MANNERS.items():
+            medians[modality_name] = {}
+            for trait_name, trait_distribution in trait_distributions.items():
+                normal_draw = rng.normal()
+                if trait_name == "slope":
+                    medians[modality_name][trait_name] = max(
+                        trait_distribution.median + trait_distribution.spread * normal_draw, 0.1
+                    )
                 else:
-                    medians[name][trait] = float(distribution.median * np.exp(distribution.spread * normal))
+                    medians[modality_name][trait_name] = float(
+                        trait_distribution.median * np.exp(trait_distribution.spread * normal_draw)
+                    )
         return cls(medians)
 
     def touch(self, key: Array, modality: str, skin: SoundingSkin, *, duration: float = 2.9) -> SimulatedSound:
@@ -147,82 +151,96 @@ class SoundingPerson(Module):
         rng = _numpy_generator(trait_key)
         if modality == "none":
             return _simulate_no_touch(skin, duration)
-        traits = {}
-        for name, median in self.medians[modality].items():
-            if name == "slope":
-                traits[name] = max(median + SPECTRAL_SLOPE_DEVIATION / 2 * rng.normal(), 0.1)
+        trait_values = {}
+        for trait_name, trait_median in self.medians[modality].items():
+            if trait_name == "slope":
+                trait_values[trait_name] = max(trait_median + SPECTRAL_SLOPE_DEVIATION / 2 * rng.normal(), 0.1)
             else:
-                traits[name] = float(median * np.exp(WITHIN_PERSON_LOG_DEVIATION * rng.normal()))
+                trait_values[trait_name] = float(trait_median * np.exp(WITHIN_PERSON_LOG_DEVIATION * rng.normal()))
         # The touch is simulated with its own spectral slope in place of the skin's slope. The microphones' noise
         # depends on the skin's slope, and is therefore not added here.
-        sloped_skin = eqx.tree_at(lambda tree: tree.spectral_slope, skin, traits.pop("slope"))
-        return _SIMULATIONS[modality](rng, sloped_skin, sound_key, traits, duration)
+        sloped_skin = eqx.tree_at(lambda skin_to_change: skin_to_change.spectral_slope, skin, trait_values.pop("slope"))
+        return _SIMULATION_FUNCTIONS[modality](rng, sloped_skin, sound_key, trait_values, duration)
 
 
 def _simulate_taps(
-    rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float
+    rng: np.random.Generator, skin: SoundingSkin, key: Array, trait_values: dict, duration: float
 ) -> SimulatedSound:
     """Simulate a pat or a tickle: taps of random strength and rhythm at random positions within a small disc."""
-    burst = Burst(traits["strength"], max(traits["length"], _MIN_BURST_LENGTH))
-    interval, radius = traits["interval"], traits.get("radius", _PAT_RADIUS)
-    num_taps = int(np.ceil(2 * duration / interval)) + 2
-    tap_intervals = interval * np.exp(_TAP_INTERVAL_LOG_DEVIATION * rng.normal(size=num_taps))
+    tap_burst = Burst(trait_values["strength"], max(trait_values["length"], _MIN_BURST_LENGTH))
+    mean_interval, disc_radius = trait_values["interval"], trait_values.get("radius", _PAT_RADIUS)
+    num_taps = int(np.ceil(2 * duration / mean_interval)) + 2
+    tap_intervals = mean_interval * np.exp(_TAP_INTERVAL_LOG_DEVIATION * rng.normal(size=num_taps))
     # The recording begins at a random phase of the rhythm.
-    onsets = FIRST_BURST_TIME - rng.uniform(0, interval) + np.cumsum(tap_intervals) - tap_intervals[0]
-    onsets = onsets[(onsets > -burst.length) & (onsets < duration)]
-    strengths = burst.strength * np.exp(_TAP_STRENGTH_LOG_DEVIATION * rng.normal(size=len(onsets)))
-    times = sample_times(skin, duration)
-    distances = radius * np.sqrt(rng.uniform(size=len(onsets)))
-    angle = rng.uniform(0, 2 * np.pi, len(onsets))
+    tap_onsets = FIRST_BURST_TIME - rng.uniform(0, mean_interval) + np.cumsum(tap_intervals) - tap_intervals[0]
+    tap_onsets = tap_onsets[(tap_onsets > -tap_burst.length) & (tap_onsets < duration)]
+    tap_strengths = tap_burst.strength * np.exp(_TAP_STRENGTH_LOG_DEVIATION * rng.normal(size=len(tap_onsets)))
+    sampling_times = sample_times(skin, duration)
+    tap_distances = disc_radius * np.sqrt(rng.uniform(size=len(tap_onsets)))
+    tap_angles = rng.uniform(0, 2 * np.pi, len(tap_onsets))
     tap_positions = _clip_to_skin(
-        skin, _random_position(rng, skin) + np.stack([distances * np.cos(angle), distances * np.sin(angle)], axis=-1)
+        skin,
+        _random_position(rng, skin)
+        + np.stack([tap_distances * np.cos(tap_angles), tap_distances * np.sin(tap_angles)], axis=-1),
     )
-    blocks = np.maximum(
-        np.searchsorted(onsets, block_times(skin, len(times)) + SOURCE_POSITION_INTERVAL, side="right") - 1, 0
+    tap_of_block = np.maximum(
+        np.searchsorted(tap_onsets, block_times(skin, len(sampling_times)) + SOURCE_POSITION_INTERVAL, side="right")
+        - 1,
+        0,
     )
-    return simulate_recording(skin, key, tap_positions[blocks], burst.envelope(times, onsets, strengths), False)
+    return simulate_recording(
+        skin, key, tap_positions[tap_of_block], tap_burst.envelope(sampling_times, tap_onsets, tap_strengths), False
+    )
 
 
 def _simulate_stroke(
-    rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float
+    rng: np.random.Generator, skin: SoundingSkin, key: Array, trait_values: dict, duration: float
 ) -> SimulatedSound:
     """Simulate a stroke back and forth along a straight path, slower at the turns."""
-    angle, phase = rng.uniform(0, 2 * np.pi, 2)
-    half_displacement = traits["path"] / 2 * np.array([np.cos(angle), np.sin(angle)])
+    path_angle, stroke_phase = rng.uniform(0, 2 * np.pi, 2)
+    half_displacement = trait_values["path"] / 2 * np.array([np.cos(path_angle), np.sin(path_angle)])
     max_coordinates = np.array([skin.layer.width, skin.layer.height]) / 2 - _EDGE_MARGIN
     half_displacement = half_displacement * min(
         1.0, float(np.min(max_coordinates / np.maximum(np.abs(half_displacement), 1e-9)))
     )
-    length = 2 * float(np.linalg.norm(half_displacement))
+    path_length = 2 * float(np.linalg.norm(half_displacement))
     path_centre = np.clip(
         _random_position(rng, skin),
         -(max_coordinates - np.abs(half_displacement)),
         max_coordinates - np.abs(half_displacement),
     )
-    times = sample_times(skin, duration)
+    sampling_times = sample_times(skin, duration)
     # The mean speed of a sinusoidal motion of peak-to-peak length L and angular frequency w is L w / π.
-    angular_frequency = np.pi * traits["speed"] / length
-    speed = np.maximum(
-        length / 2 * angular_frequency * np.abs(np.cos(angular_frequency * times + phase)),
-        _MIN_SPEED_RATIO * traits["speed"],
+    angular_frequency = np.pi * trait_values["speed"] / path_length
+    finger_speed = np.maximum(
+        path_length / 2 * angular_frequency * np.abs(np.cos(angular_frequency * sampling_times + stroke_phase)),
+        _MIN_SPEED_RATIO * trait_values["speed"],
     )
-    block_centres = block_times(skin, len(times))
-    positions = _clip_to_skin(
-        skin, path_centre + np.sin(angular_frequency * block_centres + phase)[:, None] * half_displacement
+    block_centres = block_times(skin, len(sampling_times))
+    source_positions = _clip_to_skin(
+        skin, path_centre + np.sin(angular_frequency * block_centres + stroke_phase)[:, None] * half_displacement
     )
-    return simulate_recording(skin, key, positions, traits["strength"] * np.sqrt(speed / NOMINAL_SPEED), False)
+    return simulate_recording(
+        skin, key, source_positions, trait_values["strength"] * np.sqrt(finger_speed / NOMINAL_SPEED), False
+    )
 
 
 def _simulate_wind(
-    rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float
+    rng: np.random.Generator, skin: SoundingSkin, key: Array, trait_values: dict, duration: float
 ) -> SimulatedSound:
     """Simulate an air jet that blows on a random position of the skin."""
     return simulate_wind(
-        skin, key, _random_position(rng, skin), slope=skin.spectral_slope, duration=duration, noise=False, **traits
+        skin,
+        key,
+        _random_position(rng, skin),
+        slope=skin.spectral_slope,
+        duration=duration,
+        noise=False,
+        **trait_values,
     )
 
 
-_SIMULATIONS: dict[str, Callable[..., SimulatedSound]] = {
+_SIMULATION_FUNCTIONS: dict[str, Callable[..., SimulatedSound]] = {
     "pat": _simulate_taps,
     "tickle": _simulate_taps,
     "stroke": _simulate_stroke,
@@ -232,25 +250,30 @@ _SIMULATIONS: dict[str, Callable[..., SimulatedSound]] = {
 
 def _simulate_no_touch(skin: SoundingSkin, duration: float) -> SimulatedSound:
     """Simulate a recording without a touch and without noise."""
-    silence = simulate_silence(skin, jax.random.key(0), duration=duration)
+    silent_recording = simulate_silence(skin, jax.random.key(0), duration=duration)
     return SimulatedSound(
-        np.zeros_like(silence.samples), skin.rate, np.zeros((0, 2)), np.zeros(0), silence.active, False
+        np.zeros_like(silent_recording.samples),
+        skin.rate,
+        np.zeros((0, 2)),
+        np.zeros(0),
+        silent_recording.active,
+        False,
     )
 
 
 def _random_position(rng: np.random.Generator, skin: SoundingSkin) -> np.ndarray:
     """Draw a position (2,) in metres from a uniform distribution on the skin, away from its edges."""
-    half_size = np.array([skin.layer.width, skin.layer.height]) / 2
-    return rng.uniform(-1, 1, 2) * np.maximum(half_size - _EDGE_MARGIN, half_size / 2)
+    half_skin_size = np.array([skin.layer.width, skin.layer.height]) / 2
+    return rng.uniform(-1, 1, 2) * np.maximum(half_skin_size - _EDGE_MARGIN, half_skin_size / 2)
 
 
-def _clip_to_skin(skin: SoundingSkin, positions: np.ndarray) -> np.ndarray:
-    half_size = np.array([skin.layer.width, skin.layer.height]) / 2
-    return np.clip(positions, -half_size, half_size)
+def _clip_to_skin(skin: SoundingSkin, source_positions: np.ndarray) -> np.ndarray:
+    half_skin_size = np.array([skin.layer.width, skin.layer.height]) / 2
+    return np.clip(source_positions, -half_skin_size, half_skin_size)
 
 
-def _numpy_generator(key: Array) -> np.random.Generator:
-    return np.random.default_rng(np.asarray(jax.random.bits(key, (4,))).tolist())
+def _numpy_generator(random_key: Array) -> np.random.Generator:
+    return np.random.default_rng(np.asarray(jax.random.bits(random_key, (4,))).tolist())
 
 
 # Mean level of the room's sound relative to the microphones' noise, and its standard deviation between clips, in
@@ -332,17 +355,19 @@ def simulate_sound_clips(
     return _generate_clips(key, skin, people, each, tuple(modalities), duration)
 
 
-def _generate_clips(key, skin, people, num_clips_per_label, modalities, duration) -> Iterator[SoundClip]:
+def _generate_clips(random_key, skin, people, num_clips_per_label, modalities, duration) -> Iterator[SoundClip]:
     num_samples = len(sample_times(skin, duration))
-    labels = [
-        (person, modality)
-        for person in range(len(people))
+    clip_labels = [
+        (person_index, modality)
+        for person_index in range(len(people))
         for modality in modalities
         for _ in range(num_clips_per_label)
     ]
-    for clip_index, (person, modality) in enumerate(labels):
-        touch_key, noise_key, room_key, level_key = jax.random.split(jax.random.fold_in(key, clip_index), 4)
-        touch = people[person].touch(touch_key, modality, skin, duration=duration)
-        level = _MEAN_ROOM_LEVEL_DB + _ROOM_LEVEL_DEVIATION_DB * float(jax.random.normal(level_key))
-        room_samples = simulate_room_sound(skin, room_key, level_db=level, duration=duration).samples
-        yield SoundClip(touch, microphone_noise(skin, noise_key, num_samples) + room_samples, modality, person)
+    for clip_index, (person_index, modality) in enumerate(clip_labels):
+        touch_key, noise_key, room_key, level_key = jax.random.split(jax.random.fold_in(random_key, clip_index), 4)
+        touch_recording = people[person_index].touch(touch_key, modality, skin, duration=duration)
+        room_level_db = _MEAN_ROOM_LEVEL_DB + _ROOM_LEVEL_DEVIATION_DB * float(jax.random.normal(level_key))
+        room_samples = simulate_room_sound(skin, room_key, level_db=room_level_db, duration=duration).samples
+        yield SoundClip(
+            touch_recording, microphone_noise(skin, noise_key, num_samples) + room_samples, modality, person_index
+        )

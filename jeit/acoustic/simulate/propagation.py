@@ -17,10 +17,10 @@ def band_filter(skin: SoundingSkin, frequencies: Float[Array, " F"]) -> Float[Ar
     """Power response (F,) of the analogue filters at `frequencies` (F,) in Hz: 1 in the band, 1/2 at the limits of the
     band, and 0 more than half an octave outside."""
     log2_frequencies = jnp.log2(jnp.maximum(frequencies, 1e-9))
-    low, high = jnp.log2(skin.readout.band[0]), jnp.log2(skin.readout.band[1])
+    log2_lowest, log2_highest = jnp.log2(skin.readout.band[0]), jnp.log2(skin.readout.band[1])
     rising_edge, falling_edge = (
-        jnp.clip(log2_frequencies - low + 0.5, 0, 1),
-        jnp.clip(high - log2_frequencies + 0.5, 0, 1),
+        jnp.clip(log2_frequencies - log2_lowest + 0.5, 0, 1),
+        jnp.clip(log2_highest - log2_frequencies + 0.5, 0, 1),
     )
     return (jnp.sin(jnp.pi / 2 * rising_edge) * jnp.sin(jnp.pi / 2 * falling_edge)) ** 2
 
@@ -29,15 +29,19 @@ def source_density(skin: SoundingSkin, frequencies: Float[Array, " F"]) -> Float
     """Power spectral density (F,) of a source of strength 1 at `frequencies` (F,) in Hz, in 1/Hz. The integral of the
     density over positive frequencies is 1."""
 
-    lowest_frequency, highest = skin.readout.band
+    lowest_frequency, highest_frequency = skin.readout.band
 
     def unnormalised_density(f):
         return band_filter(skin, f) * (jnp.maximum(f, 1e-9) / lowest_frequency) ** -skin.spectral_slope
 
     # The integral uses a uniform grid of log-frequency, in which both edges of the band filter have the same width: ∫ S
     # df = ∫ S f d(ln f).
-    grid = lowest_frequency * jnp.exp(jnp.linspace(-0.35, jnp.log(highest / lowest_frequency) + 0.35, 2001))
-    return unnormalised_density(frequencies) / jnp.trapezoid(unnormalised_density(grid) * grid, jnp.log(grid))
+    frequency_grid = lowest_frequency * jnp.exp(
+        jnp.linspace(-0.35, jnp.log(highest_frequency / lowest_frequency) + 0.35, 2001)
+    )
+    return unnormalised_density(frequencies) / jnp.trapezoid(
+        unnormalised_density(frequency_grid) * frequency_grid, jnp.log(frequency_grid)
+    )
 
 
 @jax.jit
@@ -51,34 +55,37 @@ def transfer(skin: SoundingSkin, frequencies: Float[Array, " F"], position: Floa
     from the top and bottom faces are part of the spreading. The transfer functions include the gain of each microphone
     and, for a multiplexed readout, crosstalk and the delays of the sampling times.
     """
-    layer = skin.layer
+    skin_layer = skin.layer
     x, y = position
-    width, height = layer.width, layer.height
-    weight = jnp.array([1.0, layer.reflection, layer.reflection])
-    x_offsets, y_offsets = jnp.array([x, width - x, -width - x]), jnp.array([y, height - y, -height - y])
+    layer_width, layer_height = skin_layer.width, skin_layer.height
+    reflection_weights = jnp.array([1.0, skin_layer.reflection, skin_layer.reflection])
+    x_offsets, y_offsets = (
+        jnp.array([x, layer_width - x, -layer_width - x]),
+        jnp.array([y, layer_height - y, -layer_height - y]),
+    )
     squared_distances = (x_offsets[:, None] - skin.microphones[:, 0, None, None]) ** 2
     squared_distances += (y_offsets - skin.microphones[:, 1, None, None]) ** 2
     path_lengths = jnp.sqrt(squared_distances + skin.microphone_depth[:, None, None] ** 2).reshape(-1, 9)
-    amplitude = (
-        jnp.outer(weight, weight).reshape(9)
-        * layer.spreading(path_lengths, skin.microphone_model.depth)
+    path_amplitudes = (
+        jnp.outer(reflection_weights, reflection_weights).reshape(9)
+        * skin_layer.spreading(path_lengths, skin.microphone_model.depth)
         * skin.gain[:, None]
     )
-    decay = layer.material.loss(frequencies) + 1j * layer.material.wavenumber(frequencies)
-    received_amplitude = jnp.sum(amplitude[..., None] * jnp.exp(-path_lengths[..., None] * decay), axis=1)
+    complex_decay = skin_layer.material.loss(frequencies) + 1j * skin_layer.material.wavenumber(frequencies)
+    received_amplitude = jnp.sum(path_amplitudes[..., None] * jnp.exp(-path_lengths[..., None] * complex_decay), axis=1)
     if not skin.readout.multiplexed:
         return received_amplitude
     # Microphone i is connected to slot i mod 4 of multiplexer i div 4. The slot read 25 µs earlier may have no
     # microphone.
     microphone_index = np.arange(skin.num_microphones)
-    previous_index = (
+    previous_channel = (
         microphone_index
         - microphone_index % NUM_MULTIPLEXER_CHANNELS
         + (microphone_index - 1) % NUM_MULTIPLEXER_CHANNELS
     )
-    has_previous_channel = previous_index < skin.num_microphones
+    has_previous_channel = previous_channel < skin.num_microphones
     previous_channel_amplitude = jnp.where(
-        has_previous_channel[:, None], received_amplitude[np.where(has_previous_channel, previous_index, 0)], 0
+        has_previous_channel[:, None], received_amplitude[np.where(has_previous_channel, previous_channel, 0)], 0
     )
     received_amplitude += (
         skin.readout.coupling * previous_channel_amplitude * jnp.exp(-2j * jnp.pi * frequencies * MULTIPLEXER_INTERVAL)
@@ -93,18 +100,21 @@ def expected_power(skin: SoundingSkin, positions) -> Float[np.ndarray, "P M"]:
     The mean square is the integral over frequency of the source's spectral density times |transfer|², and is
     proportional to the square of the source's strength. Raises `ValueError` for positions outside the skin.
     """
-    points = skin.layer.check_inside("positions", positions)
+    source_positions = skin.layer.check_inside("positions", positions)
     # Interference of two echoes makes |transfer|² oscillate with a period of at least 1 / (longest delay) in frequency.
     # Four frequencies per period make the sum nearly exact.
-    step = min(1 / (4 * skin.layer.longest_delay), skin.readout.band[0] / 10)
-    frequencies = np.arange(1, np.ceil(np.sqrt(2) * skin.readout.band[1] / step)) * step
-    return np.asarray(_expected_power(skin, jnp.asarray(points), jnp.asarray(frequencies), step))
+    frequency_step = min(1 / (4 * skin.layer.longest_delay), skin.readout.band[0] / 10)
+    frequencies = np.arange(1, np.ceil(np.sqrt(2) * skin.readout.band[1] / frequency_step)) * frequency_step
+    return np.asarray(_expected_power(skin, jnp.asarray(source_positions), jnp.asarray(frequencies), frequency_step))
 
 
 @jax.jit
-def _expected_power(skin, points, frequencies, frequency_step):
-    density = source_density(skin, frequencies) * frequency_step
-    return jax.lax.map(lambda point: jnp.abs(transfer(skin, frequencies, point)) ** 2 @ density, points)
+def _expected_power(skin, source_positions, frequencies, frequency_step):
+    source_powers = source_density(skin, frequencies) * frequency_step
+    return jax.lax.map(
+        lambda source_position: jnp.abs(transfer(skin, frequencies, source_position)) ** 2 @ source_powers,
+        source_positions,
+    )
 
 
 def nominal_power(skin: SoundingSkin, distances) -> Float[np.ndarray, " K"]:
@@ -114,11 +124,11 @@ def nominal_power(skin: SoundingSkin, distances) -> Float[np.ndarray, " K"]:
 
 
 @jax.jit
-def _nominal_power(skin, length):
+def _nominal_power(skin, path_lengths):
     frequencies = jnp.linspace(skin.readout.band[0] / 1.5, skin.readout.band[1] * 1.5, 2001)
-    decay = jnp.exp(-2 * skin.layer.material.loss(frequencies) * length[..., None])
-    return skin.layer.spreading(length, skin.microphone_model.depth) ** 2 * jnp.trapezoid(
-        source_density(skin, frequencies) * decay, frequencies
+    power_decay = jnp.exp(-2 * skin.layer.material.loss(frequencies) * path_lengths[..., None])
+    return skin.layer.spreading(path_lengths, skin.microphone_model.depth) ** 2 * jnp.trapezoid(
+        source_density(skin, frequencies) * power_decay, frequencies
     )
 
 

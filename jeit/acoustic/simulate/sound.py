@@ -50,8 +50,8 @@ def num_bins_of_source(skin: SoundingSkin, num_samples: int, *, blur: float = 0.
 
 def transform_size(count: int, padding: float, rate: float) -> int:
     """Length in samples of a fast Fourier transform of `count` samples with at least `padding` seconds of zeros."""
-    min_size = count + int(np.ceil(padding * rate))
-    return 2 * int(np.asarray(next_fast_len((min_size + 1) // 2)))
+    min_transform_length = count + int(np.ceil(padding * rate))
+    return 2 * int(np.asarray(next_fast_len((min_transform_length + 1) // 2)))
 
 
 def source_spectrum(skin: SoundingSkin, key: Array, envelope: Array, num_samples: int, num_bins: int) -> Array:
@@ -73,23 +73,29 @@ def noise_spectrum(skin: SoundingSkin, key: Array, level: Array, num_samples: in
     In a real signal of `num_samples` samples, bin k > 0 with variance v_k contributes 2 v_k / size² to the mean square,
     where size is `num_samples`.
     """
-    shape = band_filter(skin, bin_frequencies(skin, num_samples, num_bins))
-    variance = level[:, None] * shape / jnp.sum(shape) * num_samples**2 / 2
-    draws = jax.random.normal(key, (2, *variance.shape))
-    return jnp.sqrt(variance / 2) * (draws[0] + 1j * draws[1])
+    band_shape = band_filter(skin, bin_frequencies(skin, num_samples, num_bins))
+    bin_variance = level[:, None] * band_shape / jnp.sum(band_shape) * num_samples**2 / 2
+    normal_draws = jax.random.normal(key, (2, *bin_variance.shape))
+    return jnp.sqrt(bin_variance / 2) * (normal_draws[0] + 1j * normal_draws[1])
 
 
 @partial(jax.jit, static_argnums=(3, 4, 5))
-def _noise_samples(skin, key, level, count, size, bins):
-    return jnp.fft.irfft(noise_spectrum(skin, key, level, size, bins), size)[:, :count]
+def _noise_samples(skin, key, noise_level, num_samples, transform_length, num_bins):
+    return jnp.fft.irfft(noise_spectrum(skin, key, noise_level, transform_length, num_bins), transform_length)[
+        :, :num_samples
+    ]
 
 
 def microphone_noise(skin: SoundingSkin, key: Array, count: int) -> Float[np.ndarray, "M S"]:
     """Simulate `count` samples of noise of each microphone, (M, S) with S = `count`."""
-    # Noise synthesised from a spectrum is periodic with period `size`. More samples than needed are generated, so that
-    # the last samples are independent of the first.
-    size = transform_size(count, FILTER_RINGING_DURATION, skin.rate)
-    return np.asarray(_noise_samples(skin, key, noise_power(skin), count, size, num_bins_of_source(skin, size)))
+    # Noise synthesised from a spectrum is periodic with period `transform_length`. More samples than needed are
+    # generated, so that the last samples are independent of the first.
+    transform_length = transform_size(count, FILTER_RINGING_DURATION, skin.rate)
+    return np.asarray(
+        _noise_samples(
+            skin, key, noise_power(skin), count, transform_length, num_bins_of_source(skin, transform_length)
+        )
+    )
 
 
 def sample_times(skin: SoundingSkin, duration: float) -> Float[np.ndarray, " S"]:
@@ -138,10 +144,10 @@ class Burst(Module):
         integral is the mean square by which the shape is normalised.
         """
         rise_time = self.length / 6
-        elapsed = np.maximum(times - onsets[:, None], 0)
-        shape = elapsed * np.exp(-elapsed / rise_time) / np.sqrt(rise_time**3 / 4 / self.length)
+        elapsed_times = np.maximum(times - onsets[:, None], 0)
+        burst_shape = elapsed_times * np.exp(-elapsed_times / rise_time) / np.sqrt(rise_time**3 / 4 / self.length)
         # Overlapping bursts are treated as independent noises, so the powers of the bursts add.
-        return np.sqrt(((strengths[:, None] * shape) ** 2).sum(axis=0))
+        return np.sqrt(((strengths[:, None] * burst_shape) ** 2).sum(axis=0))
 
 
 def check_burst(burst: Burst, duration: float) -> None:
@@ -213,10 +219,14 @@ def superpose(skin: SoundingSkin, key: Array | None, *recordings: SimulatedSound
         raise ValueError("recordings: give at least one.")
     if any(recording.noisy for recording in recordings):
         raise ValueError("recordings: simulate them with noise=False; `superpose` adds the noise once.")
-    shapes = {(recording.samples.shape, recording.rate) for recording in recordings}
-    if len(shapes) > 1 or recordings[0].samples.shape[0] != skin.num_microphones or recordings[0].rate != skin.rate:
+    recording_shapes = {(recording.samples.shape, recording.rate) for recording in recordings}
+    if (
+        len(recording_shapes) > 1
+        or recordings[0].samples.shape[0] != skin.num_microphones
+        or recordings[0].rate != skin.rate
+    ):
         raise ValueError(
-            f"recordings: all must come from this skin and last equally long; shapes and rates are {shapes}."
+            f"recordings: all must come from this skin and last equally long; shapes and rates are {recording_shapes}."
         )
     samples = np.sum([recording.samples for recording in recordings], axis=0)
     return samples if key is None else samples + microphone_noise(skin, key, samples.shape[1])
@@ -263,23 +273,29 @@ def block_times(skin: SoundingSkin, count: int) -> np.ndarray:
 
 @partial(jax.jit, static_argnums=(4, 5, 6))
 def _moving_source_samples(skin, key, positions, envelope, num_samples, block_length, num_bins):
-    num_recorded, hop = envelope.shape[0], round(SOURCE_POSITION_INTERVAL * skin.rate)
+    num_recorded, hop_length = envelope.shape[0], round(SOURCE_POSITION_INTERVAL * skin.rate)
     source_samples = jnp.fft.irfft(
         source_spectrum(skin, key, envelope, num_samples, num_samples // 2 + 1), num_samples
     )[:num_recorded]
-    source_samples = jnp.pad(source_samples, (hop, positions.shape[0] * hop + hop - num_recorded))
-    window = jnp.sin(jnp.pi * jnp.arange(2 * hop) / (2 * hop)) ** 2
+    source_samples = jnp.pad(source_samples, (hop_length, positions.shape[0] * hop_length + hop_length - num_recorded))
+    block_window = jnp.sin(jnp.pi * jnp.arange(2 * hop_length) / (2 * hop_length)) ** 2
     frequencies = bin_frequencies(skin, block_length, num_bins)
 
-    def add_block(output, item):
-        block_index, position = item
-        block_sound = jax.lax.dynamic_slice(source_samples, (block_index * hop,), (2 * hop,)) * window
-        spectrum = jnp.fft.rfft(block_sound, block_length)[:num_bins] * transfer(skin, frequencies, position)
-        output_block = jax.lax.dynamic_slice(output, (0, block_index * hop), (output.shape[0], block_length))
+    def add_block(channel_samples, block_item):
+        block_index, block_position = block_item
+        block_sound = (
+            jax.lax.dynamic_slice(source_samples, (block_index * hop_length,), (2 * hop_length,)) * block_window
+        )
+        block_spectrum = jnp.fft.rfft(block_sound, block_length)[:num_bins] * transfer(
+            skin, frequencies, block_position
+        )
+        output_block = jax.lax.dynamic_slice(
+            channel_samples, (0, block_index * hop_length), (channel_samples.shape[0], block_length)
+        )
         return jax.lax.dynamic_update_slice(
-            output, output_block + jnp.fft.irfft(spectrum, block_length), (0, block_index * hop)
+            channel_samples, output_block + jnp.fft.irfft(block_spectrum, block_length), (0, block_index * hop_length)
         ), None
 
-    output = jnp.zeros((skin.num_microphones, positions.shape[0] * hop + block_length))
-    output, _ = jax.lax.scan(add_block, output, (jnp.arange(positions.shape[0]), positions))
-    return output[:, hop : hop + num_recorded]
+    channel_samples = jnp.zeros((skin.num_microphones, positions.shape[0] * hop_length + block_length))
+    channel_samples, _ = jax.lax.scan(add_block, channel_samples, (jnp.arange(positions.shape[0]), positions))
+    return channel_samples[:, hop_length : hop_length + num_recorded]

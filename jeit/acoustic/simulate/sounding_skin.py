@@ -52,10 +52,10 @@ class MicrophoneModel(Module):
     noise_spread_db: float = 1.0
 
     def __check_init__(self):
-        for name in ("depth", "reach"):
-            check_metres(name, getattr(self, name), MAX_SKIN_SIZE, "the longest skin known")
-        for name in ("gain_spread_db", "depth_spread", "noise_spread_db"):
-            check_not_negative(name, getattr(self, name))
+        for field_name in ("depth", "reach"):
+            check_metres(field_name, getattr(self, field_name), MAX_SKIN_SIZE, "the longest skin known")
+        for field_name in ("gain_spread_db", "depth_spread", "noise_spread_db"):
+            check_not_negative(field_name, getattr(self, field_name))
         if not np.isfinite(self.snr_db):
             raise ValueError(f"snr_db must be finite, in decibels; it is {self.snr_db}.")
 
@@ -82,11 +82,11 @@ class Readout(Module):
     def __check_init__(self):
         if not self.coupling_db < 0:
             raise ValueError(f"coupling_db: crosstalk must be below 0 dB; it is {self.coupling_db}.")
-        highest = self.rate / 2 / np.sqrt(2)
-        if len(self.band) != 2 or not 0 < self.band[0] < self.band[1] < highest:
+        max_frequency = self.rate / 2 / np.sqrt(2)
+        if len(self.band) != 2 or not 0 < self.band[0] < self.band[1] < max_frequency:
             raise ValueError(
-                f"band: give (low, high) in Hz, rising, with high below {highest:.0f} Hz so that nothing is left at "
-                f"half the sampling rate; it is {self.band}."
+                f"band: give (low, high) in Hz, rising, with high below {max_frequency:.0f} Hz so that nothing is left "
+                f"at half the sampling rate; it is {self.band}."
             )
 
     @property
@@ -149,8 +149,8 @@ class Elastomer(Module):
     attenuation_exponent: float = 1.2
 
     def __check_init__(self):
-        for name in ("shear_modulus", "density", "attenuation_frequency"):
-            check_positive(name, getattr(self, name))
+        for field_name in ("shear_modulus", "density", "attenuation_frequency"):
+            check_positive(field_name, getattr(self, field_name))
         check_not_negative("attenuation", self.attenuation)
         if not 0 <= self.attenuation_exponent <= 2:
             raise ValueError(
@@ -179,9 +179,11 @@ class Elastomer(Module):
         attenuation_exponent = jnp.where(
             jnp.abs(self.attenuation_exponent - 1) < 1e-6, 1 + 1e-6, self.attenuation_exponent
         )
-        relative = frequencies / self.attenuation_frequency
+        relative_frequencies = frequencies / self.attenuation_frequency
         dispersion_term = (
-            self.attenuation * jnp.tan(jnp.pi / 2 * attenuation_exponent) * (relative**attenuation_exponent - relative)
+            self.attenuation
+            * jnp.tan(jnp.pi / 2 * attenuation_exponent)
+            * (relative_frequencies**attenuation_exponent - relative_frequencies)
         )
         return 2 * jnp.pi * frequencies / self.wave_speed + dispersion_term
 
@@ -201,8 +203,8 @@ class ElastomerLayer(Module):
     reflection: float = 0.2
 
     def __check_init__(self):
-        for name in ("width", "height"):
-            check_metres(name, getattr(self, name), MAX_SKIN_SIZE, "the longest skin known")
+        for field_name in ("width", "height"):
+            check_metres(field_name, getattr(self, field_name), MAX_SKIN_SIZE, "the longest skin known")
         check_metres("thickness", self.thickness, max(self.width, self.height), "the layer is wide")
         check_kind("material", self.material, Elastomer, "an Elastomer, such as Elastomer(shear_modulus=1e5)")
         if not -1 <= self.reflection <= 1:
@@ -229,27 +231,27 @@ class ElastomerLayer(Module):
         """Return `points` (P, 2) in metres as floats. Raises `ValueError` unless all points are finite and on the
         layer; `name` is the argument's name in the message."""
         try:
-            positions = np.asarray(points, float)
+            point_array = np.asarray(points, float)
         except (TypeError, ValueError) as error:
             raise ValueError(f"{name}: give (x, y) in metres for each; {error}.") from None
-        if positions.ndim != 2 or positions.shape[1] != 2 or len(positions) == 0:
-            raise ValueError(f"{name}: give (x, y) in metres for each, shape (P, 2), not {positions.shape}.")
-        if not np.isfinite(positions).all():
-            raise ValueError(f"{name}: row {np.argmin(np.isfinite(positions).all(axis=1))} is not finite.")
-        half_size = np.array([self.width, self.height]) / 2 * (1 + 1e-9)
-        is_outside = (np.abs(positions) > half_size).any(axis=1)
-        if is_outside.any():
-            row = int(np.argmax(is_outside))
-            looks_like_millimetres = (np.abs(positions) > 10 * half_size).any() and (
-                np.abs(positions) <= 1000 * half_size
+        if point_array.ndim != 2 or point_array.shape[1] != 2 or len(point_array) == 0:
+            raise ValueError(f"{name}: give (x, y) in metres for each, shape (P, 2), not {point_array.shape}.")
+        if not np.isfinite(point_array).all():
+            raise ValueError(f"{name}: row {np.argmin(np.isfinite(point_array).all(axis=1))} is not finite.")
+        half_layer_size = np.array([self.width, self.height]) / 2 * (1 + 1e-9)
+        is_outside_layer = (np.abs(point_array) > half_layer_size).any(axis=1)
+        if is_outside_layer.any():
+            first_outside_index = int(np.argmax(is_outside_layer))
+            looks_like_millimetres = (np.abs(point_array) > 10 * half_layer_size).any() and (
+                np.abs(point_array) <= 1000 * half_layer_size
             ).all()
             unit_hint = " Are they in millimetres? Divide by 1000." if looks_like_millimetres else ""
             raise ValueError(
-                f"{name}: row {row}, ({positions[row, 0]:g}, {positions[row, 1]:g}) m, lies off the skin, which is "
-                f"{self.width:g} m by {self.height:g} m about the origin. Positions are in metres from its middle."
-                f"{unit_hint}"
+                f"{name}: row {first_outside_index}, ({point_array[first_outside_index, 0]:g}, "
+                f"{point_array[first_outside_index, 1]:g}) m, lies off the skin, which is {self.width:g} m by "
+                f"{self.height:g} m about the origin. Positions are in metres from its middle.{unit_hint}"
             )
-        return positions
+        return point_array
 
 
 class SoundingSkin(Module):
@@ -318,16 +320,18 @@ class SoundingSkin(Module):
         if not np.isfinite(spectral_slope):
             raise ValueError(f"spectral_slope must be finite; it is {spectral_slope}.")
         self.spectral_slope = spectral_slope
-        width, height = self.layer.width, self.layer.height
-        positions = microphone_grid(5, width=width, height=height) if microphones is None else microphones
-        positions = self.layer.check_inside("microphones", positions)
-        draws = np.asarray(jax.random.normal(key, (3, len(positions))))
-        self.microphones = jnp.asarray(positions)
-        self.microphone_depth = jnp.asarray(
-            self.microphone_model.depth * np.exp(self.microphone_model.depth_spread * draws[0])
+        layer_width, layer_height = self.layer.width, self.layer.height
+        microphone_positions = (
+            microphone_grid(5, width=layer_width, height=layer_height) if microphones is None else microphones
         )
-        self.gain = jnp.asarray(10 ** (self.microphone_model.gain_spread_db * draws[1] / 20))
-        self.noise_factor = jnp.asarray(10 ** (self.microphone_model.noise_spread_db * draws[2] / 10))
+        microphone_positions = self.layer.check_inside("microphones", microphone_positions)
+        normal_draws = np.asarray(jax.random.normal(key, (3, len(microphone_positions))))
+        self.microphones = jnp.asarray(microphone_positions)
+        self.microphone_depth = jnp.asarray(
+            self.microphone_model.depth * np.exp(self.microphone_model.depth_spread * normal_draws[0])
+        )
+        self.gain = jnp.asarray(10 ** (self.microphone_model.gain_spread_db * normal_draws[1] / 20))
+        self.noise_factor = jnp.asarray(10 ** (self.microphone_model.noise_spread_db * normal_draws[2] / 10))
 
     @property
     def num_microphones(self) -> int:

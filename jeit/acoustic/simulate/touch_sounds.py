@@ -85,9 +85,9 @@ def simulate_tap(
     if repeats < 1:
         raise ValueError(f"repeats: give at least one tap, not {repeats}.")
     check_burst(burst, duration)
-    onsets = FIRST_BURST_TIME + np.arange(repeats) / frequency
-    times = sample_times(skin, max(duration, onsets[-1] + burst.length + 0.03))
-    envelope = burst.envelope(times, onsets, np.full(repeats, burst.strength))
+    tap_onsets = FIRST_BURST_TIME + np.arange(repeats) / frequency
+    times = sample_times(skin, max(duration, tap_onsets[-1] + burst.length + 0.03))
+    envelope = burst.envelope(times, tap_onsets, np.full(repeats, burst.strength))
     return simulate_recording(skin, key, _check_position(skin, position), envelope, noise)
 
 
@@ -125,8 +125,8 @@ def simulate_pat(
     ```
     """
     check_positive("interval", interval)
-    repetition = {"repeats": taps, "frequency": 1 / interval}
-    return simulate_tap(skin, key, position, burst=burst, **repetition, duration=duration, noise=noise)
+    repetition_options = {"repeats": taps, "frequency": 1 / interval}
+    return simulate_tap(skin, key, position, burst=burst, **repetition_options, duration=duration, noise=noise)
 
 
 def simulate_tickle(
@@ -167,30 +167,36 @@ def simulate_tickle(
     ```
     """
     check_skin_and_key(skin, key)
-    centre = _check_position(skin, position)[0]
+    disc_centre = _check_position(skin, position)[0]
     check_positive("radius", radius)
     check_positive("taps_per_second", taps_per_second)
     check_burst(burst, duration)
     times = sample_times(skin, duration)
     num_taps = max(1, int((duration - FIRST_BURST_TIME - burst.length) * taps_per_second))
     position_key, jitter_key, strength_key, sound_key = jax.random.split(key, 4)
-    onsets = (
+    tap_onsets = (
         FIRST_BURST_TIME
         + (np.arange(num_taps) + 0.25 * np.asarray(jax.random.uniform(jitter_key, (num_taps,)))) / taps_per_second
     )
     strengths = burst.strength * np.exp(0.3 * np.asarray(jax.random.normal(strength_key, (num_taps,))))
-    distance, angle = np.asarray(jax.random.uniform(position_key, (2, num_taps)))
+    relative_distances, relative_angles = np.asarray(jax.random.uniform(position_key, (2, num_taps)))
     # The square root of a uniform number makes the positions uniform over the disc.
-    offsets = (radius * np.sqrt(distance) * [np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)]).T
+    tap_offsets = (
+        radius
+        * np.sqrt(relative_distances)
+        * [np.cos(2 * np.pi * relative_angles), np.sin(2 * np.pi * relative_angles)]
+    ).T
     for tap_index in range(1, num_taps):
-        offsets[tap_index] = (offsets[tap_index - 1] + offsets[tap_index]) / 2
-    half_size = np.array([skin.layer.width, skin.layer.height]) / 2
-    tap_positions = np.clip(centre + offsets, -half_size, half_size)
+        tap_offsets[tap_index] = (tap_offsets[tap_index - 1] + tap_offsets[tap_index]) / 2
+    half_skin_size = np.array([skin.layer.width, skin.layer.height]) / 2
+    tap_positions = np.clip(disc_centre + tap_offsets, -half_skin_size, half_skin_size)
     # The source moves to the position of a tap at the onset of that tap.
-    blocks = np.maximum(
-        np.searchsorted(onsets, block_times(skin, len(times)) + SOURCE_POSITION_INTERVAL, side="right") - 1, 0
+    tap_of_block = np.maximum(
+        np.searchsorted(tap_onsets, block_times(skin, len(times)) + SOURCE_POSITION_INTERVAL, side="right") - 1, 0
     )
-    return simulate_recording(skin, sound_key, tap_positions[blocks], burst.envelope(times, onsets, strengths), noise)
+    return simulate_recording(
+        skin, sound_key, tap_positions[tap_of_block], burst.envelope(times, tap_onsets, strengths), noise
+    )
 
 
 def simulate_stroke(
@@ -234,23 +240,31 @@ def simulate_stroke(
         raise ValueError(
             f"path: the function gave {len(path_positions)} positions for {len(times)} times; give one for each."
         )
-    speed = np.linalg.norm(np.gradient(path_positions, times, axis=0), axis=1)
-    if not speed.any():
+    finger_speed = np.linalg.norm(np.gradient(path_positions, times, axis=0), axis=1)
+    if not finger_speed.any():
         raise ValueError(
             "path: its length is zero, and a finger at rest makes no sound; give a longer path, or simulate a tap."
         )
     # The stroke fades in and out over 20 ms.
     fade_amplitude = np.sin(np.pi / 2 * np.clip(np.minimum(times, duration - times) / 0.02, 0, 1))
     block_centres = block_times(skin, len(times))
-    positions = np.stack([np.interp(block_centres, times, axis) for axis in path_positions.T], axis=-1)
-    return simulate_recording(skin, key, positions, strength * np.sqrt(speed / NOMINAL_SPEED) * fade_amplitude, noise)
+    block_positions = np.stack(
+        [np.interp(block_centres, times, axis_positions) for axis_positions in path_positions.T], axis=-1
+    )
+    return simulate_recording(
+        skin, key, block_positions, strength * np.sqrt(finger_speed / NOMINAL_SPEED) * fade_amplitude, noise
+    )
 
 
-def _position_on_polyline(skin: SoundingSkin, corners, duration: float) -> Callable[[np.ndarray], np.ndarray]:
-    vertices = skin.layer.check_inside("path", corners)
-    arc_lengths = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(vertices, axis=0), axis=1))])
+def _position_on_polyline(skin: SoundingSkin, path_corners, duration: float) -> Callable[[np.ndarray], np.ndarray]:
+    path_vertices = skin.layer.check_inside("path", path_corners)
+    arc_lengths = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path_vertices, axis=0), axis=1))])
     return lambda times: np.stack(
-        [np.interp(times / duration * arc_lengths[-1], arc_lengths, axis) for axis in vertices.T], axis=-1
+        [
+            np.interp(times / duration * arc_lengths[-1], arc_lengths, axis_positions)
+            for axis_positions in path_vertices.T
+        ],
+        axis=-1,
     )
 
 
@@ -320,50 +334,56 @@ def simulate_calibration_taps(
         strength_spread * np.asarray(jax.random.normal(strength_key, (len(tap_positions), repeats)))
     )
     envelope = burst.envelope(times, np.array([FIRST_BURST_TIME]), np.array([1.0]))
-    size = transform_size(len(times), skin.layer.longest_delay + FILTER_RINGING_DURATION, skin.rate)
+    transform_length = transform_size(len(times), skin.layer.longest_delay + FILTER_RINGING_DURATION, skin.rate)
     samples = np.empty((len(tap_positions), repeats, skin.num_microphones, len(times)))
-    level = noise_power(skin) if noise else None
-    keys = jax.random.split(tap_key, len(tap_positions))
+    noise_level = noise_power(skin) if noise else None
+    random_keys = jax.random.split(tap_key, len(tap_positions))
     # The taps are computed in chunks, which limits memory. All chunks have the same size, so that one compiled program
     # serves all chunks.
     num_chunks = min(len(tap_positions), -(-samples.size // MAX_CHUNK_SAMPLES))
-    for chunk in np.array_split(np.arange(-(-len(tap_positions) // num_chunks) * num_chunks), num_chunks):
-        chunk = np.minimum(chunk, len(tap_positions) - 1)
-        samples[chunk] = _tap_samples(
+    for chunk_indices in np.array_split(np.arange(-(-len(tap_positions) // num_chunks) * num_chunks), num_chunks):
+        chunk_indices = np.minimum(chunk_indices, len(tap_positions) - 1)
+        samples[chunk_indices] = _tap_samples(
             skin,
-            keys[chunk],
-            tap_positions[chunk],
-            strengths[chunk],
+            random_keys[chunk_indices],
+            tap_positions[chunk_indices],
+            strengths[chunk_indices],
             envelope,
-            level,
-            size,
-            num_bins_of_source(skin, size),
+            noise_level,
+            transform_length,
+            num_bins_of_source(skin, transform_length),
         )
         if progress is not None:
-            progress(f"{chunk[-1] + 1} of {len(tap_positions)} places")
+            progress(f"{chunk_indices[-1] + 1} of {len(tap_positions)} places")
     return CalibrationTaps(
         samples.reshape(-1, *samples.shape[2:]), skin.rate, np.repeat(tap_positions, repeats, axis=0), strengths.ravel()
     )
 
 
 @partial(jax.jit, static_argnums=(6, 7))
-def _tap_samples(skin, keys, positions, strengths, envelope, level, size, bins):
-    frequencies = bin_frequencies(skin, size, bins)
+def _tap_samples(
+    skin, random_keys, tap_positions, strengths_of_positions, envelope, noise_level, transform_length, num_bins
+):
+    frequencies = bin_frequencies(skin, transform_length, num_bins)
 
-    def samples_at_position(item):
-        key, position, tap_strengths = item
-        source_key, noise_key = jax.random.split(key)
-        channels = transfer(skin, frequencies, position)
+    def samples_at_position(tap_item):
+        random_key, tap_position, tap_strengths = tap_item
+        source_key, noise_key = jax.random.split(random_key)
+        channel_transfer = transfer(skin, frequencies, tap_position)
 
-        def samples_of_tap(key, noise_key, strength):
-            spectrum = strength * source_spectrum(skin, key, envelope, size, bins) * channels
-            if level is not None:
-                spectrum += noise_spectrum(skin, noise_key, level, size, bins)
-            return jnp.fft.irfft(spectrum, size)[:, : len(envelope)]
+        def samples_of_tap(random_key, noise_key, tap_strength):
+            channel_spectra = (
+                tap_strength
+                * source_spectrum(skin, random_key, envelope, transform_length, num_bins)
+                * channel_transfer
+            )
+            if noise_level is not None:
+                channel_spectra += noise_spectrum(skin, noise_key, noise_level, transform_length, num_bins)
+            return jnp.fft.irfft(channel_spectra, transform_length)[:, : len(envelope)]
 
         num_repetitions = len(tap_strengths)
         return jax.vmap(samples_of_tap)(
             jax.random.split(source_key, num_repetitions), jax.random.split(noise_key, num_repetitions), tap_strengths
         )
 
-    return jax.lax.map(samples_at_position, (keys, positions, strengths))
+    return jax.lax.map(samples_at_position, (random_keys, tap_positions, strengths_of_positions))

@@ -71,26 +71,40 @@ def simulate_wind(
     ```
     """
     check_skin_and_key(skin, key)
-    centre = skin.layer.check_inside("position", [position])[0]
-    for name, value in (("strength", strength), ("radius", radius), ("gust_time", gust_time), ("duration", duration)):
-        check_positive(name, value)
-    for name, value in (("gusts", gusts), ("slope", slope)):
-        check_not_negative(name, value)
+    jet_centre = skin.layer.check_inside("position", [position])[0]
+    for argument_name, argument_value in (
+        ("strength", strength),
+        ("radius", radius),
+        ("gust_time", gust_time),
+        ("duration", duration),
+    ):
+        check_positive(argument_name, argument_value)
+    for argument_name, argument_value in (("gusts", gusts), ("slope", slope)):
+        check_not_negative(argument_name, argument_value)
     position_key, gust_key, wind_key, noise_key = jax.random.split(key, 4)
-    half_size = np.array([skin.layer.width, skin.layer.height]) / 2
+    half_skin_size = np.array([skin.layer.width, skin.layer.height]) / 2
     eddy_positions = np.clip(
-        centre + radius * np.asarray(jax.random.normal(position_key, (_NUM_EDDIES, 2))), -half_size, half_size
+        jet_centre + radius * np.asarray(jax.random.normal(position_key, (_NUM_EDDIES, 2))),
+        -half_skin_size,
+        half_skin_size,
     )
     times = sample_times(skin, duration)
-    amplitude = np.exp(gusts * _slow_noise(gust_key, len(times), gust_time * skin.rate) - gusts**2)
-    density = _spectral_density(skin, slope, _received_power(skin, jnp.asarray(eddy_positions), _frequency_grid(skin)))
-    samples = strength * amplitude * _coloured_noise(skin, wind_key, density, len(times))
+    gust_amplitude = np.exp(gusts * _slow_noise(gust_key, len(times), gust_time * skin.rate) - gusts**2)
+    spectral_density = _spectral_density(
+        skin, slope, _received_power(skin, jnp.asarray(eddy_positions), _frequency_grid(skin))
+    )
+    samples = strength * gust_amplitude * _coloured_noise(skin, wind_key, spectral_density, len(times))
     if noise:
         samples = samples + microphone_noise(skin, noise_key, len(times))
-    centres = block_times(skin, len(times))
-    position_times = centres[centres <= len(times) / skin.rate]
+    block_centres = block_times(skin, len(times))
+    position_times = block_centres[block_centres <= len(times) / skin.rate]
     return SimulatedSound(
-        samples, skin.rate, np.tile(centre, (len(position_times), 1)), position_times, strength * amplitude, noise
+        samples,
+        skin.rate,
+        np.tile(jet_centre, (len(position_times), 1)),
+        position_times,
+        strength * gust_amplitude,
+        noise,
     )
 
 
@@ -122,9 +136,9 @@ def simulate_room_sound(
     if not np.isfinite(level_db):
         raise ValueError(f"level_db must be finite, in decibels; it is {level_db}.")
     times = sample_times(skin, duration)
-    power = float(np.median(noise_power(skin) / np.asarray(skin.noise_factor))) * 10 ** (level_db / 10)
+    room_power = float(np.median(noise_power(skin) / np.asarray(skin.noise_factor))) * 10 ** (level_db / 10)
     room_signal = _coloured_noise(
-        skin, key, power * _spectral_density(skin, slope, np.ones((1, _NUM_FREQUENCIES))), len(times)
+        skin, key, room_power * _spectral_density(skin, slope, np.ones((1, _NUM_FREQUENCIES))), len(times)
     )
     samples = np.asarray(skin.gain)[:, None] * room_signal
     return SimulatedSound(samples, skin.rate, np.zeros((0, 2)), np.zeros(0), np.zeros(len(times)), False)
@@ -132,53 +146,63 @@ def simulate_room_sound(
 
 def _frequency_grid(skin: SoundingSkin) -> Float[np.ndarray, " G"]:
     """Frequencies (G,) in Hz with equal ratios, from half an octave below the band to half an octave above the band."""
-    low, high = skin.readout.band
-    return np.geomspace(low / np.sqrt(2), high * np.sqrt(2), _NUM_FREQUENCIES)
+    lowest_frequency, highest_frequency = skin.readout.band
+    return np.geomspace(lowest_frequency / np.sqrt(2), highest_frequency * np.sqrt(2), _NUM_FREQUENCIES)
 
 
 @jax.jit
-def _received_power(skin: SoundingSkin, positions: Array, frequencies: Array) -> Array:
-    """Power (M, G) received by each microphone at G `frequencies` from equal sources at all `positions` (P, 2), divided
-    by the total power of the sources."""
-    total = jnp.zeros((skin.microphones.shape[0], len(frequencies)))
+def _received_power(skin: SoundingSkin, source_positions: Array, frequencies: Array) -> Array:
+    """Power (M, G) received by each microphone at G `frequencies` from equal sources at all `source_positions` (P, 2),
+    divided by the total power of the sources."""
+    total_power = jnp.zeros((skin.microphones.shape[0], len(frequencies)))
 
-    def add_source(source_index, total):
-        return total + jnp.abs(transfer(skin, frequencies, positions[source_index])) ** 2
+    def add_source(source_index, total_power):
+        return total_power + jnp.abs(transfer(skin, frequencies, source_positions[source_index])) ** 2
 
-    return jax.lax.fori_loop(0, len(positions), add_source, total) / len(positions)
+    return jax.lax.fori_loop(0, len(source_positions), add_source, total_power) / len(source_positions)
 
 
 def _spectral_density(skin: SoundingSkin, slope: float, received_power: ArrayLike) -> Float[np.ndarray, "M G"]:
     """Power spectral densities (M, G) at the microphones, in 1/Hz, for sources of total mean square 1. `received_power`
     (M, G): received power divided by the power of the sources."""
-    grid = _frequency_grid(skin)
-    shape = np.asarray(band_filter(skin, jnp.asarray(grid))) * (grid / grid[0]) ** -slope
-    return np.asarray(received_power) * shape / np.trapezoid(shape, grid)
+    frequency_grid = _frequency_grid(skin)
+    spectrum_shape = (
+        np.asarray(band_filter(skin, jnp.asarray(frequency_grid))) * (frequency_grid / frequency_grid[0]) ** -slope
+    )
+    return np.asarray(received_power) * spectrum_shape / np.trapezoid(spectrum_shape, frequency_grid)
 
 
 def _coloured_noise(
-    skin: SoundingSkin, key: Array, spectral_density: Float[np.ndarray, "M G"], count: int
+    skin: SoundingSkin, key: Array, spectral_density: Float[np.ndarray, "M G"], num_samples: int
 ) -> np.ndarray:
-    """Simulate `count` samples (M, S) of independent noises at M microphones, with the power spectral densities
+    """Simulate `num_samples` samples (M, S) of independent noises at M microphones, with the power spectral densities
     `spectral_density`."""
-    size = transform_size(count, FILTER_RINGING_DURATION, skin.rate)
-    bins = num_bins_of_source(skin, size)
-    frequencies = np.asarray(bin_frequencies(skin, size, bins))
-    grid = _frequency_grid(skin)
-    # In a real signal of `size` samples, bin k > 0 with variance v_k contributes 2 v_k / size² to the mean square.
-    variance = np.stack([np.interp(frequencies, grid, row, left=0.0, right=0.0) for row in spectral_density])
-    draws = np.asarray(jax.random.normal(key, (2, len(spectral_density), bins)))
-    spectrum = np.sqrt(variance * skin.rate * size / 4) * (draws[0] + 1j * draws[1])
-    return np.fft.irfft(spectrum, size)[:, :count]
+    transform_length = transform_size(num_samples, FILTER_RINGING_DURATION, skin.rate)
+    num_bins = num_bins_of_source(skin, transform_length)
+    frequencies = np.asarray(bin_frequencies(skin, transform_length, num_bins))
+    frequency_grid = _frequency_grid(skin)
+    # In a real signal of `transform_length` samples, bin k > 0 with variance v_k contributes 2 v_k / size² to the mean
+    # square.
+    bin_variances = np.stack(
+        [
+            np.interp(frequencies, frequency_grid, channel_density, left=0.0, right=0.0)
+            for channel_density in spectral_density
+        ]
+    )
+    normal_draws = np.asarray(jax.random.normal(key, (2, len(spectral_density), num_bins)))
+    channel_spectra = np.sqrt(bin_variances * skin.rate * transform_length / 4) * (
+        normal_draws[0] + 1j * normal_draws[1]
+    )
+    return np.fft.irfft(channel_spectra, transform_length)[:, :num_samples]
 
 
-def _slow_noise(key: Array, count: int, correlation_length: float) -> Float[np.ndarray, " S"]:
+def _slow_noise(key: Array, num_samples: int, correlation_length: float) -> Float[np.ndarray, " S"]:
     """Simulate slowly varying normal noise (S,) of variance 1, with a correlation length of `correlation_length`
     samples."""
-    num_knots = int(np.ceil(count / correlation_length)) + 3
-    values = np.asarray(jax.random.normal(key, (num_knots,)))
+    num_knots = int(np.ceil(num_samples / correlation_length)) + 3
+    knot_values = np.asarray(jax.random.normal(key, (num_knots,)))
     # The interpolation weights are the cosine and sine of the same angle, so the variance of the noise is 1 everywhere.
-    knot_coordinates = np.arange(count) / correlation_length
+    knot_coordinates = np.arange(num_samples) / correlation_length
     knot_index = knot_coordinates.astype(int)
-    angle = np.pi / 2 * (knot_coordinates - knot_index)
-    return np.cos(angle) * values[knot_index] + np.sin(angle) * values[knot_index + 1]
+    blend_angle = np.pi / 2 * (knot_coordinates - knot_index)
+    return np.cos(blend_angle) * knot_values[knot_index] + np.sin(blend_angle) * knot_values[knot_index + 1]

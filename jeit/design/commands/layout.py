@@ -48,7 +48,7 @@ _MIN_CONDUCTIVITY, _MAX_CONDUCTIVITY = 1e-9, 1e9
 _OPTIMISATION_FILES = ("layout.csv", "layout.svg", "travel.png", "report.json")
 # Minimum and maximum number of nodes of the mesh used in the optimisation: enough to form cells, and few enough for the
 # final mesh, which has four times as many.
-_MIN_NODES, _MAX_NODES = 4, 250_000
+_MIN_MESH_NODES, _MAX_MESH_NODES = 4, 250_000
 # Printed quantities: key in the report, name and unit, and factor that converts the reported value to that unit.
 _OPTIMISED_QUANTITIES = (
     ("worst_sensitivity_V", "least sensitivity / mV", 1e3),
@@ -86,14 +86,14 @@ _COMPARED_QUANTITIES = (
 
 
 @layout.callback(invoke_without_command=True)
-def _print_help(context: typer.Context) -> None:
-    if context.invoked_subcommand is None:
-        typer.echo(context.get_help())
+def _print_help(command_context: typer.Context) -> None:
+    if command_context.invoked_subcommand is None:
+        typer.echo(command_context.get_help())
 
 
-def _read_with_outline(name: str, width: float, height: float) -> "Layout":
-    """Read an electrode layout with the outline of its skin; `name`: name of a built-in layout, or path of a file. If
-    the layout has no outline, the outline is a rectangle of `width` × `height` (mm).
+def _read_layout_with_outline(name_or_path: str, width_mm: float, height_mm: float) -> "Layout":
+    """Read an electrode layout with the outline of its skin; `name_or_path`: name of a built-in layout, or path of a
+    file. If the layout has no outline, the outline is a rectangle of `width_mm` × `height_mm` (mm).
 
     Raises `ValueError` for a layout with fewer than three electrodes.
     """
@@ -102,30 +102,34 @@ def _read_with_outline(name: str, width: float, height: float) -> "Layout":
     from jeit.mesh import Rectangle
 
     def outline_from_options() -> Rectangle:
-        for option, side in (("--width-mm", width), ("--height-mm", height)):
-            check_within(option, side, 1e3 * MIN_SKIN_SIZE, 1e3 * MAX_SKIN_SIZE, "mm")
-        return Rectangle(1e-3 * width, 1e-3 * height)
+        for option_name, side_length_mm in (("--width-mm", width_mm), ("--height-mm", height_mm)):
+            check_within(option_name, side_length_mm, 1e3 * MIN_SKIN_SIZE, 1e3 * MAX_SKIN_SIZE, "mm")
+        return Rectangle(1e-3 * width_mm, 1e-3 * height_mm)
 
     with naming_options_in_errors({"name": "layout", "path": "layout"}):
-        if not Path(name).suffix:
-            layout = named_layout(name) if name.startswith("park-") else named_layout(name, outline_from_options())
+        if not Path(name_or_path).suffix:
+            layout = (
+                named_layout(name_or_path)
+                if name_or_path.startswith("park-")
+                else named_layout(name_or_path, outline_from_options())
+            )
         else:
-            layout = read_layout(name)
+            layout = read_layout(name_or_path)
             if layout.outline is None:
-                layout = read_layout(name, outline=outline_from_options())
+                layout = read_layout(name_or_path, outline=outline_from_options())
     if layout.num_electrodes < 3:
         raise ValueError(f"'{layout.name}' has {layout.num_electrodes} electrodes; give a layout of three or more.")
     return layout
 
 
-def _check_layer(thickness: float, conductivity: float) -> None:
+def _check_layer_options(thickness_mm: float, conductivity: float) -> None:
     """Raise `ValueError` unless --thickness-mm is more than the depth of a touch, and --conductivity is from 1e-9 to
     1e9 S/m."""
     from jeit.design.defaults import DEPTH
 
-    if not 1e3 * DEPTH < thickness < float("inf"):
+    if not 1e3 * DEPTH < thickness_mm < float("inf"):
         raise ValueError(
-            f"--thickness-mm must be more than the {1e3 * DEPTH:g} mm that a touch is deep; it is {thickness:g}."
+            f"--thickness-mm must be more than the {1e3 * DEPTH:g} mm that a touch is deep; it is {thickness_mm:g}."
         )
     check_within("--conductivity", conductivity, _MIN_CONDUCTIVITY, _MAX_CONDUCTIVITY, "S/m")
 
@@ -174,51 +178,63 @@ def optimise(
     from jeit.design import DesignSpace, improve_layout
     from jeit.design.reports import write_improved_layout
 
-    _check_layer(thickness, conductivity)
+    _check_layer_options(thickness, conductivity)
     check_positive({"--noise": noise})
     if contact_impedance is not None:
         check_positive({"--contact-impedance": contact_impedance})
     check_at_least({"--starts": (starts, 1), "--steps": (steps, 1), "--seed": (seed, 0)})
     if not 0 <= minimum_spacing < float("inf"):
         raise ValueError(f"--minimum-spacing-mm must not be negative; it is {minimum_spacing:g}.")
-    check_within("--num-points", num_points, _MIN_NODES, _MAX_NODES)
-    start = _read_with_outline(layout, width, height)
-    keep_out_domains = [_parse_region(text, start.known_outline) for text in keep_out or ()]
+    check_within("--num-points", num_points, _MIN_MESH_NODES, _MAX_MESH_NODES)
+    initial_layout = _read_layout_with_outline(layout, width, height)
+    keep_out_domains = [_parse_region(region_text, initial_layout.known_outline) for region_text in keep_out or ()]
     make_folder(output, _OPTIMISATION_FILES)
-    space = DesignSpace(
+    design_space = DesignSpace(
         minimum_spacing=1e-3 * minimum_spacing, keep_out=keep_out_domains, symmetry=symmetry, sizes=sizes
     )
     search_options = {"noise": noise, "steps": steps, "starts": starts, "seed": seed, "num_points": num_points}
-    material = {"thickness": 1e-3 * thickness, "conductivity": conductivity, "contact_impedance": contact_impedance}
+    material_options = {
+        "thickness": 1e-3 * thickness,
+        "conductivity": conductivity,
+        "contact_impedance": contact_impedance,
+    }
     console = plain_console()
 
-    def report_step(step_number: int, values) -> None:
-        step.report(f"step {step_number} of at most {steps}, best score {values.max():.3f}")
+    def report_step(step_number: int, scores_of_starts) -> None:
+        progress_steps.report(f"step {step_number} of at most {steps}, best score {scores_of_starts.max():.3f}")
 
-    with Steps(console, quiet=quiet) as step:
-        result = improve_layout(start, space, **search_options, **material, progress=step, callback=report_step)
-        step("write")
-        write_improved_layout(result, output)
+    with Steps(console, quiet=quiet) as progress_steps:
+        improved_layout = improve_layout(
+            initial_layout,
+            design_space,
+            **search_options,
+            **material_options,
+            progress=progress_steps,
+            callback=report_step,
+        )
+        progress_steps("write")
+        write_improved_layout(improved_layout, output)
     if not quiet:
-        _print_improvement(console, result)
+        _print_improvement(console, improved_layout)
         print_written_files(console, output / _OPTIMISATION_FILES[0], *_OPTIMISATION_FILES[1:])
 
 
-def _print_improvement(console, result: "ImprovedLayout") -> None:
+def _print_improvement(console, improved_layout: "ImprovedLayout") -> None:
     from jeit.cli.console import name_value_table
     from jeit.design.reports import report_improved_layout
 
-    report = report_improved_layout(result)
-    quantities = [
-        (name, factor, report["start"][key], report["optimised"][key]) for key, name, factor in _OPTIMISED_QUANTITIES
+    improvement_report = report_improved_layout(improved_layout)
+    scores_of_quantities = [
+        (quantity_name, unit_factor, improvement_report["start"][score_key], improvement_report["optimised"][score_key])
+        for score_key, quantity_name, unit_factor in _OPTIMISED_QUANTITIES
     ]
-    rows = [
-        (name, f"{factor * score_before:.3g} → {factor * score_after:.3g}")
-        for name, factor, score_before, score_after in quantities
+    table_rows = [
+        (quantity_name, f"{unit_factor * score_before:.3g} → {unit_factor * score_after:.3g}")
+        for quantity_name, unit_factor, score_before, score_after in scores_of_quantities
         if score_before is not None and score_after is not None
     ]
-    console.print(name_value_table(result.start.name, rows))
-    console.print(f"  {report['status']}: {report['reason']}", soft_wrap=True)
+    console.print(name_value_table(improved_layout.start.name, table_rows))
+    console.print(f"  {improvement_report['status']}: {improvement_report['reason']}", soft_wrap=True)
     console.print(
         "  on a sheet that is touched everywhere, with all two-terminal pairs: 'jeit layout compare' computes figures "
         "of a layer\n  the bound of the place is the error that noise alone causes",
@@ -228,34 +244,41 @@ def _print_improvement(console, result: "ImprovedLayout") -> None:
     )
 
 
-def _parse_region(text: str, outline: "Domain") -> "Disk | Rectangle":
+def _parse_region(region_text: str, skin_outline: "Domain") -> "Disk | Rectangle":
     """Parse a keep-out region: a disc "x,y,radius" or a rectangle "x1,y1,x2,y2", mm. Raises `ValueError` for other
     text, and for a region off the skin."""
     from jeit.mesh import Disk, Rectangle
 
     try:
-        numbers = [1e-3 * float(number_text) for number_text in text.split(",")]
+        region_numbers = [1e-3 * float(number_text) for number_text in region_text.split(",")]
     except ValueError:
-        numbers = []
-    if len(numbers) not in (3, 4) or not all(abs(number) < float("inf") for number in numbers):
+        region_numbers = []
+    if len(region_numbers) not in (3, 4) or not all(
+        abs(region_number) < float("inf") for region_number in region_numbers
+    ):
         raise ValueError(
-            f"--keep-out is {text!r}; give a disc x,y,radius or a rectangle x1,y1,x2,y2, millimetres, such as 0,0,15."
+            f"--keep-out is {region_text!r}; give a disc x,y,radius or a rectangle x1,y1,x2,y2, millimetres, such as "
+            "0,0,15."
         )
-    if len(numbers) == 3:
-        x, y, radius = numbers
-        low_x, high_x, low_y, high_y = x - radius, x + radius, y - radius, y + radius
+    if len(region_numbers) == 3:
+        x, y, disc_radius = region_numbers
+        low_x, high_x, low_y, high_y = x - disc_radius, x + disc_radius, y - disc_radius, y + disc_radius
     else:
-        (low_x, high_x), (low_y, high_y) = sorted(numbers[0::2]), sorted(numbers[1::2])
+        (low_x, high_x), (low_y, high_y) = sorted(region_numbers[0::2]), sorted(region_numbers[1::2])
     if not (high_x > low_x and high_y > low_y):
-        raise ValueError(f"--keep-out {text} has no size; give a positive radius, or two opposite corners.")
-    x_min, x_max, y_min, y_max = outline.extent
-    if low_x >= x_max or high_x <= x_min or low_y >= y_max or high_y <= y_min:
+        raise ValueError(f"--keep-out {region_text} has no size; give a positive radius, or two opposite corners.")
+    skin_x_min, skin_x_max, skin_y_min, skin_y_max = skin_outline.extent
+    if low_x >= skin_x_max or high_x <= skin_x_min or low_y >= skin_y_max or high_y <= skin_y_min:
         raise ValueError(
-            f"--keep-out {text} lies off the skin, which spans {1e3 * x_min:g} to {1e3 * x_max:g} mm by "
-            f"{1e3 * y_min:g} to {1e3 * y_max:g} mm."
+            f"--keep-out {region_text} lies off the skin, which spans {1e3 * skin_x_min:g} to {1e3 * skin_x_max:g} mm "
+            f"by {1e3 * skin_y_min:g} to {1e3 * skin_y_max:g} mm."
         )
-    centre = ((low_x + high_x) / 2, (low_y + high_y) / 2)
-    return Disk(numbers[2], centre) if len(numbers) == 3 else Rectangle(high_x - low_x, high_y - low_y, centre)
+    region_centre = ((low_x + high_x) / 2, (low_y + high_y) / 2)
+    return (
+        Disk(region_numbers[2], region_centre)
+        if len(region_numbers) == 3
+        else Rectangle(high_x - low_x, high_y - low_y, region_centre)
+    )
 
 
 @layout.command()
@@ -300,22 +323,22 @@ def compare(
     from jeit.design.skin.names import skin_protocol
     from jeit.design.skin.skin import create_skins
 
-    _check_layer(thickness, conductivity)
+    _check_layer_options(thickness, conductivity)
     check_positive({"--cell-mm": cell})
     check_within("--places", places, 2, _MAX_POSITIONS_PER_SIDE)
     check_at_least({"--pairs": (pairs, 0), "--taxels": (taxels, 1), "--seed": (seed, 0)})
     if not 0 <= margin < float("inf"):
         raise ValueError(f"--margin-mm must not be negative; it is {margin:g}.")
-    layouts = [_read_with_outline(name, width, height) for name in (first, second)]
+    layouts = [_read_layout_with_outline(layout_name, width, height) for layout_name in (first, second)]
     make_folder(output, _COMPARISON_FILES)
     console = plain_console()
-    with naming_options_in_errors(_OPTION_NAMES), Steps(console, quiet=quiet) as step:
+    with naming_options_in_errors(_OPTION_NAMES), Steps(console, quiet=quiet) as progress_steps:
         check_same_outline(*layouts)
-        step("mesh")
+        progress_steps("mesh")
         protocols = [skin_protocol(compared_layout, num_pairs=pairs) for compared_layout in layouts]
-        material = {"thickness": 1e-3 * thickness, "conductivity": conductivity}
-        skins_to_compare = create_skins(layouts, protocols, **material, cell_size=1e-3 * cell)
-        result = compare_layouts(
+        material_options = {"thickness": 1e-3 * thickness, "conductivity": conductivity}
+        skins_to_compare = create_skins(layouts, protocols, **material_options, cell_size=1e-3 * cell)
+        comparison = compare_layouts(
             skins_to_compare[0],
             skins_to_compare[1],
             margin=1e-3 * margin,
@@ -323,52 +346,59 @@ def compare(
             contrast=contrast,
             num_taxels=taxels,
             seed=seed,
-            progress=step,
+            progress=progress_steps,
         )
-        step("write")
-        write_layout_comparison(result, output)
+        progress_steps("write")
+        write_layout_comparison(comparison, output)
     if not quiet:
-        _print_comparison(console, result)
+        _print_comparison(console, comparison)
         print_written_files(console, output / "report.json", "comparison.png")
 
 
-def _model_text(skin: "Skin") -> str:
+def _skin_model_text(skin: "Skin") -> str:
     """Describe a skin in words: layer or sheet, and its thickness."""
-    thickness = f"{1e3 * float(skin.thickness):g} mm thick"
-    return f"a layer {thickness}" if skin.model.mesh.dimension == 3 else f"a sheet, {thickness}"
+    thickness_text = f"{1e3 * float(skin.thickness):g} mm thick"
+    return f"a layer {thickness_text}" if skin.model.mesh.dimension == 3 else f"a sheet, {thickness_text}"
 
 
-def _print_comparison(console, result: "LayoutComparison") -> None:
+def _print_comparison(console, comparison: "LayoutComparison") -> None:
     from rich.table import Table
 
     from jeit.design.reports.layouts import distinct_names
 
-    figures = result.figures
-    table = Table(
-        "", *distinct_names([layout_figures["layout"] for layout_figures in figures]), box=None, padding=(0, 2, 0, 0)
+    scores_of_layouts = comparison.figures
+    score_table = Table(
+        "",
+        *distinct_names([layout_scores["layout"] for layout_scores in scores_of_layouts]),
+        box=None,
+        padding=(0, 2, 0, 0),
     )
-    for column in table.columns[1:]:
-        column.justify = "right"
-    for name, key, factor in _COMPARED_QUANTITIES:
-        table.add_row(name, *(f"{factor * layout_figures[key]:.3g}" for layout_figures in figures))
-        if key == "taxel_count":
-            for statistic in ("mean", "std", "max"):
-                table.add_row(
-                    f"taxel area, {statistic} / cm²",
-                    *(f"{layout_figures['taxel_area_cm2'][statistic]:.3g}" for layout_figures in figures),
+    for table_column in score_table.columns[1:]:
+        table_column.justify = "right"
+    for quantity_name, score_key, unit_factor in _COMPARED_QUANTITIES:
+        score_table.add_row(
+            quantity_name, *(f"{unit_factor * layout_scores[score_key]:.3g}" for layout_scores in scores_of_layouts)
+        )
+        if score_key == "taxel_count":
+            for area_statistic in ("mean", "std", "max"):
+                score_table.add_row(
+                    f"taxel area, {area_statistic} / cm²",
+                    *(f"{layout_scores['taxel_area_cm2'][area_statistic]:.3g}" for layout_scores in scores_of_layouts),
                 )
     console.print()
-    console.print(table)
-    skin = result.skins[0]
-    pairs = " and ".join(f"{skin.model.protocol.num_measurements}" for skin in result.skins)
-    notes = [
-        f"{_model_text(skin)}; two-terminal measurements: {pairs}",
-        f"touched at {result.places} × {result.places} places, {1e3 * result.margin:g} mm or more from the edge, to "
-        f"{result.contrast:g} times its conductivity",
+    console.print(score_table)
+    first_skin = comparison.skins[0]
+    measurement_counts_text = " and ".join(
+        f"{first_skin.model.protocol.num_measurements}" for first_skin in comparison.skins
+    )
+    footnotes = [
+        f"{_skin_model_text(first_skin)}; two-terminal measurements: {measurement_counts_text}",
+        f"touched at {comparison.places} × {comparison.places} places, {1e3 * comparison.margin:g} mm or more from the "
+        f"edge, to {comparison.contrast:g} times its conductivity",
         "blind spot: less sensitive than the other layout's least sensitive place",
     ]
-    if len({skin.model.protocol.num_measurements for skin in result.skins}) > 1:
-        notes.append("sensitivities are norms over all measurements: more measurements alone make them larger")
-    for note in notes:
-        console.print(note, style="dim", highlight=False, soft_wrap=True)
+    if len({first_skin.model.protocol.num_measurements for first_skin in comparison.skins}) > 1:
+        footnotes.append("sensitivities are norms over all measurements: more measurements alone make them larger")
+    for footnote in footnotes:
+        console.print(footnote, style="dim", highlight=False, soft_wrap=True)
     console.print()

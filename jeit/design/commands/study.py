@@ -29,9 +29,9 @@ SchedulerOption = Annotated[
 
 
 @study.callback(invoke_without_command=True)
-def _print_help(context: typer.Context) -> None:
-    if context.invoked_subcommand is None:
-        typer.echo(context.get_help())
+def _print_help(command_context: typer.Context) -> None:
+    if command_context.invoked_subcommand is None:
+        typer.echo(command_context.get_help())
 
 
 @study.command()
@@ -45,14 +45,14 @@ def run(
     """Run a study from its beginning, and write its report."""
     from jeit.design.study.lock import lock_store
 
-    sweep, store = _read_study_and_path(file, output)
-    if store.exists() and not (store / "zarr.json").is_file():
-        raise ValueError(f"--output {store}: there is something else already; choose another name.")
-    if store.exists():
-        with lock_store(store, "study"):  # refuses while another process is writing, before the store is deleted
+    parameter_sweep, store_path = _read_study_and_path(file, output)
+    if store_path.exists() and not (store_path / "zarr.json").is_file():
+        raise ValueError(f"--output {store_path}: there is something else already; choose another name.")
+    if store_path.exists():
+        with lock_store(store_path, "study"):  # refuses while another process is writing, before the store is deleted
             pass
-        raise ValueError(f"{store} is there already: 'jeit study resume {file}' goes on with it; or delete it.")
-    _run_with_progress(sweep, file, store, page, scheduler, quiet)
+        raise ValueError(f"{store_path} is there already: 'jeit study resume {file}' goes on with it; or delete it.")
+    _run_with_progress(parameter_sweep, file, store_path, page, scheduler, quiet)
 
 
 @study.command()
@@ -66,11 +66,11 @@ def resume(
     """Continue a study that was stopped; its finished chunks are not computed again."""
     from jeit.design.study.store import Store
 
-    sweep, store = _read_study_and_path(file, output)
-    if not store.exists():
-        raise ValueError(f"there is no {store} to go on with: begin with 'jeit study run {file}'.")
-    Store(sweep, store, create=False)  # checks that the path is the store of this study
-    _run_with_progress(sweep, file, store, page, scheduler, quiet)
+    parameter_sweep, store_path = _read_study_and_path(file, output)
+    if not store_path.exists():
+        raise ValueError(f"there is no {store_path} to go on with: begin with 'jeit study run {file}'.")
+    Store(parameter_sweep, store_path, create=False)  # checks that the path is the store of this study
+    _run_with_progress(parameter_sweep, file, store_path, page, scheduler, quiet)
 
 
 @study.command()
@@ -79,14 +79,18 @@ def status(file: StudyFileArgument, output: OutputOption = None) -> None:
     from jeit.arguments import counted
     from jeit.design.study import study_progress
 
-    sweep, store = _read_study_and_path(file, output)
-    if not store.exists():
-        points, chunks = counted(len(sweep.points), "point"), counted(len(sweep.chunks), "chunk")
-        typer.echo(f"{sweep.name}: not begun; {points} in {chunks}.")
+    parameter_sweep, store_path = _read_study_and_path(file, output)
+    if not store_path.exists():
+        points_text, chunks_text = (
+            counted(len(parameter_sweep.points), "point"),
+            counted(len(parameter_sweep.chunks), "chunk"),
+        )
+        typer.echo(f"{parameter_sweep.name}: not begun; {points_text} in {chunks_text}.")
         return
-    now = study_progress(sweep, store)
+    progress = study_progress(parameter_sweep, store_path)
     typer.echo(
-        f"{sweep.name}: {now.points} of {now.all_points} points finished, in {now.chunks} of {now.all_chunks} chunks."
+        f"{parameter_sweep.name}: {progress.points} of {progress.all_points} points finished, in {progress.chunks} of "
+        f"{progress.all_chunks} chunks."
     )
 
 
@@ -95,33 +99,38 @@ def report(file: StudyFileArgument, output: OutputOption = None, page: PageOptio
     """Write an HTML page with the finished results of a study."""
     from jeit.design.reports import write_study_report
 
-    sweep, store = _read_study_and_path(file, output)
-    report_path = _report_path(file, store, page)
-    write_study_report(sweep, store, report_path)
+    parameter_sweep, store_path = _read_study_and_path(file, output)
+    report_path = _report_path(file, store_path, page)
+    write_study_report(parameter_sweep, store_path, report_path)
     typer.echo(f"Written: {report_path}")
 
 
-def _read_study_and_path(file: Path, output: Path | None) -> "tuple[Study, Path]":
+def _read_study_and_path(study_file: Path, requested_store_path: Path | None) -> "tuple[Study, Path]":
     """Read the study from its TOML file, and return it with the path of its store of results."""
     from jeit.design.study import read_study
 
     with naming_options_in_errors({"path": "study"}):
-        return read_study(file), output or file.with_suffix(".zarr")
+        return read_study(study_file), requested_store_path or study_file.with_suffix(".zarr")
 
 
-def _report_path(file: Path, store: Path, page: Path | None) -> Path:
+def _report_path(study_file: Path, store_path: Path, requested_report_path: Path | None) -> Path:
     """Path of the HTML report. Raises `ValueError` if the folder of the report does not exist, and if the path is the
     path of the study file or of the store of results."""
-    report_path = page or file.with_suffix(".html")
+    report_path = requested_report_path or study_file.with_suffix(".html")
     if not report_path.parent.is_dir():
         raise ValueError(f"--page {report_path}: there is no folder {report_path.parent}; make it first.")
-    if report_path.resolve() in (file.resolve(), store.resolve()):
+    if report_path.resolve() in (study_file.resolve(), store_path.resolve()):
         raise ValueError(f"--page {report_path}: that is the study itself; choose another name.")
     return report_path
 
 
 def _run_with_progress(
-    sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: str | None, quiet: bool
+    parameter_sweep: "Study",
+    study_file: Path,
+    store_path: Path,
+    requested_report_path: Path | None,
+    scheduler_address: str | None,
+    is_quiet: bool,
 ) -> None:
     from contextlib import ExitStack
 
@@ -133,32 +142,36 @@ def _run_with_progress(
     from jeit.design.reports import write_study_report
     from jeit.design.study import run_study
 
-    report_path = _report_path(file, store, page)
+    report_path = _report_path(study_file, store_path, requested_report_path)
     require_extra("cluster", "a study")  # before the progress bar starts
     console = plain_console()
     task_column, time_column = (
-        TextColumn(f"{{{field}}}", markup=False) for field in ("task.description", "task.fields[left]")
+        TextColumn(f"{{{column_field}}}", markup=False) for column_field in ("task.description", "task.fields[left]")
     )
-    columns = (task_column, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), time_column)
+    progress_columns = (task_column, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), time_column)
     try:
-        with ExitStack() as stack:
-            client = None if scheduler is None else stack.enter_context(connect_to_scheduler(scheduler))
-            bar = stack.enter_context(Bar(*columns, console=console, disable=quiet))
-            task = bar.add_task("points", total=len(sweep.points), left="")
+        with ExitStack() as exit_stack:
+            cluster_client = (
+                None if scheduler_address is None else exit_stack.enter_context(connect_to_scheduler(scheduler_address))
+            )
+            progress_bar = exit_stack.enter_context(Bar(*progress_columns, console=console, disable=is_quiet))
+            progress_task = progress_bar.add_task("points", total=len(parameter_sweep.points), left="")
 
-            def show_progress(now: "Progress") -> None:
-                time_text = "" if now.seconds_left is None else f"{_format_duration(now.seconds_left)} left"
-                bar.update(task, completed=now.points, left=time_text)
+            def show_progress(progress: "Progress") -> None:
+                remaining_time_text = (
+                    "" if progress.seconds_left is None else f"{_format_duration(progress.seconds_left)} left"
+                )
+                progress_bar.update(progress_task, completed=progress.points, left=remaining_time_text)
 
-            run_study(sweep, store, client=client, progress=show_progress)
-        write_study_report(sweep, store, report_path)
+            run_study(parameter_sweep, store_path, client=cluster_client, progress=show_progress)
+        write_study_report(parameter_sweep, store_path, report_path)
     except KeyboardInterrupt:
-        if not store.exists():
+        if not store_path.exists():
             raise
-        output_option = "" if store == file.with_suffix(".zarr") else f" --output {store}"
-        raise StoppedError(f"stopped; 'jeit study resume {file}{output_option}' goes on with it.") from None
-    if not quiet:
-        print_written_files(console, store, str(report_path))
+        output_option = "" if store_path == study_file.with_suffix(".zarr") else f" --output {store_path}"
+        raise StoppedError(f"stopped; 'jeit study resume {study_file}{output_option}' goes on with it.") from None
+    if not is_quiet:
+        print_written_files(console, store_path, str(report_path))
 
 
 def connect_to_scheduler(scheduler: str):
@@ -172,8 +185,12 @@ def connect_to_scheduler(scheduler: str):
         raise ValueError(f"--scheduler {scheduler} does not answer: {error}") from None
 
 
-def _format_duration(seconds: float) -> str:
+def _format_duration(duration_seconds: float) -> str:
     """Format a duration as hours, minutes and seconds, such as "1:02:03"."""
-    minutes, remaining_seconds = divmod(round(seconds), 60)
-    hours, minute = divmod(minutes, 60)
-    return f"{hours}:{minute:02}:{remaining_seconds:02}" if hours else f"{minute}:{remaining_seconds:02}"
+    total_minutes, remaining_seconds = divmod(round(duration_seconds), 60)
+    hours, remaining_minutes = divmod(total_minutes, 60)
+    return (
+        f"{hours}:{remaining_minutes:02}:{remaining_seconds:02}"
+        if hours
+        else f"{remaining_minutes}:{remaining_seconds:02}"
+    )

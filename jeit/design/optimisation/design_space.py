@@ -37,17 +37,18 @@ class Constraints(Module):
         """Raise `ValueError` if L discs of `radii` (L,), metres, are more than the densest packing of circles in the
         outline's bounding box allows."""
         x_min, x_max, y_min, y_max = self.outline.extent
-        min_radius = float(np.min(radii))
-        min_distance = max(self.minimum_spacing, 2 * min_radius)
-        # Circles of radius `min_distance` / 2 around the discs' centres do not overlap. The circles extend by this
-        # radius beyond the region in which the centres may lie.
-        available_area = (x_max - x_min - 2 * min_radius + min_distance) * (
-            y_max - y_min - 2 * min_radius + min_distance
+        min_electrode_radius = float(np.min(radii))
+        min_centre_distance = max(self.minimum_spacing, 2 * min_electrode_radius)
+        # Circles of radius `min_centre_distance` / 2 around the discs' centres do not overlap. The circles extend by
+        # this radius beyond the region in which the centres may lie.
+        available_area = (x_max - x_min - 2 * min_electrode_radius + min_centre_distance) * (
+            y_max - y_min - 2 * min_electrode_radius + min_centre_distance
         )
-        if len(radii) * min_distance**2 > 2 / np.sqrt(3) * available_area:
+        if len(radii) * min_centre_distance**2 > 2 / np.sqrt(3) * available_area:
             raise ValueError(
-                f"minimum_spacing: {len(radii)} electrodes {1e3 * min_distance:.3g} mm apart do not fit the outline, "
-                f"{1e3 * (x_max - x_min):.3g} × {1e3 * (y_max - y_min):.3g} mm; give less, or fewer electrodes."
+                f"minimum_spacing: {len(radii)} electrodes {1e3 * min_centre_distance:.3g} mm apart do not fit the "
+                f"outline, {1e3 * (x_max - x_min):.3g} × {1e3 * (y_max - y_min):.3g} mm; give less, or fewer "
+                "electrodes."
             )
 
     def violations(self, centres: Float[Array, "L 2"], radii: Float[Array, " L"]) -> Float[Array, " q"]:
@@ -61,11 +62,13 @@ class Constraints(Module):
         """Violations of the constraints on L discs, metres, by the name of the constraint: "minimum_spacing", "outline"
         and "keep_out"."""
         first_electrodes, second_electrodes = np.triu_indices(len(radii), 1)
-        distances = jnp.sqrt(jnp.sum((centres[first_electrodes] - centres[second_electrodes]) ** 2, axis=1) + 1e-24)
-        keep_out_violations = [radii + domain.signed_distance(centres) for domain in self.keep_out]
+        centre_distances = jnp.sqrt(
+            jnp.sum((centres[first_electrodes] - centres[second_electrodes]) ** 2, axis=1) + 1e-24
+        )
+        keep_out_violations = [radii + keep_out_domain.signed_distance(centres) for keep_out_domain in self.keep_out]
         return {
             "minimum_spacing": jnp.maximum(self.minimum_spacing, radii[first_electrodes] + radii[second_electrodes])
-            - distances,
+            - centre_distances,
             "outline": radii - self.outline.signed_distance(centres),
             "keep_out": jnp.concatenate(keep_out_violations) if keep_out_violations else jnp.zeros(0),
         }
@@ -124,10 +127,10 @@ class DesignSpace(Module):
             check_kind("outline", outline, Domain, "an outline, such as Rectangle(0.2, 0.2)")
         if not is_number(minimum_spacing):
             raise ValueError(f"minimum_spacing must be a length in metres; it is {describe(minimum_spacing)}.")
-        requirement = "a list of domains, such as [Disk(0.01, (0.02, 0.0))]"
-        check_kind("keep_out", keep_out, Sequence, requirement)
-        for domain in keep_out:
-            check_kind("keep_out", domain, Domain, requirement)
+        keep_out_requirement = "a list of domains, such as [Disk(0.01, (0.02, 0.0))]"
+        check_kind("keep_out", keep_out, Sequence, keep_out_requirement)
+        for keep_out_domain in keep_out:
+            check_kind("keep_out", keep_out_domain, Domain, keep_out_requirement)
         self.outline, self.minimum_spacing, self.keep_out = outline, float(minimum_spacing), tuple(keep_out)
         self.symmetry, self.sizes = symmetry, sizes
         self.contact_impedance, self.thickness = contact_impedance, thickness
@@ -147,33 +150,35 @@ class DesignSpace(Module):
     def variables(self, skin: Skin, constraints: Constraints, depth: float) -> Variables:
         """Design variables of the layouts, starting from the layout of a `skin` whose touches are `depth` metres deep.
         Raises `ValueError` for settings of the design space that no layout can satisfy."""
-        options = {"sizes": self.sizes, "contacts": self.contact_impedance, "thickness": self.thickness}
+        variable_options = {"sizes": self.sizes, "contacts": self.contact_impedance, "thickness": self.thickness}
         outline = constraints.outline
-        variables = Variables.create(outline, layout_parameters(skin), symmetry=self.symmetry, **options)
+        design_variables = Variables.create(
+            outline, layout_parameters(skin), symmetry=self.symmetry, **variable_options
+        )
         if self.thickness is not None:
             _check_thickness(self.thickness, depth, outline)
-        constraints.check_room(variables.min_radii)
-        return variables
+        constraints.check_room(design_variables.min_radii)
+        return design_variables
 
 
 def layout_parameters(skin: Skin) -> LayoutParameters:
     """Current positions, radii and contact impedances of a skin's electrodes and its thickness: the quantities that a
     layout optimisation may vary."""
-    discs = skin.model.electrodes
-    contact_impedance = discs.contact_impedance  # pyright: ignore[reportAttributeAccessIssue]
+    disc_electrodes = skin.model.electrodes
+    contact_impedance = disc_electrodes.contact_impedance  # pyright: ignore[reportAttributeAccessIssue]
     return LayoutParameters(
         skin.layout.centres, skin.layout.diameters / 2, contact_impedance, jnp.asarray(skin.thickness, float)
     )
 
 
-def _check_thickness(thickness: tuple[float, float], depth: float, outline: Domain) -> None:
-    if np.min(thickness) <= depth:
-        raise ValueError(f"thickness: the touches are {1e3 * depth:.3g} mm deep; let the sheet be thicker.")
-    check_metres("thickness", np.max(thickness), longer_side(outline), "the skin is wide")
+def _check_thickness(thickness_limits: tuple[float, float], touch_depth: float, outline: Domain) -> None:
+    if np.min(thickness_limits) <= touch_depth:
+        raise ValueError(f"thickness: the touches are {1e3 * touch_depth:.3g} mm deep; let the sheet be thicker.")
+    check_metres("thickness", np.max(thickness_limits), longer_side(outline), "the skin is wide")
 
 
 # The minimisation has converged if the relative decrease of the cost in a step is below this value.
-_TOLERANCE = 1e-5
+_COST_TOLERANCE = 1e-5
 
 
 class OptimisationHistory:
@@ -194,7 +199,12 @@ class OptimisationHistory:
 
 
 def minimise_from_starts(
-    cost, variables: Float[Array, "S v"], steps: int, history: OptimisationHistory, *, tolerance: float = _TOLERANCE
+    cost,
+    variables: Float[Array, "S v"],
+    steps: int,
+    history: OptimisationHistory,
+    *,
+    tolerance: float = _COST_TOLERANCE,
 ) -> tuple[Float[Array, "S v"], Status]:
     """Minimise the sum of the costs of S starts over v variables between 0 and 1 by L-BFGS. Returns the final variables
     (S, v) and the status: converged, step limit, or stalled if no step along the gradient lowers the cost.
@@ -202,18 +212,18 @@ def minimise_from_starts(
     `cost`: function of the variables (S, v) that returns the costs (S,), the scores (S,) for the `history`, and the
     gradient (S, v) of the costs.
     """
-    last_evaluation = {}
+    last_cost_evaluation = {}
 
     def value_and_gradient(variables):
-        costs, scores, gradients = cost(variables)
-        last_evaluation.update(variables=np.asarray(variables), score=np.asarray(scores))
-        return np.asarray(costs).sum(), gradients
+        costs_of_starts, scores_of_starts, cost_gradients = cost(variables)
+        last_cost_evaluation.update(variables=np.asarray(variables), score=np.asarray(scores_of_starts))
+        return np.asarray(costs_of_starts).sum(), cost_gradients
 
     def record_step(variables):
-        is_last_evaluation = np.array_equal(last_evaluation["variables"], variables)
-        history.add(variables, last_evaluation["score"] if is_last_evaluation else cost(variables)[1])
+        is_last_evaluation = np.array_equal(last_cost_evaluation["variables"], variables)
+        history.add(variables, last_cost_evaluation["score"] if is_last_evaluation else cost(variables)[1])
 
-    final_variables, _, status = scipy_lbfgsb(
+    final_variables, _, optimiser_status = scipy_lbfgsb(
         value_and_gradient, variables, 0.0, 1.0, tolerance=tolerance, max_steps=steps, callback=record_step
     )
-    return jnp.asarray(final_variables), status
+    return jnp.asarray(final_variables), optimiser_status

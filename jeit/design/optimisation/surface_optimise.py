@@ -81,50 +81,64 @@ def optimise_surface_layout(
         raise ValueError("skin must be a curved sheet: Skin.create(surface_layout, num_layers=0); see optimise_layout.")
     if not isinstance(steps, int) or steps < 1:
         raise ValueError(f"steps must be a whole number from 1; it is {describe(steps)}.")
-    for name, distance in (("minimum_spacing", minimum_spacing), ("margin", margin)):
-        if not is_number(distance) or distance < 0:
-            raise ValueError(f"{name} must be in metres, not negative; it is {describe(distance)}.")
-    surface, radii = Triangles.of(layout.surface), np.asarray(layout.diameters) / 2
-    min_distances = np.maximum(minimum_spacing, radii[:, None] + radii)
-    np.fill_diagonal(min_distances, 0.0)
+    for argument_name, argument_value in (("minimum_spacing", minimum_spacing), ("margin", margin)):
+        if not is_number(argument_value) or argument_value < 0:
+            raise ValueError(f"{argument_name} must be in metres, not negative; it is {describe(argument_value)}.")
+    skin_surface, electrode_radii = Triangles.of(layout.surface), np.asarray(layout.diameters) / 2
+    min_centre_distances = np.maximum(minimum_spacing, electrode_radii[:, None] + electrode_radii)
+    np.fill_diagonal(min_centre_distances, 0.0)
     score_and_gradient = _score_function(skin, objective)
-    positions = np.asarray(layout.centres)
-    score, gradient = score_and_gradient(positions)
-    electrode_spacing = float(np.sqrt(surface.areas.sum() / len(positions)))
-    step_length, history, snapshots = _MAX_STEP_FRACTION * electrode_spacing, [score], [positions]
-    for step in range(steps):
-        normals = surface.normals_at(surface.nearest(positions))
-        tangential_gradient = gradient - (gradient * normals).sum(axis=1, keepdims=True) * normals
-        max_gradient = np.linalg.norm(tangential_gradient, axis=1).max()
+    electrode_positions = np.asarray(layout.centres)
+    layout_score, score_gradient = score_and_gradient(electrode_positions)
+    electrode_spacing = float(np.sqrt(skin_surface.areas.sum() / len(electrode_positions)))
+    step_length, score_history, position_snapshots = (
+        _MAX_STEP_FRACTION * electrode_spacing,
+        [layout_score],
+        [electrode_positions],
+    )
+    for step_index in range(steps):
+        surface_normals = skin_surface.normals_at(skin_surface.nearest(electrode_positions))
+        tangential_gradient = (
+            score_gradient - (score_gradient * surface_normals).sum(axis=1, keepdims=True) * surface_normals
+        )
+        max_gradient_norm = np.linalg.norm(tangential_gradient, axis=1).max()
         accepted_step = None
-        while max_gradient > 0 and step_length > _MIN_STEP_FRACTION * electrode_spacing:
-            candidate_positions = surface.nearest(positions + step_length / max_gradient * tangential_gradient).points
-            if _is_feasible(candidate_positions, min_distances, surface, radii + margin):
+        while max_gradient_norm > 0 and step_length > _MIN_STEP_FRACTION * electrode_spacing:
+            candidate_positions = skin_surface.nearest(
+                electrode_positions + step_length / max_gradient_norm * tangential_gradient
+            ).points
+            if _is_feasible(candidate_positions, min_centre_distances, skin_surface, electrode_radii + margin):
                 candidate_score, candidate_gradient = score_and_gradient(candidate_positions)
-                if candidate_score > score:
+                if candidate_score > layout_score:
                     accepted_step = candidate_positions, candidate_score, candidate_gradient
                     break
             step_length /= 2
         if accepted_step is None:
             break
-        positions, score, gradient = accepted_step
+        electrode_positions, layout_score, score_gradient = accepted_step
         step_length = min(1.5 * step_length, _MAX_STEP_FRACTION * electrode_spacing)
-        history.append(score)
-        snapshots.append(positions)
+        score_history.append(layout_score)
+        position_snapshots.append(electrode_positions)
         if callback is not None:
-            callback(step, score)
-    options = {"contact_impedance": layout.contact_impedance, "outward": layout.outward, "labels": layout.labels}
-    final_layout = SurfaceLayout(positions, layout.diameters, layout.surface, name=layout.name, **options)
-    return SurfaceOptimisation(final_layout, score, history[0], np.array(history), np.array(snapshots))
+            callback(step_index, layout_score)
+    layout_options = {"contact_impedance": layout.contact_impedance, "outward": layout.outward, "labels": layout.labels}
+    final_layout = SurfaceLayout(
+        electrode_positions, layout.diameters, layout.surface, name=layout.name, **layout_options
+    )
+    return SurfaceOptimisation(
+        final_layout, layout_score, score_history[0], np.array(score_history), np.array(position_snapshots)
+    )
 
 
 def surface_scores(skin: Skin, objective: Objective, positions: Float[Array, "L 3"]) -> Scores:
     """Compute all scores of a curved sheet with its electrodes moved to `positions` (L, 3), metres. The scores are
     differentiable with respect to the positions."""
-    discs = skin.model.electrodes
-    assert isinstance(discs, SurfaceDiscs)
-    model = skin.model.with_electrodes(SurfaceDiscs(positions, discs.radius, discs.contact_impedance))
-    return objective.scores(eqx.tree_at(lambda skin_to_change: skin_to_change.model, skin, model))
+    disc_electrodes = skin.model.electrodes
+    assert isinstance(disc_electrodes, SurfaceDiscs)
+    moved_model = skin.model.with_electrodes(
+        SurfaceDiscs(positions, disc_electrodes.radius, disc_electrodes.contact_impedance)
+    )
+    return objective.scores(eqx.tree_at(lambda skin_to_change: skin_to_change.model, skin, moved_model))
 
 
 def _score_function(skin: Skin, objective: Objective):
@@ -134,17 +148,18 @@ def _score_function(skin: Skin, objective: Objective):
         jax.value_and_grad(lambda score_positions: objective.score(surface_scores(skin, objective, score_positions)))
     )
 
-    def score_and_gradient(positions):
-        score, gradient = compiled_score(as_array(positions))
-        return float(score), np.asarray(gradient)
+    def score_and_gradient(electrode_positions):
+        layout_score, score_gradient = compiled_score(as_array(electrode_positions))
+        return float(layout_score), np.asarray(score_gradient)
 
     return score_and_gradient
 
 
-def _is_feasible(positions, min_distances, surface: Triangles, min_edge_distances) -> bool:
-    """Whether the straight distances between the centres (L, 3) are at least `min_distances` (L, L), and the distances
-    of the centres from the edge are at least `min_edge_distances` (L,), all in metres."""
-    distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
+def _is_feasible(electrode_positions, min_centre_distances, skin_surface: Triangles, min_edge_distances) -> bool:
+    """Whether the straight distances between the centres (L, 3) are at least `min_centre_distances` (L, L), and the
+    distances of the centres from the edge are at least `min_edge_distances` (L,), all in metres."""
+    centre_distances = np.linalg.norm(electrode_positions[:, None] - electrode_positions, axis=-1)
     return bool(
-        (distances >= min_distances).all() and (surface.distance_to_border(positions) >= min_edge_distances).all()
+        (centre_distances >= min_centre_distances).all()
+        and (skin_surface.distance_to_border(electrode_positions) >= min_edge_distances).all()
     )

@@ -23,7 +23,7 @@ from jeit_solvers.engines import as_array, namespace, values_at_once
 from jeit_solvers.module import Module
 
 Symmetry = Literal["mirror-x", "mirror-y", "rotate-2", "rotate-4"]
-_IMAGES = {
+_SYMMETRY_MATRICES = {
     None: ((1, 0, 0, 1),),
     "mirror-x": ((1, 0, 0, 1), (-1, 0, 0, 1)),
     "mirror-y": ((1, 0, 0, 1), (1, 0, 0, -1)),
@@ -105,61 +105,75 @@ class Variables(Module):
         """Create the mapping from the `initial` parameters of a layout. Raises `ValueError` for settings that
         contradict the parameters."""
         if symmetry is not None:
-            check_name("symmetry", symmetry, filter(None, _IMAGES), ", or None")
-        centres, radii = np.asarray(initial.centres), np.asarray(initial.radii)
-        images = np.array(_IMAGES[symmetry], float).reshape(-1, 2, 2)
+            check_name("symmetry", symmetry, filter(None, _SYMMETRY_MATRICES), ", or None")
+        electrode_centres, electrode_radii = np.asarray(initial.centres), np.asarray(initial.radii)
+        symmetry_matrices = np.array(_SYMMETRY_MATRICES[symmetry], float).reshape(-1, 2, 2)
         x_min, x_max, y_min, y_max = outline.extent
         if symmetry == "rotate-4" and not np.isclose(x_max - x_min, y_max - y_min):
             raise ValueError("symmetry: a quarter turn maps only a square onto itself, and the outline's box is none.")
         box_centre = np.array([x_min + x_max, y_min + y_max]) / 2
-        is_generator = _is_in_first_sector(centres - box_centre, symmetry)
-        _check_symmetric_counts(is_generator.sum(), len(images), len(centres), symmetry)
-        size_range = contact_range = None
+        is_generating_electrode = _is_in_first_sector(electrode_centres - box_centre, symmetry)
+        _check_symmetric_counts(is_generating_electrode.sum(), len(symmetry_matrices), len(electrode_centres), symmetry)
+        radius_range = contact_impedance_range = None
         if sizes is True:
-            size_range = LogarithmicRange(radii[is_generator] / 2, np.full(is_generator.sum(), np.log(4.0)))
+            radius_range = LogarithmicRange(
+                electrode_radii[is_generating_electrode] / 2, np.full(is_generating_electrode.sum(), np.log(4.0))
+            )
         elif sizes is not False:
-            diameters = LogarithmicRange.create("sizes", sizes, radii[is_generator], "metres")
-            size_range = LogarithmicRange(diameters.lower_limits / 2, diameters.log_ratios)
+            diameter_range = LogarithmicRange.create("sizes", sizes, electrode_radii[is_generating_electrode], "metres")
+            radius_range = LogarithmicRange(diameter_range.lower_limits / 2, diameter_range.log_ratios)
         if contacts is not None:
-            contact_range = LogarithmicRange.create("contact_impedance", contacts, radii[is_generator], "ohm·m²")
+            contact_impedance_range = LogarithmicRange.create(
+                "contact_impedance", contacts, electrode_radii[is_generating_electrode], "ohm·m²"
+            )
         thickness_range = (
             None if thickness is None else LogarithmicRange.create("thickness", thickness, np.ones(1), "metres")
         )
-        min_radius = radii.min() if size_range is None else size_range.lower_limits.min()
-        low, size = np.array([x_min, y_min]) + min_radius, np.array([x_max - x_min, y_max - y_min]) - 2 * min_radius
-        if (size <= 0).any():
-            name = "outline: it" if size_range is None else "sizes: the outline"
-            raise ValueError(f"{name} is smaller than an electrode; give millimetres divided by 1000.")
-        image_positions = (np.einsum("kij,gj->kgi", images, centres[is_generator] - box_centre) + box_centre).reshape(
-            -1, 2
+        min_electrode_radius = electrode_radii.min() if radius_range is None else radius_range.lower_limits.min()
+        low_corner, box_size = (
+            np.array([x_min, y_min]) + min_electrode_radius,
+            np.array([x_max - x_min, y_max - y_min]) - 2 * min_electrode_radius,
         )
+        if (box_size <= 0).any():
+            constrained_argument = "outline: it" if radius_range is None else "sizes: the outline"
+            raise ValueError(f"{constrained_argument} is smaller than an electrode; give millimetres divided by 1000.")
+        mirrored_positions = (
+            np.einsum("kij,gj->kgi", symmetry_matrices, electrode_centres[is_generating_electrode] - box_centre)
+            + box_centre
+        ).reshape(-1, 2)
         # Images of generators are assigned to electrodes such that the sum of the distances between image and electrode
         # is minimal.
         electrode_order = scipy.optimize.linear_sum_assignment(
-            np.linalg.norm(centres[:, None] - image_positions, axis=-1)
+            np.linalg.norm(electrode_centres[:, None] - mirrored_positions, axis=-1)
         )[1]
-        start = [np.clip((centres[is_generator] - low) / size, 0, 1).ravel()]
-        if size_range is not None:
-            start.append(size_range.variables(radii[is_generator]))
-        if contact_range is not None:
-            start.append(contact_range.variables(np.asarray(initial.contact_impedance)[is_generator]))
+        initial_variables = [
+            np.clip((electrode_centres[is_generating_electrode] - low_corner) / box_size, 0, 1).ravel()
+        ]
+        if radius_range is not None:
+            initial_variables.append(radius_range.variables(electrode_radii[is_generating_electrode]))
+        if contact_impedance_range is not None:
+            initial_variables.append(
+                contact_impedance_range.variables(np.asarray(initial.contact_impedance)[is_generating_electrode])
+            )
         if thickness_range is not None:
-            start.append(thickness_range.variables(np.asarray(initial.thickness)[None]))
-        radii, impedance = (
-            as_array(np.tile(np.asarray(values)[is_generator], len(images))[electrode_order])
-            for values in (radii, initial.contact_impedance)
+            initial_variables.append(thickness_range.variables(np.asarray(initial.thickness)[None]))
+        electrode_radii, contact_impedances = (
+            as_array(
+                np.tile(np.asarray(electrode_values)[is_generating_electrode], len(symmetry_matrices))[electrode_order]
+            )
+            for electrode_values in (electrode_radii, initial.contact_impedance)
         )
-        symmetric_parameters = LayoutParameters(initial.centres, radii, impedance, initial.thickness)
-        electrode_spacing = float(np.sqrt(np.prod(size) / len(electrode_order)))
-        parameter_ranges = size_range, contact_range, thickness_range
+        symmetric_parameters = LayoutParameters(initial.centres, electrode_radii, contact_impedances, initial.thickness)
+        electrode_spacing = float(np.sqrt(np.prod(box_size) / len(electrode_order)))
+        parameter_ranges = radius_range, contact_impedance_range, thickness_range
         return cls(
-            low,
-            size,
-            images,
+            low_corner,
+            box_size,
+            symmetry_matrices,
             electrode_order,
             symmetric_parameters,
             *parameter_ranges,
-            np.concatenate(start),
+            np.concatenate(initial_variables),
             electrode_spacing,
         )
 
@@ -167,11 +181,13 @@ class Variables(Module):
         """Whether the variables `start` reproduce the given `parameters`: True if the parameters have the symmetry and
         lie in the ranges."""
         represented_parameters = _compiled_parameters(self, jnp.asarray(self.start))
-        are_equal = (
+        are_values_equal = (
             np.allclose(represented_values, parameter_values, rtol=1e-6, atol=0)
             for represented_values, parameter_values in zip(represented_parameters[1:], parameters[1:], strict=True)
         )
-        return bool(np.allclose(represented_parameters.centres, parameters.centres, atol=1e-6)) and all(are_equal)
+        return bool(np.allclose(represented_parameters.centres, parameters.centres, atol=1e-6)) and all(
+            are_values_equal
+        )
 
     @property
     def num_generators(self) -> int:
@@ -188,11 +204,11 @@ class Variables(Module):
     def parameters(self, variables: Float[Array, " v"]) -> LayoutParameters:
         """Parameters of the layout that correspond to the design variables (v,) between 0 and 1."""
         num_generators = self.num_generators
-        offsets, remaining_variables = (
+        generator_offsets, remaining_variables = (
             variables[: 2 * num_generators].reshape(num_generators, 2) * self.size - self.size / 2,
             variables[2 * num_generators :],
         )
-        centres = jnp.einsum("kij,gj->kgi", self.images, offsets).reshape(-1, 2) + self.low + self.size / 2
+        centres = jnp.einsum("kij,gj->kgi", self.images, generator_offsets).reshape(-1, 2) + self.low + self.size / 2
         _, radii, contact_impedance, thickness = self.initial
         if self.sizes is not None:
             radii, remaining_variables = (
@@ -208,26 +224,26 @@ class Variables(Module):
             thickness = self.thickness.values(remaining_variables)[0]
         return LayoutParameters(centres[self.electrode_order], radii, contact_impedance, thickness)
 
-    def _values_of_mirror_images(self, values: Float[Array, " G"]) -> Float[Array, " L"]:
+    def _values_of_mirror_images(self, generator_values: Float[Array, " G"]) -> Float[Array, " L"]:
         """Repeat the values (G,) of the generators for their images: values (L,) of all electrodes."""
-        return jnp.tile(values, len(self.images))[self.electrode_order]
+        return jnp.tile(generator_values, len(self.images))[self.electrode_order]
 
 
 _compiled_parameters = eqx.filter_jit(Variables.parameters)
 
 
 @values_at_once
-def _scale_conductance(conductance, thickness, initial_thickness):
-    return conductance * (thickness / initial_thickness)
+def _scale_conductance(sheet_conductance, thickness, initial_thickness):
+    return sheet_conductance * (thickness / initial_thickness)
 
 
-def _is_in_first_sector(offsets: np.ndarray, symmetry: str | None) -> np.ndarray:
-    x, y = offsets.T
+def _is_in_first_sector(centre_offsets: np.ndarray, symmetry: str | None) -> np.ndarray:
+    x, y = centre_offsets.T
     if symmetry == "mirror-x":
         return x < 0
     if symmetry in ("mirror-y", "rotate-2"):
         return y < 0
-    return (x > 0) & (y >= 0) if symmetry == "rotate-4" else np.ones(len(offsets), bool)
+    return (x > 0) & (y >= 0) if symmetry == "rotate-4" else np.ones(len(centre_offsets), bool)
 
 
 def _check_symmetric_counts(
@@ -236,15 +252,15 @@ def _check_symmetric_counts(
     if num_in_first_sector * num_sectors == num_electrodes:
         return
     if num_electrodes % num_sectors:
-        remedy = (
+        suggested_remedy = (
             f"{num_electrodes} electrodes cannot be shared equally among {num_sectors} parts; add or remove "
             f"{num_electrodes % num_sectors}, or choose another symmetry."
         )
     else:
-        remedy = "give a layout with the same number in each."
+        suggested_remedy = "give a layout with the same number in each."
     raise ValueError(
         f"symmetry: {num_in_first_sector} of {num_electrodes} electrodes are in the first of {num_sectors} parts of "
-        f"the skin for '{symmetry}'; {remedy}"
+        f"the skin for '{symmetry}'; {suggested_remedy}"
     )
 
 
@@ -305,14 +321,14 @@ class Objective(Module):
 
     def scores(self, skin: Skin) -> Scores:
         """Compute all scores of a skin. Raises `ValueError` as `layout_scores` does."""
-        options = {"prior": self.prior, "noise": self.noise, "temperature": self.temperature}
-        return layout_scores(skin.model, skin.model_conductivity, self.touches, **options)
+        score_options = {"prior": self.prior, "noise": self.noise, "temperature": self.temperature}
+        return layout_scores(skin.model, skin.model_conductivity, self.touches, **score_options)
 
     def scores_of_varied(self, skin: Skin, varied: LayoutParameters) -> Scores:
         """Compute the scores of a skin with its electrodes and thickness replaced by those of `varied`. The scores are
         differentiable with respect to `varied`."""
         model = skin.model.with_electrodes(SheetDiscs(varied.centres, varied.radii, varied.contact_impedance))
-        conductance = _scale_conductance(skin.model_conductivity, varied.thickness, skin.thickness)
+        sheet_conductance = _scale_conductance(skin.model_conductivity, varied.thickness, skin.thickness)
         touches = self.touches.with_thickness(varied.thickness)
-        options = {"prior": self.prior, "noise": self.noise, "temperature": self.temperature}
-        return layout_scores(model, conductance, touches, **options)
+        score_options = {"prior": self.prior, "noise": self.noise, "temperature": self.temperature}
+        return layout_scores(model, sheet_conductance, touches, **score_options)

@@ -56,35 +56,39 @@ def plot_travel(
         raise ValueError(
             f"start must be from 0 to {num_starts - 1}, of one of the {num_starts} starts; it is {start!r}."
         )
-    final_centres, radii = optimisation.centres[start], optimisation.radii[start]
-    paths = np.concatenate([optimisation.snapshots[start], final_centres[None]])
+    final_centres, electrode_radii = optimisation.centres[start], optimisation.radii[start]
+    electrode_paths = np.concatenate([optimisation.snapshots[start], final_centres[None]])
     ax = get_or_create_axes(ax)
-    outline = flat_layout(optimisation.layout).outline
-    if outline is not None:
-        ax.add_patch(PathPatch(outline_path(outline), facecolor="none", edgecolor=DARK_GREY, linewidth=0.9, zorder=2))
-        extent = outline.extent
-        hide_axes(ax, extent, numbered=False)
-        draw_scale_bar(ax, extent)
-    for domain in keep_out:
-        ax.add_patch(PathPatch(outline_path(domain), **_KEEP_OUT_STYLE))
-    initial_circles = [Circle((x, y), r) for (x, y), r in zip(paths[0], radii, strict=True)]
-    final_circles = [Circle((x, y), r) for (x, y), r in zip(final_centres, radii, strict=True)]
+    skin_outline = flat_layout(optimisation.layout).outline
+    if skin_outline is not None:
+        ax.add_patch(
+            PathPatch(outline_path(skin_outline), facecolor="none", edgecolor=DARK_GREY, linewidth=0.9, zorder=2)
+        )
+        skin_extent = skin_outline.extent
+        hide_axes(ax, skin_extent, numbered=False)
+        draw_scale_bar(ax, skin_extent)
+    for keep_out_domain in keep_out:
+        ax.add_patch(PathPatch(outline_path(keep_out_domain), **_KEEP_OUT_STYLE))
+    initial_circles = [Circle((x, y), r) for (x, y), r in zip(electrode_paths[0], electrode_radii, strict=True)]
+    final_circles = [Circle((x, y), r) for (x, y), r in zip(final_centres, electrode_radii, strict=True)]
     ax.add_collection(PatchCollection(initial_circles, facecolor="none", edgecolor=LIGHT_GREY, linewidth=1.0, zorder=3))
-    ax.add_collection(LineCollection(list(paths.swapaxes(0, 1)), colors=LIGHT_GREY, linewidths=1.2, zorder=3))
+    ax.add_collection(LineCollection(list(electrode_paths.swapaxes(0, 1)), colors=LIGHT_GREY, linewidths=1.2, zorder=3))
     ax.add_collection(
         PatchCollection(final_circles, facecolor=ELECTRODE_COLOUR, edgecolor=DARK_GREY, linewidth=0.6, zorder=4)
     )
     _draw_legend(ax, has_excluded_areas=bool(keep_out))
-    distances = np.linalg.norm(final_centres - paths[0], axis=1)
-    ax.set_title(f"Moved {1e3 * distances.mean():.0f} mm on average" if title is None else title, color=DARK_GREY)
+    travelled_distances = np.linalg.norm(final_centres - electrode_paths[0], axis=1)
+    ax.set_title(
+        f"Moved {1e3 * travelled_distances.mean():.0f} mm on average" if title is None else title, color=DARK_GREY
+    )
     return ax
 
 
 def _draw_legend(ax: Axes, *, has_excluded_areas: bool) -> None:
     """Draw the legend of the positions below the plot, beside the scale bar."""
-    disc = {"marker": "o", "markersize": 8, "linestyle": "none"}
-    handles: list[Artist] = [
-        Line2D([], [], markerfacecolor="none", markeredgecolor=LIGHT_GREY, label="where it began", **disc),
+    disc_style = {"marker": "o", "markersize": 8, "linestyle": "none"}
+    legend_handles: list[Artist] = [
+        Line2D([], [], markerfacecolor="none", markeredgecolor=LIGHT_GREY, label="where it began", **disc_style),
         Line2D([], [], color=LIGHT_GREY, linewidth=1.2, label="way, step by step"),
         Line2D(
             [],
@@ -93,16 +97,24 @@ def _draw_legend(ax: Axes, *, has_excluded_areas: bool) -> None:
             markeredgecolor=DARK_GREY,
             markeredgewidth=0.6,
             label="where it ended",
-            **disc,
+            **disc_style,
         ),
     ]
     if has_excluded_areas:
-        handles.append(Patch(facecolor="none", edgecolor=LIGHT_GREY, hatch="////", label="kept free"))
-    style = {"frameon": False, "fontsize": 9, "labelcolor": DARK_GREY, "borderaxespad": 0.2, "columnspacing": 1.2}
-    ax.legend(handles=handles, loc="lower right", ncols=2, **style)
+        legend_handles.append(Patch(facecolor="none", edgecolor=LIGHT_GREY, hatch="////", label="kept free"))
+    legend_style = {
+        "frameon": False,
+        "fontsize": 9,
+        "labelcolor": DARK_GREY,
+        "borderaxespad": 0.2,
+        "columnspacing": 1.2,
+    }
+    ax.legend(handles=legend_handles, loc="lower right", ncols=2, **legend_style)
 
 
 def outline_path(domain: Domain) -> Path:
     """Convert the boundary of a domain, including its holes, to closed loops of a matplotlib path, in metres."""
-    loops = [np.asarray(loop) for loop in domain.loops()]
-    return Path.make_compound_path(*(Path(np.concatenate([loop, loop[:1]]), closed=True) for loop in loops))
+    boundary_loops = [np.asarray(boundary_loop) for boundary_loop in domain.loops()]
+    return Path.make_compound_path(
+        *(Path(np.concatenate([boundary_loop, boundary_loop[:1]]), closed=True) for boundary_loop in boundary_loops)
+    )

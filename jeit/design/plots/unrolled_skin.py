@@ -62,40 +62,40 @@ def plot_unrolled(
     check_kind("unrolled", unrolled, Unrolled, "a surface laid flat, as of unroll(skin.model.mesh)")
     check_scale(scale)
     ax = get_or_create_axes(ax, (7.4, 5.2))
-    points = unrolled.points
-    triangulation = Triangulation(points[:, 0], points[:, 1], unrolled.cells)
+    unrolled_points = unrolled.points
+    triangulation = Triangulation(unrolled_points[:, 0], unrolled_points[:, 1], unrolled.cells)
     if values is not None:
         value_array = _check_values(unrolled, values)
         scaled_colours = scale.of(value_array, "S")
         is_per_cell = len(value_array) == len(unrolled.cells)
-        style: dict[str, Any] = {"shading": "gouraud"}
+        shading_style: dict[str, Any] = {"shading": "gouraud"}
         if is_per_cell:
-            style = {"shading": "flat", "edgecolors": "face", "linewidth": 0.5}
+            shading_style = {"shading": "flat", "edgecolors": "face", "linewidth": 0.5}
         mesh_image = ax.tripcolor(
             triangulation,
             scaled_colours.factor * (value_array if is_per_cell else value_array[unrolled.nodes]),
-            **style,
+            **shading_style,
             **scaled_colours.keywords,
         )
         scaled_colours.draw_bar(ax, mesh_image)
     _draw_edges(ax, unrolled)
     if electrodes is not None:
         _draw_electrodes(ax, unrolled, electrodes)
-    for (name, places), colour in zip((marks or {}).items(), SERIES_COLOURS, strict=False):
-        flat_positions = unrolled.flat(np.atleast_2d(np.asarray(places, float)))
+    for (mark_name, mark_places), mark_colour in zip((marks or {}).items(), SERIES_COLOURS, strict=False):
+        flat_positions = unrolled.flat(np.atleast_2d(np.asarray(mark_places, float)))
         ax.plot(
             flat_positions[:, 0],
             flat_positions[:, 1],
             "o",
-            color=colour,
+            color=mark_colour,
             markersize=5,
             markeredgecolor="white",
-            label=name,
+            label=mark_name,
             zorder=5,
         )
-    extent = extent_of(points)
-    hide_axes(ax, extent, numbered=False)
-    draw_scale_bar(ax, extent)
+    plot_extent = extent_of(unrolled_points)
+    hide_axes(ax, plot_extent, numbered=False)
+    draw_scale_bar(ax, plot_extent)
     if marks:
         ax.legend(loc="lower right", frameon=False, labelcolor=DARK_GREY, ncols=len(marks), borderaxespad=0)
     if unrolled.mean_distortion > _MIN_STATED_DISTORTION:
@@ -107,12 +107,12 @@ def plot_unrolled(
     return ax
 
 
-def _check_values(unrolled: Unrolled, values: ArrayLike) -> np.ndarray:
-    value_array, num_values = np.asarray(values), (len(unrolled.cells), len(unrolled.surface.points))
-    if value_array.shape not in ((num_values[0],), (num_values[1],)):
+def _check_values(unrolled: Unrolled, plotted_values: ArrayLike) -> np.ndarray:
+    value_array, cell_and_node_counts = np.asarray(plotted_values), (len(unrolled.cells), len(unrolled.surface.points))
+    if value_array.shape not in ((cell_and_node_counts[0],), (cell_and_node_counts[1],)):
         raise ValueError(
-            f"values has shape {value_array.shape}; give one for each of the {num_values[0]} triangles or the "
-            f"{num_values[1]} nodes."
+            f"values has shape {value_array.shape}; give one for each of the {cell_and_node_counts[0]} triangles or "
+            f"the {cell_and_node_counts[1]} nodes."
         )
     if np.iscomplexobj(value_array):
         raise ValueError("values are complex; draw their real or imaginary part.")
@@ -120,8 +120,10 @@ def _check_values(unrolled: Unrolled, values: ArrayLike) -> np.ndarray:
 
 
 def _draw_edges(ax: Axes, unrolled: Unrolled) -> None:
-    for edges, style in ((unrolled.edge, "solid"), (unrolled.seam, (0, (3, 2)))):
-        ax.add_collection(LineCollection(list(edges), colors=LIGHT_GREY, linewidths=1.0, linestyles=[style]))
+    for boundary_edges, line_style in ((unrolled.edge, "solid"), (unrolled.seam, (0, (3, 2)))):
+        ax.add_collection(
+            LineCollection(list(boundary_edges), colors=LIGHT_GREY, linewidths=1.0, linestyles=[line_style])
+        )
 
 
 def _draw_electrodes(ax: Axes, unrolled: Unrolled, electrodes) -> None:
@@ -130,14 +132,25 @@ def _draw_electrodes(ax: Axes, unrolled: Unrolled, electrodes) -> None:
         "electrodes", electrodes, electrode_classes, "those of a curved skin: its layout, or skin.model.electrodes"
     )
     if isinstance(electrodes, SurfaceLayout):
-        centres, radii, names = electrodes.centres, electrodes.diameters / 2, electrodes.labels
+        electrode_centres, electrode_radii, electrode_names = (
+            electrodes.centres,
+            electrodes.diameters / 2,
+            electrodes.labels,
+        )
     else:
-        centres, radii = electrodes.position, electrodes.radius
-        names = [str(k + 1) for k in range(electrodes.num_electrodes)]
-    for flat_centre, radius, name in zip(unrolled.flat(centres), np.asarray(radii), names, strict=True):
+        electrode_centres, electrode_radii = electrodes.position, electrodes.radius
+        electrode_names = [str(k + 1) for k in range(electrodes.num_electrodes)]
+    for flat_centre, electrode_radius, electrode_name in zip(
+        unrolled.flat(electrode_centres), np.asarray(electrode_radii), electrode_names, strict=True
+    ):
         ax.add_patch(
             Circle(
-                tuple(flat_centre), float(radius), facecolor="#ffffffa0", edgecolor=DARK_GREY, linewidth=0.8, zorder=3
+                tuple(flat_centre),
+                float(electrode_radius),
+                facecolor="#ffffffa0",
+                edgecolor=DARK_GREY,
+                linewidth=0.8,
+                zorder=3,
             )
         )
-        ax.annotate(name, tuple(flat_centre), ha="center", va="center", fontsize=6, color=DARK_GREY, zorder=4)
+        ax.annotate(electrode_name, tuple(flat_centre), ha="center", va="center", fontsize=6, color=DARK_GREY, zorder=4)

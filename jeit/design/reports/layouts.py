@@ -41,19 +41,19 @@ def write_layout_comparison(result: LayoutComparison, folder: str | Path) -> Non
 def report_layout_comparison(result: LayoutComparison) -> dict[str, Any]:
     """Scores of the two compared layouts ("layouts"), and parameters of the skins and touches ("options"), as plain
     numbers and strings."""
-    skin, response = result.skins[0], result.responses[0]
-    options = {
-        "thickness_mm": 1e3 * skin.thickness,
-        "conductivity_S_per_m": skin.conductivity,
-        "pairs": skin.model.protocol.num_measurements,
-        "taxels": len(response.taxels.areas),
+    first_skin, first_response = result.skins[0], result.responses[0]
+    comparison_options = {
+        "thickness_mm": 1e3 * first_skin.thickness,
+        "conductivity_S_per_m": first_skin.conductivity,
+        "pairs": first_skin.model.protocol.num_measurements,
+        "taxels": len(first_response.taxels.areas),
         "contrast": result.contrast,
         "margin_mm": 1e3 * result.margin,
         "places": result.places,
-        "cell_mm": None if skin.cell_size is None else 1e3 * skin.cell_size,
+        "cell_mm": None if first_skin.cell_size is None else 1e3 * first_skin.cell_size,
         "seed": result.seed,
     }
-    return to_plain_values({"layouts": result.figures, "options": options})
+    return to_plain_values({"layouts": result.figures, "options": comparison_options})
 
 
 def draw_layout_comparison(result: LayoutComparison):
@@ -72,55 +72,74 @@ def draw_layout_comparison(result: LayoutComparison):
 
     figure = Figure(figsize=(14.4, 8.8), layout="constrained")
     figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.12)
-    axes = figure.subplots(2, 3, width_ratios=(1.1, 1.1, 1))
+    figure_axes = figure.subplots(2, 3, width_ratios=(1.1, 1.1, 1))
     responses = result.responses
-    max_sensitivity = max(float(response.sensitivity.values.max()) for response in responses)
-    max_area = max(float(response.taxels.max_area) for response in responses)
-    names = distinct_names([_shorten_name(response.layout.name) for response in responses])
-    for row_axes, name, response in zip(axes, names, responses, strict=True):
-        centres, outline = response.layout.centres, flat_layout(response.layout).known_outline
+    max_sensitivity = max(float(layout_response.sensitivity.values.max()) for layout_response in responses)
+    max_taxel_area = max(float(layout_response.taxels.max_area) for layout_response in responses)
+    layout_names = distinct_names([_shorten_name(layout_response.layout.name) for layout_response in responses])
+    for row_axes, layout_name, layout_response in zip(figure_axes, layout_names, responses, strict=True):
+        electrode_centres, skin_outline = (
+            layout_response.layout.centres,
+            flat_layout(layout_response.layout).known_outline,
+        )
         plot_sensitivity_map(
-            response.sensitivity,
-            electrodes=centres,
+            layout_response.sensitivity,
+            electrodes=electrode_centres,
             limit=max_sensitivity,
-            title=f"{name}: sensitivity",
+            title=f"{layout_name}: sensitivity",
             ax=row_axes[0],
         )
-        plot_taxels(response.taxels, electrodes=centres, limit=max_area, title=f"{name}: taxels", ax=row_axes[1])
+        plot_taxels(
+            layout_response.taxels,
+            electrodes=electrode_centres,
+            limit=max_taxel_area,
+            title=f"{layout_name}: taxels",
+            ax=row_axes[1],
+        )
         # The scale bar of the taxel map is placed for the touched part of the skin only. It is replaced by a scale bar
         # for the whole skin, which both maps show.
         for scale_bar_part in (row_axes[1].lines[-1], row_axes[1].texts[-1]):
             scale_bar_part.remove()
-        draw_scale_bar(row_axes[1], outline.extent)
+        draw_scale_bar(row_axes[1], skin_outline.extent)
         for ax in row_axes[:2]:
-            ax.add_patch(PathPatch(outline_path(outline), facecolor="none", edgecolor=DARK_GREY, linewidth=0.9))
-            hide_axes(ax, outline.extent, numbered=False)
+            ax.add_patch(PathPatch(outline_path(skin_outline), facecolor="none", edgecolor=DARK_GREY, linewidth=0.9))
+            hide_axes(ax, skin_outline.extent, numbered=False)
     plot_sensitivity_histograms(
-        {name: response.sensitivity for name, response in zip(names, responses, strict=True)}, ax=axes[0, 2]
+        {
+            layout_name: layout_response.sensitivity
+            for layout_name, layout_response in zip(layout_names, responses, strict=True)
+        },
+        ax=figure_axes[0, 2],
     )
-    plot_taxel_areas({name: response.taxels for name, response in zip(names, responses, strict=True)}, ax=axes[1, 2])
-    disc: dict[str, Any] = {
+    plot_taxel_areas(
+        {
+            layout_name: layout_response.taxels
+            for layout_name, layout_response in zip(layout_names, responses, strict=True)
+        },
+        ax=figure_axes[1, 2],
+    )
+    electrode_marker: dict[str, Any] = {
         "marker": "o",
         "linestyle": "none",
         "markerfacecolor": "white",
         "markeredgecolor": DARK_GREY,
     }
-    handles: list[Artist] = [Line2D([], [], label="electrode", **disc)]
+    legend_handles: list[Artist] = [Line2D([], [], label="electrode", **electrode_marker)]
     if result.margin > 0:
         margin_label = f"not touched: {1e3 * result.margin:.3g} mm wide"
-        handles.append(Patch(facecolor="white", edgecolor=DARK_GREY, linewidth=0.9, label=margin_label))
-    figure.legend(handles=handles, loc="outside lower left", ncols=2, frameon=False)
+        legend_handles.append(Patch(facecolor="white", edgecolor=DARK_GREY, linewidth=0.9, label=margin_label))
+    figure.legend(handles=legend_handles, loc="outside lower left", ncols=2, frameon=False)
     return figure
 
 
 def distinct_names(names: list[str]) -> list[str]:
     """Return the two layout names, with numbers appended if the names are equal."""
-    return names if names[0] != names[1] else [f"{name} ({k})" for k, name in enumerate(names, 1)]
+    return names if names[0] != names[1] else [f"{layout_name} ({k})" for k, layout_name in enumerate(names, 1)]
 
 
-def _shorten_name(name: str) -> str:
+def _shorten_name(layout_name: str) -> str:
     """A layout's name, shortened to fit above a map."""
-    return name if len(name) <= _MAX_NAME_LENGTH else f"{name[: _MAX_NAME_LENGTH - 1]}…"
+    return layout_name if len(layout_name) <= _MAX_NAME_LENGTH else f"{layout_name[: _MAX_NAME_LENGTH - 1]}…"
 
 
 def write_improved_layout(result: ImprovedLayout, folder: str | Path) -> None:
@@ -162,8 +181,8 @@ def draw_improved_layout(result: ImprovedLayout):
 def report_improved_layout(result: ImprovedLayout) -> dict[str, Any]:
     """Result of the layout optimisation, scores of the given ("start") and the optimised layout ("optimised") on the
     finer mesh, and the options, as plain numbers and strings. Values that are not finite are None."""
-    optimisation, skin, space = result.optimisation, result.skin, result.space
-    report = {
+    optimisation, skin, design_space = result.optimisation, result.skin, result.space
+    layout_report = {
         "layout": result.start.name,
         "status": optimisation.status,
         "reason": optimisation.reason,
@@ -176,14 +195,14 @@ def report_improved_layout(result: ImprovedLayout) -> dict[str, Any]:
             "thickness_mm": 1e3 * skin.thickness,
             "conductivity_S_per_m": skin.conductivity,
             "noise_V": result.noise,
-            "minimum_spacing_mm": 1e3 * space.minimum_spacing,
-            "keep_out_mm": [_format_region(domain) for domain in space.keep_out],
-            "symmetry": space.symmetry,
-            "sizes": space.sizes,
+            "minimum_spacing_mm": 1e3 * design_space.minimum_spacing,
+            "keep_out_mm": [_format_region(keep_out_domain) for keep_out_domain in design_space.keep_out],
+            "symmetry": design_space.symmetry,
+            "sizes": design_space.sizes,
             "num_points": result.num_points,
         },
     }
-    return to_plain_values(report)
+    return to_plain_values(layout_report)
 
 
 def _score_figures(scores: Scores) -> dict[str, Any]:
@@ -198,14 +217,14 @@ def _score_figures(scores: Scores) -> dict[str, Any]:
     }
 
 
-def _format_region(domain: Domain) -> str | dict[str, Any]:
+def _format_region(keep_out_domain: Domain) -> str | dict[str, Any]:
     """Keep-out region in the format of the option --keep-out, a disc "x,y,radius" or a rectangle "x1,y1,x2,y2" in
     millimetres. For a region of a different shape, a description is returned."""
-    if isinstance(domain, Disk):
-        numbers = (*domain.centre, domain.radius)
-    elif isinstance(domain, Rectangle):
-        low_x, high_x, low_y, high_y = domain.extent
-        numbers = (low_x, low_y, high_x, high_y)
+    if isinstance(keep_out_domain, Disk):
+        region_numbers = (*keep_out_domain.centre, keep_out_domain.radius)
+    elif isinstance(keep_out_domain, Rectangle):
+        low_x, high_x, low_y, high_y = keep_out_domain.extent
+        region_numbers = (low_x, low_y, high_x, high_y)
     else:
-        return describe_domain(domain)
-    return ",".join(f"{1e3 * number:.6g}" for number in numbers)
+        return describe_domain(keep_out_domain)
+    return ",".join(f"{1e3 * region_number:.6g}" for region_number in region_numbers)

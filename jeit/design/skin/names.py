@@ -40,40 +40,44 @@ def curved_layout(
     overlap or are not on the surface, and gaps below `minimum_gap`.
     """
     try:
-        layout = _create_curved(name, folder, surface, outward, diameter)
+        layout = _create_curved_layout(name, folder, surface, outward, diameter)
     except (ValueError, OSError) as error:
         raise ValueError(f"electrodes.layouts: {describe(name)}: {error}") from None
     if minimum_gap > 0:
         check_spacing(layout, layout.lengths(), minimum_gap)
     if not math.isnan(contact_impedance):
-        impedance = contact_impedance
+        contact_impedances = contact_impedance
     else:
-        impedance = CONTACT_IMPEDANCE if layout.contact_impedance is None else layout.contact_impedance
-    diameters = layout.diameters if math.isnan(diameter) else diameter
+        contact_impedances = CONTACT_IMPEDANCE if layout.contact_impedance is None else layout.contact_impedance
+    electrode_diameters = layout.diameters if math.isnan(diameter) else diameter
     return SurfaceLayout(
         layout.centres,
-        diameters,
+        electrode_diameters,
         surface,
-        contact_impedance=impedance,
+        contact_impedance=contact_impedances,
         outward=outward,
         labels=layout.labels,
         name=name,
     )
 
 
-def _create_curved(name: str, folder: Path, surface: Mesh, outward: bool, diameter: float) -> SurfaceLayout:
-    if is_layout_file(name):
-        return read_surface_layout(folder / name, surface, outward=outward)
-    name_match = re.fullmatch(r"inner-(\d{1,4})", name)
+def _create_curved_layout(
+    layout_name: str, layout_folder: Path, surface: Mesh, is_outward: bool, electrode_diameter: float
+) -> SurfaceLayout:
+    if is_layout_file(layout_name):
+        return read_surface_layout(layout_folder / layout_name, surface, outward=is_outward)
+    name_match = re.fullmatch(r"inner-(\d{1,4})", layout_name)
     if name_match is None:
         raise ValueError("a curved skin has inner-N, spread evenly along it, or a .csv file with x_mm, y_mm and z_mm.")
     num_electrodes = int(name_match[1])
     check_num_electrodes(num_electrodes)
-    diameters = DIAMETER if math.isnan(diameter) else diameter
-    return SurfaceLayout.spread(surface, num_electrodes, np.full(num_electrodes, diameters), outward=outward, name=name)
+    electrode_diameters = DIAMETER if math.isnan(electrode_diameter) else electrode_diameter
+    return SurfaceLayout.spread(
+        surface, num_electrodes, np.full(num_electrodes, electrode_diameters), outward=is_outward, name=layout_name
+    )
 
 
-_SUFFIXES = (".csv", ".dxf", ".svg")
+_LAYOUT_FILE_SUFFIXES = (".csv", ".dxf", ".svg")
 
 
 def study_layout(
@@ -87,29 +91,31 @@ def study_layout(
     below `minimum_gap`.
     """
     try:
-        layout = _create_flat(name, folder, outline, diameter)
+        layout = _create_flat_layout(name, folder, outline, diameter)
     except (ValueError, OSError) as error:
         raise ValueError(f"electrodes.layouts: {describe(name)}: {str(error).removeprefix('name: ')}") from None
-    centres = np.asarray(layout.centres)
-    check_spacing(layout, np.linalg.norm(centres[:, None] - centres, axis=-1), minimum_gap)
+    electrode_centres = np.asarray(layout.centres)
+    check_spacing(layout, np.linalg.norm(electrode_centres[:, None] - electrode_centres, axis=-1), minimum_gap)
     if not math.isnan(contact_impedance):
-        impedances = contact_impedance
+        contact_impedances = contact_impedance
     else:
-        impedances = CONTACT_IMPEDANCE if layout.contact_impedance is None else layout.contact_impedance
-    return Layout(layout.centres, layout.diameters, contact_impedance=impedances, outline=outline, name=name)
+        contact_impedances = CONTACT_IMPEDANCE if layout.contact_impedance is None else layout.contact_impedance
+    return Layout(layout.centres, layout.diameters, contact_impedance=contact_impedances, outline=outline, name=name)
 
 
 def is_layout_file(name: str) -> bool:
     """Whether the `name` of a layout is the name of a file."""
-    return Path(name).suffix.lower() in _SUFFIXES
+    return Path(name).suffix.lower() in _LAYOUT_FILE_SUFFIXES
 
 
-def _create_flat(name: str, folder: Path, outline: Rectangle, diameter: float) -> Layout:
-    if not is_layout_file(name):
-        layout = named_layout(name, outline, diameter=DIAMETER if math.isnan(diameter) else diameter)
+def _create_flat_layout(layout_name: str, layout_folder: Path, outline: Rectangle, electrode_diameter: float) -> Layout:
+    if not is_layout_file(layout_name):
+        layout = named_layout(
+            layout_name, outline, diameter=DIAMETER if math.isnan(electrode_diameter) else electrode_diameter
+        )
         check_num_electrodes(layout.num_electrodes)
         return layout
-    layout = read_layout(folder / name, outline=outline)
+    layout = read_layout(layout_folder / layout_name, outline=outline)
     if not same_outline(layout.outline, outline):
         low_x, high_x, low_y, high_y = layout.extent
         raise ValueError(
@@ -117,8 +123,14 @@ def _create_flat(name: str, folder: Path, outline: Rectangle, diameter: float) -
             f"study's is a rectangle of {1e3 * outline.width:g} × {1e3 * outline.height:g} mm about the origin; change "
             "skin.width_mm and skin.height_mm, or the layout."
         )
-    diameters = layout.diameters if math.isnan(diameter) else diameter
-    return Layout(layout.centres, diameters, contact_impedance=layout.contact_impedance, outline=outline, name=name)
+    electrode_diameters = layout.diameters if math.isnan(electrode_diameter) else electrode_diameter
+    return Layout(
+        layout.centres,
+        electrode_diameters,
+        contact_impedance=layout.contact_impedance,
+        outline=outline,
+        name=layout_name,
+    )
 
 
 def check_num_electrodes(number: int) -> None:
@@ -130,13 +142,14 @@ def check_num_electrodes(number: int) -> None:
 def check_spacing(layout: Layout | SurfaceLayout, lengths: Float[np.ndarray, "L L"], minimum_gap: float) -> None:
     """Raise `ValueError` for gaps between electrodes below `minimum_gap`; `lengths`: distances (L, L) of their centres,
     metres."""
-    radii = np.asarray(layout.diameters) / 2
-    gaps = lengths - radii[:, None] - radii
-    np.fill_diagonal(gaps, np.inf)
-    if gaps.min() < minimum_gap - 1e-9:
+    electrode_radii = np.asarray(layout.diameters) / 2
+    electrode_gaps = lengths - electrode_radii[:, None] - electrode_radii
+    np.fill_diagonal(electrode_gaps, np.inf)
+    if electrode_gaps.min() < minimum_gap - 1e-9:
         raise ValueError(
             f"electrodes.minimum_gap_mm is {1e3 * minimum_gap:g}, and electrodes of {layout.name!r} are "
-            f"{1e3 * gaps.min():.3g} mm apart: an impossible spacing; ask for less, or for fewer or smaller electrodes."
+            f"{1e3 * electrode_gaps.min():.3g} mm apart: an impossible spacing; ask for less, or for fewer or smaller "
+            "electrodes."
         )
 
 
@@ -164,10 +177,12 @@ def skin_protocol(
             raise ValueError(f"num_pairs is {num_pairs}, and only 'two-terminal' has pairs, not {name!r}.")
         return {"adjacent": adjacent, "opposite": opposite}[name](layout.num_electrodes, current=current)
     checked_num_pairs = number_of_pairs(layout, num_pairs)
-    pairs = np.column_stack(np.triu_indices(layout.num_electrodes, 1))
-    if checked_num_pairs < len(pairs):
-        pairs = pairs[np.sort(nearest_pairs(layout.centres, checked_num_pairs, lengths=layout.lengths()))]
-    return two_terminal(layout.num_electrodes, pairs, current=current)
+    electrode_pairs = np.column_stack(np.triu_indices(layout.num_electrodes, 1))
+    if checked_num_pairs < len(electrode_pairs):
+        electrode_pairs = electrode_pairs[
+            np.sort(nearest_pairs(layout.centres, checked_num_pairs, lengths=layout.lengths()))
+        ]
+    return two_terminal(layout.num_electrodes, electrode_pairs, current=current)
 
 
 def number_of_pairs(layout: Layout | SurfaceLayout, num_pairs: int | None) -> int:

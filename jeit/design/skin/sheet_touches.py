@@ -40,21 +40,25 @@ class SheetTouches(Module):
         """Return the same touches for a sheet that represents a layer of a different `thickness`, metres. Conductivity
         changes are proportional to depth / thickness."""
         depth_ratio = self.thickness / thickness
-        touched = eqx.tree_at(
+        rescaled_touched_cells = eqx.tree_at(
             lambda cells_to_change: cells_to_change.change, self.touched, self.touched.change * depth_ratio
         )
-        return SheetTouches(touched, self.slope * depth_ratio, thickness, self.depth)
+        return SheetTouches(rescaled_touched_cells, self.slope * depth_ratio, thickness, self.depth)
 
     def weights(self, conductivity: Float[Array, " m"]) -> tuple[Float[Array, "n m"], Float[Array, "2 n m"]]:
         """Compute the change (n, m) of the conductivity of every cell due to every touch, siemens, and the derivatives
         (2, n, m) of the change with respect to the two coordinates of the position, siemens per metre."""
-        cells = self.touched.cells
-        indices = np.arange(len(cells))[:, None], cells
+        changed_cells = self.touched.cells
+        touch_and_cell_indices = np.arange(len(changed_cells))[:, None], changed_cells
 
         def cell_changes(relative_change):
-            return sum_into((len(cells), len(conductivity)), indices, relative_change * gather(conductivity, cells))
+            return sum_into(
+                (len(changed_cells), len(conductivity)),
+                touch_and_cell_indices,
+                relative_change * gather(conductivity, changed_cells),
+            )
 
-        position_slopes = [cell_changes(self.slope[..., axis]) for axis in range(2)]
+        position_slopes = [cell_changes(self.slope[..., coordinate_axis]) for coordinate_axis in range(2)]
         return cell_changes(self.touched.change), namespace(conductivity).stack(position_slopes)
 
 
@@ -68,46 +72,60 @@ def sheet_touches(
     """
     if mesh.dimension != 2:
         raise ValueError(f"mesh is {mesh.dimension}-D; these touches are of the equivalent sheet, with a 2-D mesh.")
-    touched = touched_cells(mesh, indentation, places, thickness=thickness, contrast=contrast)
+    changed_cells = touched_cells(mesh, indentation, places, thickness=thickness, contrast=contrast)
 
-    def relative_change(place, centroid):
+    def relative_change(touch_place, cell_centroid):
         # The square root has no derivative at 0; adding a nanometre does not change the depth noticeably.
-        distance = jnp.sqrt(jnp.sum((place - centroid) ** 2) + 1e-18)
-        return (contrast - 1) * indentation.depth_at(distance) / thickness
+        touch_distance = jnp.sqrt(jnp.sum((touch_place - cell_centroid) ** 2) + 1e-18)
+        return (contrast - 1) * indentation.depth_at(touch_distance) / thickness
 
     # In NumPy where values are known, so that only the derivative is compiled.
-    all_centroids, touched_values = on_host((centroids(mesh), touched))
-    cell_centroids, origins = gather(all_centroids, touched_values.cells), touched_values.places
+    all_centroids, changed_cells_on_host = on_host((centroids(mesh), changed_cells))
+    cell_centroids, touch_origins = gather(all_centroids, changed_cells_on_host.cells), changed_cells_on_host.places
     if mesh.is_surface:
-        cell_centroids = _flatten_centroids(mesh, touched, indentation.reach)
-        origins = np.zeros((len(touched.places), 2))
-    slopes = on_host(jax.jit(jax.vmap(jax.vmap(jax.grad(relative_change), (None, 0))))(origins, cell_centroids))
-    slopes = jnp.asarray(namespace(touched_values, slopes).where(touched_values.change[..., None] != 0, slopes, 0.0))
-    return SheetTouches(touched, slopes, jnp.asarray(thickness, float), float(indentation.depth_at(host.zeros(()))))
+        cell_centroids = _flatten_centroids(mesh, changed_cells, indentation.reach)
+        touch_origins = np.zeros((len(changed_cells.places), 2))
+    change_slopes = on_host(
+        jax.jit(jax.vmap(jax.vmap(jax.grad(relative_change), (None, 0))))(touch_origins, cell_centroids)
+    )
+    change_slopes = jnp.asarray(
+        namespace(changed_cells_on_host, change_slopes).where(
+            changed_cells_on_host.change[..., None] != 0, change_slopes, 0.0
+        )
+    )
+    return SheetTouches(
+        changed_cells, change_slopes, jnp.asarray(thickness, float), float(indentation.depth_at(host.zeros(())))
+    )
 
 
-def _flatten_centroids(mesh: Mesh, touched: TouchedCells, max_distance: float) -> Float[np.ndarray, "n c 2"]:
+def _flatten_centroids(mesh: Mesh, changed_cells: TouchedCells, max_distance: float) -> Float[np.ndarray, "n c 2"]:
     """Map the centroids of touched cells to the tangent plane at the position of their touch. The distance from the
     position in the plane equals the distance along the surface. Returns coordinates (n, c, 2) relative to the position,
     metres."""
-    surface, places, cells = Triangles.of(mesh), np.asarray(touched.places), np.asarray(touched.cells)
+    mesh_surface, touch_places, touched_cell_indices = (
+        Triangles.of(mesh),
+        np.asarray(changed_cells.places),
+        np.asarray(changed_cells.cells),
+    )
     cell_centroids = np.asarray(centroids(mesh))
-    normals = surface.normals_at(surface.nearest(places))
-    reference_axes = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-    first_tangents = np.cross(reference_axes, normals)
+    surface_normals = mesh_surface.normals_at(mesh_surface.nearest(touch_places))
+    reference_axes = np.where(np.abs(surface_normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    first_tangents = np.cross(reference_axes, surface_normals)
     first_tangents = first_tangents / np.linalg.norm(first_tangents, axis=1, keepdims=True)
-    tangent_frames = np.stack([first_tangents, np.cross(normals, first_tangents)], axis=1)
-    flat_centroids = np.einsum("nid,ncd->nci", tangent_frames, cell_centroids[cells] - places[:, None])
-    lengths, cell_lengths = np.zeros(cells.shape), np.zeros(mesh.num_cells)
-    for row, (cell_indices, touch_lengths) in enumerate(
-        Geodesics.create(surface).near(places, surface.nearest(cell_centroids), max_distance)
+    tangent_frames = np.stack([first_tangents, np.cross(surface_normals, first_tangents)], axis=1)
+    flat_centroids = np.einsum(
+        "nid,ncd->nci", tangent_frames, cell_centroids[touched_cell_indices] - touch_places[:, None]
+    )
+    geodesic_distances, distances_of_cells = np.zeros(touched_cell_indices.shape), np.zeros(mesh.num_cells)
+    for touch_index, (cell_indices, distances_from_touch) in enumerate(
+        Geodesics.create(mesh_surface).near(touch_places, mesh_surface.nearest(cell_centroids), max_distance)
     ):
-        cell_lengths[cell_indices] = touch_lengths
-        lengths[row] = cell_lengths[cells[row]]
+        distances_of_cells[cell_indices] = distances_from_touch
+        geodesic_distances[touch_index] = distances_of_cells[touched_cell_indices[touch_index]]
     straight_distances = np.linalg.norm(flat_centroids, axis=-1)
     return (
         flat_centroids
-        * np.where(straight_distances > 0, lengths / np.where(straight_distances > 0, straight_distances, 1.0), 1.0)[
-            ..., None
-        ]
+        * np.where(
+            straight_distances > 0, geodesic_distances / np.where(straight_distances > 0, straight_distances, 1.0), 1.0
+        )[..., None]
     )

@@ -162,8 +162,8 @@ class Skin(Module):
         _check_electrodes(layout, electrodes, mesh, cell_size, num_points)
         model = ForwardModel(mesh, electrodes, skin_protocol(layout) if protocol is None else protocol)
         layout = eqx.tree_at(lambda layout_to_change: layout_to_change.outline, layout, outline)
-        options = {"num_layers": num_layers, "cell_size": cell_size}
-        return cls(layout, model, thickness=thickness, conductivity=conductivity, **options)
+        skin_options = {"num_layers": num_layers, "cell_size": cell_size}
+        return cls(layout, model, thickness=thickness, conductivity=conductivity, **skin_options)
 
     @property
     def outline(self) -> Domain | Triangles:
@@ -224,18 +224,18 @@ class Skin(Module):
                 self.model.mesh, indentation, places, thickness=float(self.thickness), contrast=contrast
             )
         max_depth = float(indentation.depth_at(host.zeros(())))
-        max_thickness = _MAX_LAYER_THICKNESS_RATIO * self.num_layers * max_depth
+        max_meshed_thickness = _MAX_LAYER_THICKNESS_RATIO * self.num_layers * max_depth
         thickness_text = (
             f"thickness is {1e3 * self.thickness:g} mm; give more than the {1e3 * max_depth:g} mm that a touch is "
-            f"deep, and no more than {1e3 * max_thickness:g} mm, where {self.num_layers} layers of cells become too "
-            "coarse for it"
+            f"deep, and no more than {1e3 * max_meshed_thickness:g} mm, where {self.num_layers} layers of cells become "
+            "too coarse for it"
         )
         if max_depth >= self.thickness:
             raise ValueError(f"{thickness_text}.")
         try:
             return touched_cells(self.model.mesh, indentation, places, contrast=contrast, face=self.touched_face)
         except ValueError as error:
-            if self.thickness > max_thickness:
+            if self.thickness > max_meshed_thickness:
                 raise ValueError(f"{thickness_text}: {error}") from None
             raise
 
@@ -311,13 +311,13 @@ def model_conductivity(conductivity, thickness, num_layers: int):
 def plain_outline(outline: Domain) -> Domain:
     """Convert an outline that is an axis-parallel rectangle to a `Rectangle`, so that it is meshed as a rectangle;
     return other outlines unchanged."""
-    if [len(loop) for loop in outline.loops()] != [4]:
+    if [len(boundary_loop) for boundary_loop in outline.loops()] != [4]:
         return outline
     low_x, high_x, low_y, high_y = outline.extent
-    width, height = high_x - low_x, high_y - low_y
-    if abs(width * height - float(outline.area)) > 1e-6 * width * height:
+    outline_width, outline_height = high_x - low_x, high_y - low_y
+    if abs(outline_width * outline_height - float(outline.area)) > 1e-6 * outline_width * outline_height:
         return outline
-    return Rectangle(width, height, ((low_x + high_x) / 2, (low_y + high_y) / 2))
+    return Rectangle(outline_width, outline_height, ((low_x + high_x) / 2, (low_y + high_y) / 2))
 
 
 def curved_model(
@@ -341,11 +341,15 @@ def skin_electrodes(
         contact_impedance = CONTACT_IMPEDANCE
     if isinstance(layout, SurfaceLayout):
         return layout.discs(contact_impedance, sheet=not num_layers)
-    discs = layout.sheet_discs(contact_impedance)
+    disc_electrodes = layout.sheet_discs(contact_impedance)
     if not num_layers:
-        return discs
-    centres = np.asarray(discs.position)
-    return FaceDiscs(np.column_stack([centres, np.zeros(len(centres))]), discs.radius, discs.contact_impedance)
+        return disc_electrodes
+    electrode_centres = np.asarray(disc_electrodes.position)
+    return FaceDiscs(
+        np.column_stack([electrode_centres, np.zeros(len(electrode_centres))]),
+        disc_electrodes.radius,
+        disc_electrodes.contact_impedance,
+    )
 
 
 def _check_electrodes(layout: Layout, electrodes, mesh: Mesh, cell_size: float | None, num_points: int | None) -> None:
@@ -354,13 +358,13 @@ def _check_electrodes(layout: Layout, electrodes, mesh: Mesh, cell_size: float |
     except ValueError:
         diameter_text = f"{1e3 * smallest_diameter(layout):.3g} mm across"
         if num_points is not None:
-            message = f"num_points {num_points} makes cells too coarse for electrodes {diameter_text}; give more."
+            error_message = f"num_points {num_points} makes cells too coarse for electrodes {diameter_text}; give more."
         else:
-            message = (
+            error_message = (
                 f"cell_size is {1e3 * (cell_size or 0):g} mm, too large: electrodes of '{layout.name}' are "
                 f"{diameter_text}; give less."
             )
-        raise ValueError(message) from None
+        raise ValueError(error_message) from None
 
 
 def check_cell_size(
@@ -374,11 +378,11 @@ def check_cell_size(
     """
     check_metres(name, cell_size)
     min_diameter = smallest_diameter(layout)
-    max_size = _MAX_CELL_SIZE_RATIO * min_diameter
-    if cell_size > (1 + 1e-9) * max_size:
+    max_cell_size = _MAX_CELL_SIZE_RATIO * min_diameter
+    if cell_size > (1 + 1e-9) * max_cell_size:
         unit_hint = f"; {MILLIMETRE_HINT}" if cell_size**2 > area else "."
         raise ValueError(
-            f"{name} is {1e3 * cell_size:g} mm; give no more than {1e3 * max_size:.3g} mm, as electrodes of "
+            f"{name} is {1e3 * cell_size:g} mm; give no more than {1e3 * max_cell_size:.3g} mm, as electrodes of "
             f"'{layout.name}' are {1e3 * min_diameter:.3g} mm across{unit_hint}"
         )
     scaled_area = _NUM_NODES_PER_CELL_AREA * area * (num_layers + 1)

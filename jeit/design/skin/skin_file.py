@@ -130,36 +130,42 @@ def read_described_skin(path: str | Path) -> Skin:
     from jeit.files.limits import faults_message
     from jeit.files.schema import validated
 
-    table = validated(SkinTable, read_toml(path), path.name)
+    skin_table = validated(SkinTable, read_toml(path), path.name)
     try:
-        return _create_skin(table, path.parent)
+        return _create_skin(skin_table, path.parent)
     except ValueError as error:
         raise ValueError(faults_message(path.name, [str(error)])) from None
 
 
-def _create_skin(table: SkinTable, folder: Path) -> Skin:
-    material, electrodes, measurement = table.skin, table.electrodes, table.measurement
-    diameter, impedance, cell_size = (
-        1e-3 * electrodes.diameter_mm,
-        electrodes.contact_impedance_ohm_m2,
-        1e-3 * table.mesh.cell_mm,
+def _create_skin(skin_table: SkinTable, skin_folder: Path) -> Skin:
+    material_table, layout_table, measurement_table = skin_table.skin, skin_table.electrodes, skin_table.measurement
+    electrode_diameter, contact_impedance, cell_size = (
+        1e-3 * layout_table.diameter_mm,
+        layout_table.contact_impedance_ohm_m2,
+        1e-3 * skin_table.mesh.cell_mm,
     )
-    if table.surface is None:
-        outline = Rectangle(1e-3 * material.width_mm, 1e-3 * material.height_mm)
-        layout = study_layout(electrodes.layout, folder, outline, diameter, impedance, 0.0)
+    if skin_table.surface is None:
+        skin_outline = Rectangle(1e-3 * material_table.width_mm, 1e-3 * material_table.height_mm)
+        layout = study_layout(
+            layout_table.layout, skin_folder, skin_outline, electrode_diameter, contact_impedance, 0.0
+        )
     else:
-        surface, outward = described_surface(table.surface, folder, cell_size), table.surface.outward
-        layout = curved_layout(electrodes.layout, folder, surface, outward, diameter, impedance, 0.0)
-    if measurement.protocol == "two-terminal" and measurement.pairs is not None:
-        number = layout.num_electrodes
-        pairs = measurement.pairs or number * (number - 1) // 2
-        check_memory(f"measurement.pairs: {pairs:,} of {layout.name!r}", 32.0 * pairs * number)
-    current = 1e-3 * measurement.current_mA
+        surface, is_outward = described_surface(skin_table.surface, skin_folder, cell_size), skin_table.surface.outward
+        layout = curved_layout(
+            layout_table.layout, skin_folder, surface, is_outward, electrode_diameter, contact_impedance, 0.0
+        )
+    if measurement_table.protocol == "two-terminal" and measurement_table.pairs is not None:
+        num_electrodes = layout.num_electrodes
+        num_pairs = measurement_table.pairs or num_electrodes * (num_electrodes - 1) // 2
+        check_memory(f"measurement.pairs: {num_pairs:,} of {layout.name!r}", 32.0 * num_pairs * num_electrodes)
+    drive_current = 1e-3 * measurement_table.current_mA
     return Skin.create(
         layout,
-        thickness=1e-3 * material.thickness_mm,
-        conductivity=material.conductivity_S_per_m,
-        num_layers=table.mesh.layers if material.model == "layer" else 0,
-        cell_size=cell_size if table.surface is None else None,
-        protocol=skin_protocol(layout, measurement.protocol, num_pairs=measurement.pairs, current=current),
+        thickness=1e-3 * material_table.thickness_mm,
+        conductivity=material_table.conductivity_S_per_m,
+        num_layers=skin_table.mesh.layers if material_table.model == "layer" else 0,
+        cell_size=cell_size if skin_table.surface is None else None,
+        protocol=skin_protocol(
+            layout, measurement_table.protocol, num_pairs=measurement_table.pairs, current=drive_current
+        ),
     )

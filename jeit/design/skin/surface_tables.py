@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 from jeit.files.schema import Number, Numbers, Table, TableOfKind, Word, fault
 from jeit.mesh.gmsh import CAD
 
-_RADIUS = Number(2, 5000, "mm")
-_LENGTH = Number(5, 5000, "mm")
-_SECTION = Numbers(((2, 2),), 2, 5000, "mm", single=True)
+_RADIUS_RANGE = Number(2, 5000, "mm")
+_LENGTH_RANGE = Number(5, 5000, "mm")
+_SECTION_RADII_RANGE = Numbers(((2, 2),), 2, 5000, "mm", single=True)
 
 
 class TubeTable(Table):
@@ -17,8 +17,8 @@ class TubeTable(Table):
 
     name_in_messages = "a tube"
     kind: Literal["tube"]
-    radius_mm: Annotated[float, _RADIUS]
-    height_mm: Annotated[float, _LENGTH]
+    radius_mm: Annotated[float, _RADIUS_RANGE]
+    height_mm: Annotated[float, _LENGTH_RANGE]
     outward: bool = True
 
 
@@ -27,9 +27,9 @@ class ForearmTable(Table):
 
     name_in_messages = "a forearm"
     kind: Literal["forearm"]
-    length_mm: Annotated[float, _LENGTH]
-    wrist_mm: Annotated[Any, _SECTION]
-    elbow_mm: Annotated[Any, _SECTION]
+    length_mm: Annotated[float, _LENGTH_RANGE]
+    wrist_mm: Annotated[Any, _SECTION_RADII_RANGE]
+    elbow_mm: Annotated[Any, _SECTION_RADII_RANGE]
     outward: bool = True
 
 
@@ -38,7 +38,7 @@ class SphereTable(Table):
 
     name_in_messages = "a sphere"
     kind: Literal["sphere"]
-    radius_mm: Annotated[float, _RADIUS]
+    radius_mm: Annotated[float, _RADIUS_RANGE]
     outward: bool = True
 
 
@@ -47,7 +47,7 @@ class CapTable(Table):
 
     name_in_messages = "a cap"
     kind: Literal["cap"]
-    radius_mm: Annotated[float, _RADIUS]
+    radius_mm: Annotated[float, _RADIUS_RANGE]
     angle_degrees: Annotated[float, Number(5, 170, "degrees")]
     outward: bool = True
 
@@ -57,9 +57,9 @@ class BentSheetTable(Table):
 
     name_in_messages = "a bent sheet"
     kind: Literal["bent sheet"]
-    width_mm: Annotated[float, _LENGTH]
-    height_mm: Annotated[float, _LENGTH]
-    radius_mm: Annotated[float, _RADIUS]
+    width_mm: Annotated[float, _LENGTH_RANGE]
+    height_mm: Annotated[float, _LENGTH_RANGE]
+    radius_mm: Annotated[float, _RADIUS_RANGE]
     axis: Literal["x", "y"] = "y"
     outward: bool = True
 

@@ -102,9 +102,9 @@ class Hemisphere(AbstractIndentation):
     @numpy_or_compiled
     def depth_at(self, distance):
         """Depth in metres at horizontal distances (metres) from the centre of the ball."""
-        xp, radius = namespace(self, distance), self.diameter / 2
-        height = xp.sqrt(xp.maximum(radius**2 - xp.asarray(distance) ** 2, 0.0))
-        return xp.maximum(self.depth - radius + height, 0.0)
+        xp, ball_radius = namespace(self, distance), self.diameter / 2
+        sphere_height = xp.sqrt(xp.maximum(ball_radius**2 - xp.asarray(distance) ** 2, 0.0))
+        return xp.maximum(self.depth - ball_radius + sphere_height, 0.0)
 
     @property
     def reach(self) -> float:
@@ -135,9 +135,9 @@ class TouchGrid(Module):
 
     def raster(self, values) -> Float[np.ndarray, "rows columns"]:
         """Arrange `values` (n,) at the touched positions as an image (rows, columns), with NaN outside the skin."""
-        image = np.full(self.shape, np.nan)
-        image[self.rows, self.columns] = np.asarray(values)
-        return image
+        raster_image = np.full(self.shape, np.nan)
+        raster_image[self.rows, self.columns] = np.asarray(values)
+        return raster_image
 
 
 class SurfaceGrid(TouchGrid):
@@ -170,15 +170,15 @@ class SurfaceGrid(TouchGrid):
         point of `surface` is mapped to the point of `face` with the same coordinates within the same triangle. Areas
         are scaled accordingly."""
         nearest_points = surface.nearest(self.places)
-        areas = self.areas * nearest_points.of_nodes(surface, face.node_areas / surface.node_areas)
-        mean_triangle_area = float(areas.mean())
+        mapped_areas = self.areas * nearest_points.of_nodes(surface, face.node_areas / surface.node_areas)
+        mean_triangle_area = float(mapped_areas.mean())
         return SurfaceGrid(
             nearest_points.of_nodes(surface, face.points),
             self.rows,
             self.columns,
             self.shape,
             (mean_triangle_area**0.5, mean_triangle_area**0.5),
-            areas,
+            mapped_areas,
         )
 
     def raster(self, values) -> Float[np.ndarray, "rows columns"]:
@@ -219,12 +219,14 @@ def touch_grid(
     if isinstance(outline, Triangles):
         return SurfaceGrid.spread(outline, columns * rows)
     low_x, high_x, low_y, high_y = outline.extent
-    width, height = (high_x - low_x) / columns, (high_y - low_y) / rows
-    x, y = low_x + width * (np.arange(columns) + 0.5), low_y + height * (np.arange(rows) + 0.5)
+    cell_width, cell_height = (high_x - low_x) / columns, (high_y - low_y) / rows
+    x, y = low_x + cell_width * (np.arange(columns) + 0.5), low_y + cell_height * (np.arange(rows) + 0.5)
     places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    is_inside = np.asarray(outline.contains(places))
-    row_indices, column_indices = np.divmod(np.flatnonzero(is_inside), columns)
-    return TouchGrid(places[is_inside], row_indices, column_indices, (rows, columns), (float(width), float(height)))
+    is_inside_outline = np.asarray(outline.contains(places))
+    row_indices, column_indices = np.divmod(np.flatnonzero(is_inside_outline), columns)
+    return TouchGrid(
+        places[is_inside_outline], row_indices, column_indices, (rows, columns), (float(cell_width), float(cell_height))
+    )
 
 
 def touches_away_from_the_edge(
@@ -251,13 +253,21 @@ def touches_away_from_the_edge(
     if isinstance(outline, Triangles):
         return SurfaceGrid.spread(outline, columns * rows, margin)
     grid = touch_grid(outline, columns, rows)
-    offsets = margin * np.array(
-        [[np.cos(angle), np.sin(angle)] for angle in np.linspace(0, 2 * np.pi, 16, endpoint=False)]
+    margin_offsets = margin * np.array(
+        [[np.cos(offset_angle), np.sin(offset_angle)] for offset_angle in np.linspace(0, 2 * np.pi, 16, endpoint=False)]
     )
-    is_allowed = np.all([np.asarray(outline.contains(grid.places + offset)) for offset in offsets], axis=0)
-    if not is_allowed.any():
+    is_away_from_edge = np.all(
+        [np.asarray(outline.contains(grid.places + margin_offset)) for margin_offset in margin_offsets], axis=0
+    )
+    if not is_away_from_edge.any():
         raise ValueError(f"margin is {1e3 * margin:g} mm: no place of the skin is so far from its edge; give less.")
-    return TouchGrid(grid.places[is_allowed], grid.rows[is_allowed], grid.columns[is_allowed], grid.shape, grid.pitch)
+    return TouchGrid(
+        grid.places[is_away_from_edge],
+        grid.rows[is_away_from_edge],
+        grid.columns[is_away_from_edge],
+        grid.shape,
+        grid.pitch,
+    )
 
 
 def check_grid(grid: TouchGrid) -> None:
@@ -268,16 +278,19 @@ def check_grid(grid: TouchGrid) -> None:
 def check_places(places, dimension: int = 2) -> Float[np.ndarray, "n d"]:
     """Convert touched positions (n, `dimension`), metres, to an array. Raises `ValueError` for arguments that are not
     positions, such as a whole `TouchGrid`, and for values that are not finite."""
-    requirement = f"places must be (n, {dimension}), one or more, in metres, such as touch_grid(skin.outline).places"
+    places_requirement = (
+        f"places must be (n, {dimension}), one or more, in metres, such as touch_grid(skin.outline).places"
+    )
     try:
-        positions = np.asarray(places, float)
+        touched_positions = np.asarray(places, float)
     except (TypeError, ValueError):
-        raise ValueError(f"{requirement}; it is {describe(places)}.") from None
-    if positions.ndim != 2 or positions.shape[1] != dimension or not len(positions):
-        raise ValueError(f"{requirement}; they have shape {positions.shape}.")
-    invalid_rows = np.flatnonzero(~np.isfinite(positions).all(axis=1))
-    if invalid_rows.size:
+        raise ValueError(f"{places_requirement}; it is {describe(places)}.") from None
+    if touched_positions.ndim != 2 or touched_positions.shape[1] != dimension or not len(touched_positions):
+        raise ValueError(f"{places_requirement}; they have shape {touched_positions.shape}.")
+    invalid_positions = np.flatnonzero(~np.isfinite(touched_positions).all(axis=1))
+    if invalid_positions.size:
         raise ValueError(
-            f"places: {invalid_rows.size} of {len(positions)} are not finite, the first is number {invalid_rows[0]}."
+            f"places: {invalid_positions.size} of {len(touched_positions)} are not finite, the first is number "
+            f"{invalid_positions[0]}."
         )
-    return positions
+    return touched_positions

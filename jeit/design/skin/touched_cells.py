@@ -67,26 +67,30 @@ def reached_cells(
         return _reached_cells_on_surface(mesh, cell_centroids, places, radius, max_depth, face)
     centroid_depths, thickness = np.zeros(len(cell_centroids)), None
     if mesh.dimension == 3:
-        heights = np.asarray(mesh.points)[:, 2]
-        centroid_depths, thickness = heights.max() - cell_centroids[:, 2], float(np.ptp(heights))
-    candidates = np.flatnonzero(centroid_depths < max_depth)
-    candidate_indices = KDTree(cell_centroids[candidates, :2]).query_ball_point(places, radius, return_sorted=True)
-    cells = [candidates[np.asarray(indices, int)] for indices in candidate_indices]
-    distances = [
-        np.linalg.norm(cell_centroids[touch_cells, :2] - place, axis=-1)
-        for touch_cells, place in zip(cells, places, strict=True)
+        node_heights = np.asarray(mesh.points)[:, 2]
+        centroid_depths, thickness = node_heights.max() - cell_centroids[:, 2], float(np.ptp(node_heights))
+    candidate_cells = np.flatnonzero(centroid_depths < max_depth)
+    indices_within_radius = KDTree(cell_centroids[candidate_cells, :2]).query_ball_point(
+        places, radius, return_sorted=True
+    )
+    cells_of_touches = [candidate_cells[np.asarray(reached_indices, int)] for reached_indices in indices_within_radius]
+    touch_distances = [
+        np.linalg.norm(cell_centroids[cells_of_touch, :2] - touch_place, axis=-1)
+        for cells_of_touch, touch_place in zip(cells_of_touches, places, strict=True)
     ]
-    return ReachedCells(cells, distances, centroid_depths, thickness)
+    return ReachedCells(cells_of_touches, touch_distances, centroid_depths, thickness)
 
 
 def _reached_cells_on_surface(
-    mesh: Mesh, centroids, places, radius: float, max_depth: float, face: str
+    mesh: Mesh, cell_centroids, places, max_touch_distance: float, max_depth: float, face: str
 ) -> ReachedCells:
-    surface = touched_surface(mesh, face)
+    touched_triangles = touched_surface(mesh, face)
     thickness = None if mesh.is_surface else shell_thickness(mesh)
-    max_distance = _MAX_RELATIVE_DISTANCE * (np.sqrt(surface.areas.max()) if thickness is None else thickness)
-    surface_distances = surface.nearest(places).away
-    invalid_places = np.flatnonzero(surface_distances > max_distance)
+    max_surface_distance = _MAX_RELATIVE_DISTANCE * (
+        np.sqrt(touched_triangles.areas.max()) if thickness is None else thickness
+    )
+    surface_distances = touched_triangles.nearest(places).away
+    invalid_places = np.flatnonzero(surface_distances > max_surface_distance)
     if invalid_places.size:
         raise ValueError(
             f"places: {invalid_places.size} of {len(places)} lie off the skin's surface, the first, at "
@@ -94,19 +98,19 @@ def _reached_cells_on_surface(
             f"mm, by {1e3 * surface_distances[invalid_places[0]]:.3g} mm; give places on the touched face, in metres, "
             "such as touch_grid(skin.outline).places."
         )
-    nearest_points = surface.nearest(centroids)
-    centroid_depths = np.zeros(len(centroids)) if mesh.is_surface else nearest_points.away
-    candidates = np.flatnonzero(centroid_depths < max_depth)
+    nearest_points = touched_triangles.nearest(cell_centroids)
+    centroid_depths = np.zeros(len(cell_centroids)) if mesh.is_surface else nearest_points.away
+    candidate_cells = np.flatnonzero(centroid_depths < max_depth)
     candidate_points = type(nearest_points)(
-        nearest_points.triangle[candidates],
-        nearest_points.weights[candidates],
-        nearest_points.points[candidates],
-        nearest_points.away[candidates],
+        nearest_points.triangle[candidate_cells],
+        nearest_points.weights[candidate_cells],
+        nearest_points.points[candidate_cells],
+        nearest_points.away[candidate_cells],
     )
-    indices_and_lengths = Geodesics.create(surface).near(places, candidate_points, radius)
+    indices_and_lengths = Geodesics.create(touched_triangles).near(places, candidate_points, max_touch_distance)
     return ReachedCells(
-        [candidates[indices] for indices, _ in indices_and_lengths],
-        [lengths for _, lengths in indices_and_lengths],
+        [candidate_cells[reached_indices] for reached_indices, _ in indices_and_lengths],
+        [geodesic_lengths for _, geodesic_lengths in indices_and_lengths],
         centroid_depths,
         thickness,
     )
@@ -120,7 +124,7 @@ def shell_thickness(mesh: Mesh) -> float:
 
 def millimetre_text(place) -> str:
     """Format a position in metres as a text in millimetres, such as "(12, 3.5)"."""
-    return "(" + ", ".join(f"{1e3 * value:.4g}" for value in place) + ")"
+    return "(" + ", ".join(f"{1e3 * coordinate:.4g}" for coordinate in place) + ")"
 
 
 class TouchedCells(Module):
@@ -188,17 +192,22 @@ def touched_cells(
             f"the indentation is {1e3 * max_depth:.3g} mm deep, and the skin {1e3 * thickness:.3g} mm thick; press "
             "less."
         )
-    cells, is_not_padding = pad_rows(cells_in_reach.cells)
-    distances = np.full(cells.shape, np.inf)
-    distances[is_not_padding] = np.concatenate(cells_in_reach.distances)
-    depths, centroid_depths = np.asarray(indentation.depth_at(as_array(distances))), cells_in_reach.centroid_depths
+    padded_cells, is_not_padding = pad_rows(cells_in_reach.cells)
+    touch_distances = np.full(padded_cells.shape, np.inf)
+    touch_distances[is_not_padding] = np.concatenate(cells_in_reach.distances)
+    indentation_depths, centroid_depths = (
+        np.asarray(indentation.depth_at(as_array(touch_distances))),
+        cells_in_reach.centroid_depths,
+    )
     if not is_solid_layer:
-        fractions = depths / thickness
+        indented_fractions = indentation_depths / thickness
     elif edge:
-        fractions = np.asarray(smooth_step(jnp.asarray((depths - centroid_depths[cells]) / edge)))
+        indented_fractions = np.asarray(
+            smooth_step(jnp.asarray((indentation_depths - centroid_depths[padded_cells]) / edge))
+        )
     else:
-        fractions = (depths > centroid_depths[cells]).astype(float)
-    is_changed = is_not_padding & (fractions > 0)
+        indented_fractions = (indentation_depths > centroid_depths[padded_cells]).astype(float)
+    is_changed = is_not_padding & (indented_fractions > 0)
     empty_touches = np.flatnonzero(~is_changed.any(axis=1))
     if empty_touches.size:
         raise ValueError(
@@ -208,31 +217,34 @@ def touched_cells(
             "the mesh, in a layer upwards."
         )
     changed_cells, is_not_padding = pad_rows(
-        [touch_cells[is_used] for touch_cells, is_used in zip(cells, is_changed, strict=True)]
+        [
+            cells_of_touch[is_changed_cell]
+            for cells_of_touch, is_changed_cell in zip(padded_cells, is_changed, strict=True)
+        ]
     )
-    changes = np.zeros(changed_cells.shape)
-    changes[is_not_padding] = (contrast - 1) * fractions[is_changed]
-    return TouchedCells(as_array(places), as_array(changed_cells), as_array(changes), mesh.num_cells)
+    conductivity_changes = np.zeros(changed_cells.shape)
+    conductivity_changes[is_not_padding] = (contrast - 1) * indented_fractions[is_changed]
+    return TouchedCells(as_array(places), as_array(changed_cells), as_array(conductivity_changes), mesh.num_cells)
 
 
 def pad_rows(rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Join `rows` of integers of different lengths into one array, padded with zeros. Returns this array and a mask of
     the entries that are not padding."""
-    lengths = np.array([len(row) for row in rows])
-    is_entry = np.arange(max(lengths.max(), 1)) < lengths[:, None]
-    padded = np.zeros(is_entry.shape, np.int32)
-    padded[is_entry] = np.concatenate(rows)
-    return padded, is_entry
+    row_lengths = np.array([len(unpadded_row) for unpadded_row in rows])
+    is_row_entry = np.arange(max(row_lengths.max(), 1)) < row_lengths[:, None]
+    padded_rows = np.zeros(is_row_entry.shape, np.int32)
+    padded_rows[is_row_entry] = np.concatenate(rows)
+    return padded_rows, is_row_entry
 
 
-def _check_values(contrast: float, edge: float) -> None:
+def _check_values(contrast: float, edge_width: float) -> None:
     if not 0 <= contrast <= MAX_CONTRAST or contrast == 1:
         raise ValueError(
             f"contrast must be a factor for the conductivity, 0 for an insulator, above 1 for a conductor, up to "
             f"{MAX_CONTRAST:g}, where the limit is reached long before; it is {contrast!r}."
         )
-    if not 0 <= edge < np.inf:
-        raise ValueError(f"edge must be a depth in metres, not negative; it is {edge!r}.")
+    if not 0 <= edge_width < np.inf:
+        raise ValueError(f"edge must be a depth in metres, not negative; it is {edge_width!r}.")
 
 
 # Number of touches processed at once, and multiple to which a touch's number of nodes is padded, since a program is
@@ -260,24 +272,36 @@ def touched_nodes(model: ForwardModel, touches: TouchedCells, strips: Strips | N
     """Find the mesh nodes of the cells that touches change. `strips`: order of a set of nodes that contains these
     nodes; by default an order of these nodes only."""
     mesh, cells, is_changed = model.mesh, np.asarray(touches.cells), np.asarray(touches.change) != 0
-    is_touched = np.zeros(mesh.num_points, bool)
-    is_touched[np.asarray(mesh.cells)[cells[is_changed]]] = True
+    is_touched_node = np.zeros(mesh.num_points, bool)
+    is_touched_node[np.asarray(mesh.cells)[cells[is_changed]]] = True
     if strips is None:
-        strips = Strips.create(model.system.pattern, np.asarray(mesh.points), is_touched)
+        strips = Strips.create(model.system.pattern, np.asarray(mesh.points), is_touched_node)
     shared_untouched_index = strips.num_strips * strips.selected_per_strip  # one entry for all untouched nodes
-    node_indices = np.where(is_touched, strips.place, shared_untouched_index).astype(np.int32)[np.asarray(mesh.cells)]
-    corners, chunk_results = np.zeros((*cells.shape, mesh.cells.shape[1]), np.int32), []
-    for start in range(0, len(cells), _TOUCHES_AT_ONCE):
-        chunk = slice(start, start + _TOUCHES_AT_ONCE)
-        chunk_nodes = np.where(is_changed[chunk, :, None], node_indices[cells[chunk]], shared_untouched_index)
-        corners[chunk], (touch, number, node) = _number_nodes(chunk_nodes, shared_untouched_index)
-        chunk_results.append((start + touch, number, node))
-    corners[~is_changed] = 0
-    touch, number, node = (np.concatenate(arrays) for arrays in zip(*chunk_results, strict=True))
-    nodes = np.zeros((len(cells), -(-(number.max(initial=0) + 1) // _PADDING_MULTIPLE) * _PADDING_MULTIPLE), np.int32)
-    nodes[touch, number] = node
-    entry_indices = np.minimum(np.arange(nodes.shape[1]), np.bincount(touch, minlength=len(cells))[:, None] - 1)
-    return TouchedNodes(strips, np.take_along_axis(nodes, entry_indices, axis=1), corners)
+    strip_indices = np.where(is_touched_node, strips.place, shared_untouched_index).astype(np.int32)[
+        np.asarray(mesh.cells)
+    ]
+    corner_indices, chunk_results = np.zeros((*cells.shape, mesh.cells.shape[1]), np.int32), []
+    for first_touch in range(0, len(cells), _TOUCHES_AT_ONCE):
+        touch_slice = slice(first_touch, first_touch + _TOUCHES_AT_ONCE)
+        chunk_nodes = np.where(
+            is_changed[touch_slice, :, None], strip_indices[cells[touch_slice]], shared_untouched_index
+        )
+        corner_indices[touch_slice], (touch_indices, node_numbers, distinct_nodes) = _number_nodes(
+            chunk_nodes, shared_untouched_index
+        )
+        chunk_results.append((first_touch + touch_indices, node_numbers, distinct_nodes))
+    corner_indices[~is_changed] = 0
+    touch_indices, node_numbers, distinct_nodes = (
+        np.concatenate(result_arrays) for result_arrays in zip(*chunk_results, strict=True)
+    )
+    padded_nodes = np.zeros(
+        (len(cells), -(-(node_numbers.max(initial=0) + 1) // _PADDING_MULTIPLE) * _PADDING_MULTIPLE), np.int32
+    )
+    padded_nodes[touch_indices, node_numbers] = distinct_nodes
+    entry_indices = np.minimum(
+        np.arange(padded_nodes.shape[1]), np.bincount(touch_indices, minlength=len(cells))[:, None] - 1
+    )
+    return TouchedNodes(strips, np.take_along_axis(padded_nodes, entry_indices, axis=1), corner_indices)
 
 
 def _number_nodes(nodes: Int[np.ndarray, "b c q"], padding_index: int):
@@ -285,13 +309,15 @@ def _number_nodes(nodes: Int[np.ndarray, "b c q"], padding_index: int):
     padding. Returns the number of every entry of `nodes` (b, c, q), and for every distinct node its touch, number and
     index."""
     first_key_of_touch = (padding_index + 1) * np.arange(len(nodes), dtype=np.int32)
-    keys = nodes + first_key_of_touch[:, None, None]
-    is_used = np.zeros(len(nodes) * (padding_index + 1), bool)
-    is_used[keys] = True
-    is_used[first_key_of_touch + padding_index] = False
-    distinct_keys = np.flatnonzero(is_used)
-    touch, node = np.divmod(distinct_keys, padding_index + 1)
-    number_within_touch = np.arange(len(distinct_keys)) - np.searchsorted(distinct_keys, first_key_of_touch)[touch]
-    numbers_of_keys = np.zeros(len(is_used), np.int32)
+    touch_node_keys = nodes + first_key_of_touch[:, None, None]
+    is_used_key = np.zeros(len(nodes) * (padding_index + 1), bool)
+    is_used_key[touch_node_keys] = True
+    is_used_key[first_key_of_touch + padding_index] = False
+    distinct_keys = np.flatnonzero(is_used_key)
+    touch_indices, distinct_nodes = np.divmod(distinct_keys, padding_index + 1)
+    number_within_touch = (
+        np.arange(len(distinct_keys)) - np.searchsorted(distinct_keys, first_key_of_touch)[touch_indices]
+    )
+    numbers_of_keys = np.zeros(len(is_used_key), np.int32)
     numbers_of_keys[distinct_keys] = number_within_touch
-    return numbers_of_keys[keys], (touch, number_within_touch, node)
+    return numbers_of_keys[touch_node_keys], (touch_indices, number_within_touch, distinct_nodes)

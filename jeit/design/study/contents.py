@@ -60,49 +60,66 @@ class Contents(NamedTuple):
 def study_contents(study: Study) -> Contents:
     """Contents of the store of a study's results. Each row of an array belongs to one point and is stored in a separate
     file."""
-    coordinates = [point.coordinates for point in study.points]
-    parameter_values = {name: [values[name] for values in coordinates] for name in coordinates[0]}
-    arrays = _result_arrays(study)
-    axes = ("x_mm", "y_mm", "z_mm") if study.surface else ("x_mm", "y_mm")
+    parameters_of_points = [point.coordinates for point in study.points]
+    parameter_values = {
+        array_name: [array_values[array_name] for array_values in parameters_of_points]
+        for array_name in parameters_of_points[0]
+    }
+    result_arrays = _result_arrays(study)
+    axis_names = ("x_mm", "y_mm", "z_mm") if study.surface else ("x_mm", "y_mm")
 
     def fill_zarr_group(zarr_group: Any) -> None:
-        grid = study_grid(study)
-        for name, values in parameter_values.items():
-            _write_array(zarr_group, name, "point", values)
-        for axis, values in enumerate(np.asarray(grid.places).T):
-            _write_array(zarr_group, axes[axis], "place", np.round(1e3 * values, 9).tolist())
-        num_points, num_places = len(study.points), len(grid.places)
-        for name, (unit, description) in arrays.items():
-            has_place_axis = name == "sensitivity"
+        touched_grid = study_grid(study)
+        for array_name, array_values in parameter_values.items():
+            _write_array(zarr_group, array_name, "point", array_values)
+        for axis_index, array_values in enumerate(np.asarray(touched_grid.places).T):
+            _write_array(zarr_group, axis_names[axis_index], "place", np.round(1e3 * array_values, 9).tolist())
+        num_points, num_places = len(study.points), len(touched_grid.places)
+        for array_name, (array_unit, array_description) in result_arrays.items():
+            has_place_axis = array_name == "sensitivity"
             zarr_group.create_array(
-                name,
+                array_name,
                 shape=(num_points, num_places) if has_place_axis else (num_points,),
                 chunks=(1, num_places) if has_place_axis else (1,),
                 dtype="float64",
                 fill_value=np.nan,
                 dimension_names=("point", "place") if has_place_axis else ("point",),
-                attributes={"units": unit, "long_name": description},
+                attributes={"units": array_unit, "long_name": array_description},
             )
 
-    attributes = {"coordinates": " ".join([*parameter_values, *axes]), "name": study.name, "study": study.text}
+    store_attributes = {
+        "coordinates": " ".join([*parameter_values, *axis_names]),
+        "name": study.name,
+        "study": study.text,
+    }
     return Contents(
-        "study", "'jeit study run'", study.fingerprint, study.chunks, [*arrays], attributes, fill_zarr_group
+        "study",
+        "'jeit study run'",
+        study.fingerprint,
+        study.chunks,
+        [*result_arrays],
+        store_attributes,
+        fill_zarr_group,
     )
 
 
 def _result_arrays(study: Study) -> dict[str, tuple[str, str]]:
     """Unit and description of every result of `study`."""
-    arrays = {"sensitivity": ("V", "sensitivity ‖Δv‖ to a touch")}
-    for score, score_arrays in _SCORE_ARRAYS.items():
-        if score in study.scores:
-            arrays |= score_arrays
-    return arrays
+    result_arrays = {"sensitivity": ("V", "sensitivity ‖Δv‖ to a touch")}
+    for score_name, score_arrays in _SCORE_ARRAYS.items():
+        if score_name in study.scores:
+            result_arrays |= score_arrays
+    return result_arrays
 
 
-def _write_array(zarr_group, name: str, dimension: str, values: list) -> None:
-    is_text = isinstance(values[0], str)
-    array = np.array(values, dtype=object if is_text else None)
+def _write_array(zarr_group, array_name: str, dimension_name: str, array_values: list) -> None:
+    is_text = isinstance(array_values[0], str)
+    numpy_array = np.array(array_values, dtype=object if is_text else None)
     zarr_array = zarr_group.create_array(
-        name, shape=array.shape, chunks=array.shape, dtype=str if is_text else array.dtype, dimension_names=(dimension,)
+        array_name,
+        shape=numpy_array.shape,
+        chunks=numpy_array.shape,
+        dtype=str if is_text else numpy_array.dtype,
+        dimension_names=(dimension_name,),
     )
-    zarr_array[:] = array
+    zarr_array[:] = numpy_array

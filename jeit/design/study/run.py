@@ -40,10 +40,10 @@ class ProgressReporter:
     def __init__(
         self, chunks: Sequence[Sequence[int]], finished_chunks: set[int], progress: Callable[[Progress], None] | None
     ):
-        self._chunks, self._finished_chunks, self._progress = chunks, set(finished_chunks), progress
-        self._num_points = sum(len(chunk) for chunk in chunks)
+        self._points_of_chunks, self._finished_chunks, self._progress_callback = chunks, set(finished_chunks), progress
+        self._num_points = sum(len(chunk_points) for chunk_points in chunks)
         self._initial_points, self._start_time = self._num_finished_points(), time.monotonic()
-        self._report(self._initial_points, None)
+        self._report_progress(self._initial_points, None)
 
     def report_finished_chunk(self, number: int) -> None:
         """Report that the chunk `number` is finished."""
@@ -54,17 +54,23 @@ class ProgressReporter:
         """Report the number of finished points of the current chunk."""
         self._estimate_and_report(self._num_finished_points() + points)
 
-    def _estimate_and_report(self, points: int) -> None:
-        seconds_per_point = (time.monotonic() - self._start_time) / (points - self._initial_points)
-        self._report(points, seconds_per_point * (self._num_points - points))
+    def _estimate_and_report(self, num_finished_points: int) -> None:
+        seconds_per_point = (time.monotonic() - self._start_time) / (num_finished_points - self._initial_points)
+        self._report_progress(num_finished_points, seconds_per_point * (self._num_points - num_finished_points))
 
     def _num_finished_points(self) -> int:
-        return sum(len(self._chunks[number]) for number in self._finished_chunks)
+        return sum(len(self._points_of_chunks[chunk_number]) for chunk_number in self._finished_chunks)
 
-    def _report(self, points: int, seconds_left: float | None) -> None:
-        if self._progress is not None:
-            self._progress(
-                Progress(points, self._num_points, len(self._finished_chunks), len(self._chunks), seconds_left)
+    def _report_progress(self, num_finished_points: int, seconds_left: float | None) -> None:
+        if self._progress_callback is not None:
+            self._progress_callback(
+                Progress(
+                    num_finished_points,
+                    self._num_points,
+                    len(self._finished_chunks),
+                    len(self._points_of_chunks),
+                    seconds_left,
+                )
             )
 
 
@@ -83,17 +89,20 @@ def solve_on_cluster(
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sending large graph")
         shared_data_future = client.submit(_return_unchanged, shared_data, pure=False)
-    futures = {client.submit(solve, shared_data_future, number, pure=False, retries=2): number for number in numbers}
+    chunk_futures = {
+        client.submit(solve, shared_data_future, chunk_number, pure=False, retries=2): chunk_number
+        for chunk_number in numbers
+    }
     try:
-        for future, results in distributed.as_completed(futures, with_results=True):
-            yield futures[future], results
-            future.release()
+        for chunk_future, chunk_results in distributed.as_completed(chunk_futures, with_results=True):
+            yield chunk_futures[chunk_future], chunk_results
+            chunk_future.release()
     finally:
-        client.cancel([shared_data_future, *futures])
+        client.cancel([shared_data_future, *chunk_futures])
 
 
-def _return_unchanged(data: Any) -> Any:
-    return data
+def _return_unchanged(unchanged_data: Any) -> Any:
+    return unchanged_data
 
 
 def run_study(
@@ -127,13 +136,17 @@ def run_study(
     """
     require_extra("cluster", "a study")
     check_points(study)
-    with writing(study, path) as store:
-        finished_chunks = set(store.intact_chunks())
-        remaining_chunks = [number for number in range(len(study.chunks)) if number not in finished_chunks]
-        report = ProgressReporter(study.chunks, finished_chunks, progress)
-        for number, results in _solve_chunks(study, remaining_chunks, client, report.report_points):
-            store.write(number, results)
-            report.report_finished_chunk(number)
+    with writing(study, path) as results_store:
+        finished_chunks = set(results_store.intact_chunks())
+        remaining_chunks = [
+            chunk_number for chunk_number in range(len(study.chunks)) if chunk_number not in finished_chunks
+        ]
+        progress_reporter = ProgressReporter(study.chunks, finished_chunks, progress)
+        for chunk_number, chunk_results in _solve_chunks(
+            study, remaining_chunks, client, progress_reporter.report_points
+        ):
+            results_store.write(chunk_number, chunk_results)
+            progress_reporter.report_finished_chunk(chunk_number)
     return open_results(study, path)
 
 
@@ -156,17 +169,17 @@ def study_progress(study: Study, path: str | Path) -> Progress:
     ```
     """
     finished_chunks = Store(study, path, create=False).intact_chunks()
-    points = sum(len(study.chunks[number]) for number in finished_chunks)
-    return Progress(points, len(study.points), len(finished_chunks), len(study.chunks), None)
+    num_finished_points = sum(len(study.chunks[chunk_number]) for chunk_number in finished_chunks)
+    return Progress(num_finished_points, len(study.points), len(finished_chunks), len(study.chunks), None)
 
 
 def _solve_chunks(
-    study: Study, numbers: list[int], client: Any, solved: Callable[[int], None]
+    study: Study, chunk_numbers: list[int], cluster_client: Any, report_num_solved: Callable[[int], None]
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-    """Yield the number of each chunk of a study with its results, in the order in which the chunks are solved; `solved`
-    as in `solve_chunk`."""
-    if client is None:
-        for number in numbers:
-            yield number, solve_chunk(study, number, solved)
+    """Yield the number of each chunk of a study with its results, in the order in which the chunks are solved;
+    `report_num_solved` as in `solve_chunk`."""
+    if cluster_client is None:
+        for chunk_number in chunk_numbers:
+            yield chunk_number, solve_chunk(study, chunk_number, report_num_solved)
         return
-    yield from solve_on_cluster(client, solve_chunk, study, numbers)
+    yield from solve_on_cluster(cluster_client, solve_chunk, study, chunk_numbers)

@@ -34,11 +34,11 @@ LayoutFactory = Callable[[str, float, float, float], Layout | SurfaceLayout]
 """Function that creates a layout from name, diameter, contact impedance and minimum gap, as `study_layout` does."""
 
 # Version of the results of studies: to be increased if the same study would give different results.
-_VERSION = 2
+_FINGERPRINT_VERSION = 2
 # Minimum number of electrodes for each measurement protocol.
 _MIN_ELECTRODES = {"adjacent": 4, "opposite": 4, "two-terminal": 2}
 # Maximum size of a study file, and of the study's store of results, bytes.
-_MAX_FILE_BYTES, _MAX_STORE_BYTES = 2**22, 20e9
+_MAX_STUDY_BYTES, _MAX_STORE_BYTES = 2**22, 20e9
 
 
 class PointShape(NamedTuple):
@@ -143,21 +143,21 @@ class Study:
     @cached_property
     def chunks(self) -> tuple[tuple[int, ...], ...]:
         """Numbers of the points of each chunk: at most `chunk_points` points, all with the same shape."""
-        shapes: dict[tuple, list[int]] = {}
-        for number, point in enumerate(self.points):
-            shapes.setdefault(point.shape, []).append(number)
+        points_by_shape: dict[tuple, list[int]] = {}
+        for point_number, point in enumerate(self.points):
+            points_by_shape.setdefault(point.shape, []).append(point_number)
         max_points = self.chunk_points
         return tuple(
-            tuple(point_numbers[start : start + max_points])
-            for point_numbers in shapes.values()
-            for start in range(0, len(point_numbers), max_points)
+            tuple(point_numbers[first_point : first_point + max_points])
+            for point_numbers in points_by_shape.values()
+            for first_point in range(0, len(point_numbers), max_points)
         )
 
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 hash of everything that determines the results, without comments and the study's name."""
         outline_values = [self.surface] if isinstance(self.outline, Triangles) else [*map(float, self.outline.extent)]
-        hashed_values = [_VERSION, *outline_values, type(self.indentation).__name__]
+        hashed_values = [_FINGERPRINT_VERSION, *outline_values, type(self.indentation).__name__]
         hashed_values += [*map(float, vars(self.indentation).values()), self.columns, self.rows, self.current]
         hashed_values += [self.contrast, self.exact, *self.scores, self.num_taxels, self.threshold, self.correlation]
         hashed_values += [self.seed, self.chunk_points]
@@ -238,7 +238,7 @@ def read_study(path: str | Path) -> Study:
     from jeit.files.limits import faults_message
     from jeit.files.schema import validated
 
-    text = read_text(path, max_bytes=_MAX_FILE_BYTES)
+    text = read_text(path, max_bytes=_MAX_STUDY_BYTES)
     table = validated(StudyTable, parsed_toml(text, path.name), path.name)
     try:
         return _study_from_table(text, table, path.parent)
@@ -256,8 +256,8 @@ def _study_from_table(text: str, table: StudyTable, folder: Path) -> Study:
     cell_sizes, outline, layout_factories = _surface_meshes(table, folder)
     # Every layout is created once for each mesh; on flat skins, a single layout serves all meshes.
     layouts = [
-        [create_layout(name, diameter, impedance, minimum_gap) for create_layout in layout_factories]
-        for name, diameter, impedance in itertools.product(
+        [create_layout(name, diameter, contact_impedance, minimum_gap) for create_layout in layout_factories]
+        for name, diameter, contact_impedance in itertools.product(
             electrodes.layouts, _to_metres(electrodes.diameter_mm), electrodes.contact_impedance_ohm_m2
         )
     ]
@@ -330,7 +330,7 @@ def _check_touches(table: StudyTable) -> None:
     """Check that there are enough touches for the scores, and that disk space and memory suffice for the results and
     the computation."""
     scores, num_touches = table.scores, table.touch.columns * table.touch.rows
-    sheet_scores = [score for score in SHEET_ONLY_SCORES if score in scores.wanted]
+    sheet_scores = [score_name for score_name in SHEET_ONLY_SCORES if score_name in scores.wanted]
     num_bytes = 8.0 * table.num_points * num_touches
     if num_bytes > _MAX_STORE_BYTES:
         raise ValueError(
@@ -360,26 +360,26 @@ def _check_layout(
     layout: Layout | SurfaceLayout, outline: Rectangle | Triangles, layers: int, table: StudyTable
 ) -> None:
     """Check that an electrode layout can be measured and meshed for all values of the swept parameters."""
-    width_mm, max_thickness_mm = 1e3 * longer_side(outline), max(table.skin.thickness_mm)
-    if max_thickness_mm > width_mm:
-        raise ValueError(f"skin.thickness_mm is {max_thickness_mm:g}, more than the skin is wide: {width_mm:g} mm.")
-    touches = table.touch.columns * table.touch.rows
+    side_mm, max_thickness_mm = 1e3 * longer_side(outline), max(table.skin.thickness_mm)
+    if max_thickness_mm > side_mm:
+        raise ValueError(f"skin.thickness_mm is {max_thickness_mm:g}, more than the skin is wide: {side_mm:g} mm.")
+    num_touches = table.touch.columns * table.touch.rows
     for protocol in table.measurement.protocol:
         for pairs in table.measurement.pairs or [None]:
             num_pairs = _num_pairs(layout, protocol, pairs)
             _check_measurement(layout, protocol, num_pairs)
             if protocol == "two-terminal":
                 num_measurements = num_pairs or _num_all_pairs(layout)
-                num_bytes = 8.0 * num_measurements * (4 * layout.num_electrodes + touches)
+                num_bytes = 8.0 * num_measurements * (4 * layout.num_electrodes + num_touches)
                 check_memory(
-                    f"measurement.pairs: {num_measurements:,} of {layout.name!r}, touched at {touches:,} places,",
+                    f"measurement.pairs: {num_measurements:,} of {layout.name!r}, touched at {num_touches:,} places,",
                     num_bytes,
                 )
     if isinstance(outline, Triangles) and "cell_mm" not in table.mesh.model_fields_set:
         return
-    area = float(outline.areas.sum()) if isinstance(outline, Triangles) else outline.area
+    skin_area = float(outline.areas.sum()) if isinstance(outline, Triangles) else outline.area
     for cell_size in _to_metres(table.mesh.cell_mm):
-        check_cell_size("mesh.cell_mm", cell_size, layout, area, layers)
+        check_cell_size("mesh.cell_mm", cell_size, layout, skin_area, layers)
 
 
 def _num_pairs(layout: Layout | SurfaceLayout, protocol: str, pairs: int | None) -> int:
@@ -417,14 +417,14 @@ def _check_measurement(layout: Layout | SurfaceLayout, protocol: str, pairs: int
         )
 
 
-def _to_metres(lengths: list[float]) -> list[float]:
+def _to_metres(lengths_mm: list[float]) -> list[float]:
     """Convert millimetres to metres."""
-    return [1e-3 * length for length in lengths]
+    return [1e-3 * length_mm for length_mm in lengths_mm]
 
 
-def _remove_rounding_error(value) -> float:
-    """Round `value` to 12 digits, which removes rounding errors of unit conversion."""
-    return float(f"{float(value):.12g}")
+def _remove_rounding_error(converted_value) -> float:
+    """Round `converted_value` to 12 digits, which removes rounding errors of unit conversion."""
+    return float(f"{float(converted_value):.12g}")
 
 
 def _surface_meshes(
@@ -434,12 +434,12 @@ def _surface_meshes(
     the functions that create layouts: a single function for flat skins, one for each cell size for curved skins."""
     from jeit.design.skin.surface_tables import ScanTable  # imported already when the table was read
 
-    cell_sizes = [1e-3 * size for size in table.mesh.cell_mm]
+    cell_sizes = [1e-3 * cell_size for cell_size in table.mesh.cell_mm]
     surface_table = table.surface
     if surface_table is None:
         outline = Rectangle(1e-3 * table.skin.width_mm, 1e-3 * table.skin.height_mm)
         return cell_sizes, outline, [lambda name, *sizes: study_layout(name, folder, outline, *sizes)]
-    surfaces = [described_surface(surface_table, folder, size) for size in cell_sizes]
+    surfaces = [described_surface(surface_table, folder, cell_size) for cell_size in cell_sizes]
     if isinstance(surface_table, ScanTable) and surface_table.has_cells:
         cell_sizes = [typical_cell_size(surfaces[0])]
 

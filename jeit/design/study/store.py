@@ -59,19 +59,19 @@ class ArrayShape(NamedTuple):
 def find_unsafe_content(path: Path) -> str | None:
     """Reason why a store must not be opened; None if nothing in the store can run code or link to other paths. Raises
     `OSError` for files that cannot be read."""
-    for folder, folders, files in os.walk(path):
-        for name in [*folders, *files]:
-            entry = Path(folder, name)
-            if entry.is_symlink():
-                return f"'{entry.relative_to(path)}' is a link to another place"
+    for parent, subfolder_names, file_names in os.walk(path):
+        for name in [*subfolder_names, *file_names]:
+            entry_path = Path(parent, name)
+            if entry_path.is_symlink():
+                return f"'{entry_path.relative_to(path)}' is a link to another place"
             if name in _FORMAT_2_FILES:
-                return f"'{entry.relative_to(path)}' is of Zarr's format 2, which jeit does not write"
+                return f"'{entry_path.relative_to(path)}' is of Zarr's format 2, which jeit does not write"
     for file in path.rglob(_METADATA_FILE):
         metadata = _read_json_object(file)  # a file that Zarr cannot read is damaged, but not dangerous
         for location, node in [] if metadata is None else _metadata_nodes(metadata, str(file.relative_to(path))):
-            reason = _find_node_danger(node)
-            if reason:
-                return f"{location} {reason}"
+            danger = _find_node_danger(node)
+            if danger:
+                return f"{location} {danger}"
     return None
 
 
@@ -86,22 +86,22 @@ def find_damage(path: Path, expected_arrays: Mapping[str, ArrayShape]) -> str | 
         return f"its arrays are not those of its contents: {_short_text(array_names ^ set(expected_arrays))}"
     if metadata.get("zarr_format") != 3 or metadata.get("node_type") != "group":
         return "it is no group of Zarr's format 3"
-    consolidated = metadata.get("consolidated_metadata")
-    consolidated_nodes = consolidated.get("metadata") if isinstance(consolidated, dict) else None
+    group_metadata = metadata.get("consolidated_metadata")
+    consolidated_nodes = group_metadata.get("metadata") if isinstance(group_metadata, dict) else None
     if not isinstance(consolidated_nodes, dict) or set(consolidated_nodes) != set(expected_arrays):
         return "it does not name the arrays of its contents"
     for name, array in expected_arrays.items():
         if [*(path / name).rglob(_METADATA_FILE)] != [path / name / _METADATA_FILE]:
             return f"array '{name}' has not one {_METADATA_FILE}"
         array_node = _read_json_object(path / name / _METADATA_FILE)
-        reason = (
+        damage = (
             _UNREADABLE_METADATA
             if array_node is None
             else _find_node_damage(consolidated_nodes[name], array) or _find_node_damage(array_node, array)
         )
-        reason = reason or _chunk_damage(path / name, array)
-        if reason:
-            return f"array '{name}' {reason}"
+        damage = damage or _chunk_damage(path / name, array)
+        if damage:
+            return f"array '{name}' {damage}"
     return None
 
 
@@ -112,35 +112,38 @@ def _chunk_damage(folder: Path, array: ArrayShape) -> str | None:
     for file in folder.rglob("*"):
         if file.is_file() and file.name != _METADATA_FILE:
             with file.open("rb") as chunk_file:
-                size = _unpacked_size(chunk_file.read(18), file.stat().st_size)
-            if size is None or size > max_bytes:
-                return f"has a chunk, '{file.relative_to(folder)}', of {size or 'unknown'} bytes, more than {max_bytes}"
+                num_bytes = _unpacked_size(chunk_file.read(18), file.stat().st_size)
+            if num_bytes is None or num_bytes > max_bytes:
+                return (
+                    f"has a chunk, '{file.relative_to(folder)}', of {num_bytes or 'unknown'} bytes, more than "
+                    f"{max_bytes}"
+                )
     return None
 
 
-def _unpacked_size(first_bytes: bytes, size: int) -> int | None:
-    """Unpacked size in bytes of a chunk, from its `first_bytes` and its `size` on disk: as stated in a zstd frame (RFC
-    8878) or a blosc header, otherwise `size` itself. None if a frame does not state its size."""
+def _unpacked_size(first_bytes: bytes, packed_size: int) -> int | None:
+    """Unpacked size in bytes of a chunk, from its `first_bytes` and its `packed_size` on disk: as stated in a zstd
+    frame (RFC 8878) or a blosc header, otherwise `packed_size` itself. None if a frame does not state its size."""
     if first_bytes.startswith(b"\x28\xb5\x2f\xfd") and len(first_bytes) > 5:
-        descriptor = first_bytes[4]
-        is_single_segment = descriptor >> 5 & 1
-        size_start = 5 + (1 - is_single_segment) + (0, 1, 2, 4)[descriptor & 3]
-        num_size_bytes = (is_single_segment, 2, 4, 8)[descriptor >> 6]
-        content_size = int.from_bytes(first_bytes[size_start : size_start + num_size_bytes], "little")
+        frame_descriptor = first_bytes[4]
+        is_single_segment = frame_descriptor >> 5 & 1
+        size_field_start = 5 + (1 - is_single_segment) + (0, 1, 2, 4)[frame_descriptor & 3]
+        num_size_bytes = (is_single_segment, 2, 4, 8)[frame_descriptor >> 6]
+        content_size = int.from_bytes(first_bytes[size_field_start : size_field_start + num_size_bytes], "little")
         return content_size + (256 if num_size_bytes == 2 else 0) if num_size_bytes else None
     if first_bytes[:1] == b"\x02" and len(first_bytes) >= 16:
-        return max(size, int.from_bytes(first_bytes[4:8], "little"))
-    return size
+        return max(packed_size, int.from_bytes(first_bytes[4:8], "little"))
+    return packed_size
 
 
 def _metadata_nodes(metadata: Any, location: str) -> Iterator[tuple[str, Any]]:
     """Yield the location and the metadata of every group and array that `metadata` describes, including consolidated
     metadata at any depth."""
     yield f"'{location}'", metadata
-    consolidated = metadata.get("consolidated_metadata") if isinstance(metadata, dict) else None
-    nested_nodes = consolidated.get("metadata") if isinstance(consolidated, dict) else None
-    for name, node in (nested_nodes if isinstance(nested_nodes, dict) else {}).items():
-        yield from _metadata_nodes(node, f"{location}: {name}")
+    group_metadata = metadata.get("consolidated_metadata") if isinstance(metadata, dict) else None
+    nested_nodes = group_metadata.get("metadata") if isinstance(group_metadata, dict) else None
+    for name, nested_node in (nested_nodes if isinstance(nested_nodes, dict) else {}).items():
+        yield from _metadata_nodes(nested_node, f"{location}: {name}")
 
 
 def _find_node_danger(node: Any) -> str | None:
@@ -154,8 +157,8 @@ def _find_node_danger(node: Any) -> str | None:
     if "data_type" in node and not (isinstance(data_type, str) and data_type in _ALLOWED_TYPES):
         return f"holds neither numbers nor text but {_short_text([data_type])}"
     codecs = node.get("codecs", [])
-    names = [codec.get("name") if isinstance(codec, dict) else codec for codec in _as_list(codecs)]
-    unknown_codecs = [name for name in names if not (isinstance(name, str) and name in CODECS)]
+    codec_names = [codec.get("name") if isinstance(codec, dict) else codec for codec in _as_list(codecs)]
+    unknown_codecs = [name for name in codec_names if not (isinstance(name, str) and name in CODECS)]
     return (
         f"asks for {_short_text(unknown_codecs)}, and not only for codecs that pack bytes" if unknown_codecs else None
     )
@@ -192,7 +195,7 @@ def _short_text(values: Any) -> str:
     return ", ".join(ascii(value)[:60] for value in [*values][:3])
 
 
-_PACKAGES = ("jeit", "jax", "numpy", "scipy")
+_RECORDED_PACKAGES = ("jeit", "jax", "numpy", "scipy")
 _EXTRA_PURPOSE = "a store of results"
 _PATH_DESCRIPTION = "that of the store, such as 'results.zarr'"
 
@@ -225,7 +228,7 @@ class Store:
                 raise OSError(
                     error.errno, f"the {kind}'s store cannot be made ({error.strerror})", str(path)
                 ) from error
-        attributes = self._attributes()
+        attributes = self._read_attributes()
         if not attributes:
             raise ValueError(
                 f"{self.path} holds no {kind}: name the store that {self.contents.made_by} wrote, or, for a new one, a "
@@ -236,20 +239,20 @@ class Store:
                 f"{self.path} holds the results of another {kind}, or of this one before it was changed; move it away "
                 "or choose another path."
             )
-        self._check(_store_shapes(zarr, self.contents))
+        self._check_metadata(_store_shapes(zarr, self.contents))
         try:
-            self._group = zarr.open_group(str(self.path), mode="r+" if create else "r", zarr_format=3)
+            self._zarr = zarr.open_group(str(self.path), mode="r+" if create else "r", zarr_format=3)
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise self._damage_error(error) from None
 
     @property
     def versions(self) -> dict[str, str]:
         """Versions of the packages that created the store, by the packages' names."""
-        return self._attributes()["versions"]
+        return self._read_attributes()["versions"]
 
     def finished_checksums(self) -> dict[int, str]:
         """Checksum of every finished chunk, by the chunk's number."""
-        return {int(number): checksum for number, checksum in self._attributes()["finished"].items()}
+        return {int(number): checksum for number, checksum in self._read_attributes()["finished"].items()}
 
     def intact_chunks(self) -> list[int]:
         """Numbers of the finished chunks whose results match their checksums."""
@@ -275,7 +278,7 @@ class Store:
 
     def write_array(self, name: str, points: Sequence[int], values: np.ndarray) -> None:
         """Write `values` (k, …) of the array `name` for the k `points`."""
-        array, first_row = self._group[name], 0
+        array, first_row = self._zarr[name], 0
         for rows in _consecutive_runs(points):
             last_row = first_row + rows.stop - rows.start
             array[rows] = values[first_row:last_row]  # pyright: ignore[reportIndexIssue]
@@ -284,23 +287,23 @@ class Store:
     def _mark_finished(self, number: int, checksum: str) -> None:
         metadata = _read_json(self.path)
         finished_checksums = metadata["attributes"]["finished"] | {str(number): checksum}
-        metadata["attributes"]["finished"] = dict(sorted(finished_checksums.items(), key=lambda item: int(item[0])))
+        metadata["attributes"]["finished"] = dict(sorted(finished_checksums.items(), key=lambda entry: int(entry[0])))
         # The temporary file is beside the store, since Zarr would not recognise a file left behind inside the store.
-        temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.tmp")
+        temporary_path = self.path.with_name(f".{self.path.name}.{os.getpid()}.tmp")
         try:
-            with open(temporary, "w", encoding="utf-8") as file:
-                json.dump(metadata, file, indent=1, ensure_ascii=False)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, self.path / "zarr.json")
+            with open(temporary_path, "w", encoding="utf-8") as temporary_file:
+                json.dump(metadata, temporary_file, indent=1, ensure_ascii=False)
+                temporary_file.flush()
+                os.fsync(temporary_file.fileno())
+            os.replace(temporary_path, self.path / "zarr.json")
         finally:
-            temporary.unlink(missing_ok=True)
+            temporary_path.unlink(missing_ok=True)
 
     def _checksum(self, number: int) -> str | None:
-        runs = _consecutive_runs(self.contents.chunks[number])
+        slices = _consecutive_runs(self.contents.chunks[number])
         try:
             return _checksum(
-                {name: np.concatenate([self._group[name][rows] for rows in runs]) for name in self.contents.arrays}
+                {name: np.concatenate([self._zarr[name][rows] for rows in slices]) for name in self.contents.arrays}
             )  # pyright: ignore
         except (OSError, ValueError, RuntimeError):
             return None  # a file of the chunk cannot be decoded
@@ -309,7 +312,7 @@ class Store:
         """Open the whole store as an `xarray.Dataset`, whose values are read from disk when they are needed."""
         return import_optional("xarray", _EXTRA_PURPOSE).open_zarr(str(self.path), chunks=None, zarr_format=3)
 
-    def _check(self, expected_arrays: Mapping[str, ArrayShape]) -> None:
+    def _check_metadata(self, expected_arrays: Mapping[str, ArrayShape]) -> None:
         """Check the metadata before Zarr opens the store. Raises `ValueError` if the store is dangerous or damaged."""
         try:
             danger_text = find_unsafe_content(self.path)
@@ -325,7 +328,7 @@ class Store:
         if damage_text:
             raise self._damage_error(damage_text)
 
-    def _attributes(self) -> dict:
+    def _read_attributes(self) -> dict:
         """Read the attributes of the store; empty if the path is not a store. Raises `ValueError` if the attributes
         cannot be read.
         """
@@ -342,8 +345,8 @@ class Store:
             raise self._damage_error("what it says of finished chunks makes no sense")
         return attributes
 
-    def _damage_error(self, reason: object) -> ValueError:
-        reason_text = " ".join(str(reason).split()).rstrip(".")
+    def _damage_error(self, damage: object) -> ValueError:
+        reason_text = " ".join(str(damage).split()).rstrip(".")
         return ValueError(
             f"{self.path / 'zarr.json'} cannot be read ({reason_text}): the store is damaged, and does not say what is "
             f"finished. Put that file back from a copy; or move the store away and run the {self.contents.kind} again."
@@ -395,23 +398,23 @@ def open_results(study: Study, path: str | Path):
     is_finished = np.zeros(len(study.points), bool)
     for number in store.intact_chunks():
         is_finished[list(study.chunks[number])] = True
-    variables = {}
+    result_arrays = {}
     with store.open_dataset() as dataset:
-        for name, variable in dataset.data_vars.items():
-            values = np.full(variable.shape, np.nan)
-            values[is_finished] = variable[np.flatnonzero(is_finished)]
-            variables[name] = (variable.dims, values, variable.attrs)
+        for name, stored_array in dataset.data_vars.items():
+            values = np.full(stored_array.shape, np.nan)
+            values[is_finished] = stored_array[np.flatnonzero(is_finished)]
+            result_arrays[name] = (stored_array.dims, values, stored_array.attrs)
         coordinates = {name: coordinate.load() for name, coordinate in dataset.coords.items()}
-        return xarray.Dataset(variables, {**coordinates, "finished": ("point", is_finished)}, dataset.attrs)
+        return xarray.Dataset(result_arrays, {**coordinates, "finished": ("point", is_finished)}, dataset.attrs)
 
 
 def _store_shapes(zarr: ModuleType, contents: Contents) -> dict[str, ArrayShape]:
     """Sizes of the arrays of `contents`, by name, determined from a store in memory that has no values."""
-    group = zarr.open_group(zarr.storage.MemoryStore(), mode="w", zarr_format=3)
-    contents.fill(group)
+    zarr_group = zarr.open_group(zarr.storage.MemoryStore(), mode="w", zarr_format=3)
+    contents.fill(zarr_group)
     return {
         name: ArrayShape(array.shape, array.chunks, array.metadata.to_dict()["data_type"])
-        for name, array in group.arrays()
+        for name, array in zarr_group.arrays()
     }
 
 
@@ -424,40 +427,42 @@ def _consecutive_runs(points: Sequence[int]) -> list[slice]:
 
 def _create_store(zarr: ModuleType, contents: Contents, path: Path) -> None:
     """Create the store atomically: it is written under a temporary name, and then renamed."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.new")
-    shutil.rmtree(temporary, ignore_errors=True)
+    temporary_path = path.with_name(f".{path.name}.{os.getpid()}.new")
+    shutil.rmtree(temporary_path, ignore_errors=True)
     attributes = {
         **contents.attributes,
         "fingerprint": contents.fingerprint,
         "finished": {},
-        "versions": {name: metadata.version(name) for name in _PACKAGES},
+        "versions": {name: metadata.version(name) for name in _RECORDED_PACKAGES},
     }
     try:
-        group = zarr.open_group(str(temporary), mode="w", zarr_format=3, attributes=dict(sorted(attributes.items())))
-        contents.fill(group)
+        zarr_group = zarr.open_group(
+            str(temporary_path), mode="w", zarr_format=3, attributes=dict(sorted(attributes.items()))
+        )
+        contents.fill(zarr_group)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Consolidated metadata is currently not part")
-            zarr.consolidate_metadata(str(temporary))
-        os.rename(temporary, path)
+            zarr.consolidate_metadata(str(temporary_path))
+        os.rename(temporary_path, path)
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        shutil.rmtree(temporary_path, ignore_errors=True)
 
 
 def _remove_temporary_stores(path: Path) -> None:
     """Remove temporary files beside the store that killed runs have left."""
     for temporary_path in path.parent.glob(f".{glob.escape(path.name)}.*"):
-        pid, _, kind = temporary_path.name.removeprefix(f".{path.name}.").partition(".")
-        if pid.isdecimal() and kind == "new":
+        process_id, _, suffix = temporary_path.name.removeprefix(f".{path.name}.").partition(".")
+        if process_id.isdecimal() and suffix == "new":
             shutil.rmtree(temporary_path, ignore_errors=True)
-        elif pid.isdecimal() and kind == "tmp":
+        elif process_id.isdecimal() and suffix == "tmp":
             temporary_path.unlink(missing_ok=True)
 
 
 def _checksum(results: Mapping[str, np.ndarray]) -> str:
-    sha256 = hashlib.sha256()
+    results_hash = hashlib.sha256()
     for name in sorted(results):
-        sha256.update(name.encode() + np.ascontiguousarray(results[name], dtype=float).tobytes())
-    return sha256.hexdigest()
+        results_hash.update(name.encode() + np.ascontiguousarray(results[name], dtype=float).tobytes())
+    return results_hash.hexdigest()
 
 
 def _read_json(path: Path) -> dict:

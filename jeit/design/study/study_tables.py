@@ -112,43 +112,54 @@ class StudyTable(Table):
     @property
     def num_layouts(self) -> int:
         """Number of combinations of layouts, diameters and contact impedances."""
-        electrodes = self.electrodes
-        return math.prod(map(len, (electrodes.layouts, electrodes.diameter_mm, electrodes.contact_impedance_ohm_m2)))
+        layout_sweep = self.electrodes
+        return math.prod(
+            map(len, (layout_sweep.layouts, layout_sweep.diameter_mm, layout_sweep.contact_impedance_ohm_m2))
+        )
 
     @property
     def num_points(self) -> int:
         """Number of points of the study, that is of all combinations of swept values."""
-        skin, measurement = self.skin, self.measurement
-        other_value_lists = (measurement.protocol, measurement.pairs or [0], measurement.noise_V, self.mesh.cell_mm)
+        material_sweep, measurement_sweep = self.skin, self.measurement
+        other_value_lists = (
+            measurement_sweep.protocol,
+            measurement_sweep.pairs or [0],
+            measurement_sweep.noise_V,
+            self.mesh.cell_mm,
+        )
         return self.num_layouts * math.prod(
-            map(len, (skin.thickness_mm, skin.conductivity_S_per_m, *other_value_lists))
+            map(len, (material_sweep.thickness_mm, material_sweep.conductivity_S_per_m, *other_value_lists))
         )
 
     def value_of(self, key: str) -> Any:
         """Value of the key with the dotted name `key`, such as "mesh.layers"."""
-        section, name = key.split(".")
-        return getattr(getattr(self, section), name)
+        section_name, key_name = key.split(".")
+        return getattr(getattr(self, section_name), key_name)
 
     @model_validator(mode="after")
     def _check_required_values(self) -> "StudyTable":
-        for key, (required_key, required_values) in _REQUIRED_VALUES.items():
-            section, name = key.split(".")
-            value = self.value_of(required_key)
-            values = value if isinstance(value, list) else [value]
-            if name in getattr(self, section).model_fields_set and not set(required_values) & set(values):
+        for dependent_key, (required_key, required_values) in _REQUIRED_VALUES.items():
+            section_name, key_name = dependent_key.split(".")
+            required_key_value = self.value_of(required_key)
+            values_of_required_key = (
+                required_key_value if isinstance(required_key_value, list) else [required_key_value]
+            )
+            if key_name in getattr(self, section_name).model_fields_set and not set(required_values) & set(
+                values_of_required_key
+            ):
                 raise fault(
                     f"has no effect: it applies where {required_key} is {' or '.join(map(repr, required_values))}, "
-                    f"and that is {', '.join(map(repr, values))}; leave it out, or change the other.",
-                    key,
+                    f"and that is {', '.join(map(repr, values_of_required_key))}; leave it out, or change the other.",
+                    dependent_key,
                 )
         return self
 
     @model_validator(mode="after")
     def _check_keys_of_surface(self) -> "StudyTable":
         check_keys_of_surface(self.surface, self.skin, self.mesh)
-        sides = {"width_mm", "height_mm"} & self.skin.model_fields_set
-        if len(sides) == 1:
-            raise fault("is given alone; give both skin.width_mm and skin.height_mm.", f"skin.{sides.pop()}")
+        given_sides = {"width_mm", "height_mm"} & self.skin.model_fields_set
+        if len(given_sides) == 1:
+            raise fault("is given alone; give both skin.width_mm and skin.height_mm.", f"skin.{given_sides.pop()}")
         return self
 
     @model_validator(mode="after")

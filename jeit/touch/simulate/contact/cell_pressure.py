@@ -51,41 +51,41 @@ def pressed_cells(
     Parts of an indenter beyond the edge of the skin carry no load. `progress` is called with a message on the number of
     presses computed so far. Raises `ValueError` for presses off the skin, and as `pressure` of the support does.
     """
-    presses = [press for touch in touches for press in touch]
+    presses = [press for presses_of_touch in touches for press in presses_of_touch]
     if not presses:
         return PressedCells(np.zeros((len(touches), 1), int), np.zeros((len(touches), 1, samples.points.shape[1])))
-    pressed = _pressed_cells(samples, support, presses, progress)
-    if all(len(touch) == 1 for touch in touches):
-        return pressed
-    rows_of_cells, pressures, first_press = [], [], 0
-    for touch in touches:
-        touch_presses = slice(first_press, first_press + len(touch))
-        first_press += len(touch)
-        is_pressed = pressed.pressure[touch_presses].any(axis=-1)
-        cells, cell_indices = np.unique(pressed.cells[touch_presses][is_pressed], return_inverse=True)
-        total_pressures = np.zeros((len(cells), pressed.pressure.shape[-1]))
-        np.add.at(total_pressures, cell_indices, pressed.pressure[touch_presses][is_pressed])
-        rows_of_cells.append(cells)
-        pressures.append(total_pressures)
-    return _pad_and_stack(rows_of_cells, pressures)
+    cells_of_presses = _pressed_cells(samples, support, presses, progress)
+    if all(len(presses_of_touch) == 1 for presses_of_touch in touches):
+        return cells_of_presses
+    rows_of_cells, pressures_of_touches, first_press = [], [], 0
+    for presses_of_touch in touches:
+        press_slice = slice(first_press, first_press + len(presses_of_touch))
+        first_press += len(presses_of_touch)
+        is_pressed_cell = cells_of_presses.pressure[press_slice].any(axis=-1)
+        touch_cells, cell_indices = np.unique(cells_of_presses.cells[press_slice][is_pressed_cell], return_inverse=True)
+        total_pressures = np.zeros((len(touch_cells), cells_of_presses.pressure.shape[-1]))
+        np.add.at(total_pressures, cell_indices, cells_of_presses.pressure[press_slice][is_pressed_cell])
+        rows_of_cells.append(touch_cells)
+        pressures_of_touches.append(total_pressures)
+    return _pad_and_stack(rows_of_cells, pressures_of_touches)
 
 
 def _pressed_cells(
     samples: Samples, support: AbstractSupport, presses: Sequence[Press], progress: Callable[[str], None] | None
 ) -> PressedCells:
     samples.check(presses)
-    positions = np.array([press.position for press in presses])
+    press_positions = np.array([press.position for press in presses])
     indenter_numbers = _indenter_numbers(presses)
     max_reaches = samples.max_chord_ratio * np.array([press.indenter.reach for press in presses])
     # The extent of the pressure on a flat skin is no upper bound for that on a concave skin.
     reach_bounds = max_reaches if samples.curved is not None else _reach_bounds(support, presses, indenter_numbers)
     contact_radii = np.minimum(reach_bounds, max_reaches) + samples.radius
-    tree = KDTree(samples.points.mean(axis=1))
-    candidate_cells = tree.query_ball_point(positions, contact_radii, return_sorted=True)
+    cell_tree = KDTree(samples.points.mean(axis=1))
+    candidate_cells = cell_tree.query_ball_point(press_positions, contact_radii, return_sorted=True)
     skin_areas = samples.points.shape[1] * np.array([samples.area[cells].sum() for cells in candidate_cells])
     presses_beyond_skin = np.flatnonzero(skin_areas < _MIN_SKIN_FRACTION * np.pi * contact_radii**2)
-    candidate_cells[presses_beyond_skin] = tree.query_ball_point(
-        positions[presses_beyond_skin], max_reaches[presses_beyond_skin] + samples.radius, return_sorted=True
+    candidate_cells[presses_beyond_skin] = cell_tree.query_ball_point(
+        press_positions[presses_beyond_skin], max_reaches[presses_beyond_skin] + samples.radius, return_sorted=True
     )
     candidate_cells = samples.facing_cells(presses, candidate_cells)
     num_cells = np.array([len(cells) for cells in candidate_cells])
@@ -93,37 +93,44 @@ def _pressed_cells(
     if empty_presses.size:
         raise ValueError(
             f"position: {empty_presses.size} of {len(presses)} presses lie off the skin, the first at "
-            f"{millimetre_text(positions[empty_presses[0]])} mm; places are in metres."
+            f"{millimetre_text(press_positions[empty_presses[0]])} mm; places are in metres."
         )
     rows_of_cells: list = [None] * len(presses)
-    pressures: list = [None] * len(presses)
+    pressures_of_presses: list = [None] * len(presses)
     num_finished = 0
     for indenter_number in np.unique(indenter_numbers):
         press_indices = np.flatnonzero(indenter_numbers == indenter_number)
         press_indices = press_indices[np.argsort(num_cells[press_indices], kind="stable")]
-        for chunk in np.split(press_indices, range(_PRESSES_AT_ONCE, len(press_indices), _PRESSES_AT_ONCE)):
-            cells, is_not_padding = pad_rows([np.asarray(candidate_cells[press_index], int) for press_index in chunk])
-            pressure = _pressures_of_equal_indenters(
-                samples, support, [presses[press_index] for press_index in chunk], cells, is_not_padding
+        for press_chunk in np.split(press_indices, range(_PRESSES_AT_ONCE, len(press_indices), _PRESSES_AT_ONCE)):
+            cells, is_not_padding = pad_rows(
+                [np.asarray(candidate_cells[press_index], int) for press_index in press_chunk]
             )
-            for press_index, touch_cells, touch_pressure in zip(chunk, cells, pressure, strict=True):
-                is_pressed = touch_pressure.any(axis=-1)
-                rows_of_cells[press_index], pressures[press_index] = touch_cells[is_pressed], touch_pressure[is_pressed]
-            num_finished += len(chunk)
+            chunk_pressures = _pressures_of_equal_indenters(
+                samples, support, [presses[press_index] for press_index in press_chunk], cells, is_not_padding
+            )
+            for press_index, touch_cells, touch_pressure in zip(press_chunk, cells, chunk_pressures, strict=True):
+                is_pressed_cell = touch_pressure.any(axis=-1)
+                rows_of_cells[press_index], pressures_of_presses[press_index] = (
+                    touch_cells[is_pressed_cell],
+                    touch_pressure[is_pressed_cell],
+                )
+            num_finished += len(press_chunk)
             if progress is not None:
                 progress(f"pressure: {num_finished} of {len(presses)}")
-    return _pad_and_stack(rows_of_cells, pressures)
+    return _pad_and_stack(rows_of_cells, pressures_of_presses)
 
 
 def _indenter_numbers(presses: Sequence[Press]) -> Int[np.ndarray, " n"]:
     """Return the number of the indenter of each press (n,); equal indenters have the same number."""
-    numbers: dict = {}
+    numbers_by_content: dict = {}
     numbers_by_id: dict[int, int] = {}
     for press in presses:
         if id(press.indenter) not in numbers_by_id:
-            leaves, structure = jax.tree.flatten(press.indenter)
-            values = tuple((np.shape(leaf), np.asarray(leaf).tobytes()) for leaf in leaves)
-            numbers_by_id[id(press.indenter)] = numbers.setdefault((structure, values), len(numbers))
+            tree_leaves, tree_structure = jax.tree.flatten(press.indenter)
+            leaf_values = tuple((np.shape(tree_leaf), np.asarray(tree_leaf).tobytes()) for tree_leaf in tree_leaves)
+            numbers_by_id[id(press.indenter)] = numbers_by_content.setdefault(
+                (tree_structure, leaf_values), len(numbers_by_content)
+            )
     return np.array([numbers_by_id[id(press.indenter)] for press in presses])
 
 
@@ -154,24 +161,24 @@ def _reach_bounds(support: AbstractSupport, presses: Sequence[Press], indenter_n
 
 def _pressures_of_equal_indenters(samples: Samples, support: AbstractSupport, presses: Sequence[Press], cells, is_cell):
     """Compute pressures (b, c, s) of b presses with the same indenter at the s samples of the `cells` (b, c)."""
-    points = samples.points[cells]
-    sample_shape = points.shape[:-1]
+    sample_points = samples.points[cells]
+    sample_shape = sample_points.shape[:-1]
     local_points, height_differences, area_ratios = samples.to_indenter_coordinates(
-        presses, cells, points.reshape(len(cells), -1, points.shape[-1])
+        presses, cells, sample_points.reshape(len(cells), -1, sample_points.shape[-1])
     )
     sample_areas = np.broadcast_to((area_ratios * samples.area[cells] * is_cell)[..., None], sample_shape).reshape(
         len(cells), -1
     )
-    loads = np.array([press.load for press in presses])
-    pressure = support.spread(
-        presses[0].indenter, loads, local_points, sample_areas, _depth_below_plane(samples, height_differences)
+    press_loads = np.array([press.load for press in presses])
+    sample_pressures = support.spread(
+        presses[0].indenter, press_loads, local_points, sample_areas, _depth_below_plane(samples, height_differences)
     ) * (sample_areas > 0)
-    pressure = pressure.reshape(sample_shape)
-    for press_index in np.flatnonzero(np.count_nonzero(pressure, axis=(1, 2)) < _MIN_NUM_SAMPLES).tolist():
-        pressure[press_index] = _pressures_on_finer_lattice(
+    sample_pressures = sample_pressures.reshape(sample_shape)
+    for press_index in np.flatnonzero(np.count_nonzero(sample_pressures, axis=(1, 2)) < _MIN_NUM_SAMPLES).tolist():
+        sample_pressures[press_index] = _pressures_on_finer_lattice(
             samples, support, presses[press_index], cells[press_index], is_cell[press_index]
         )
-    return pressure
+    return sample_pressures
 
 
 def _pressures_on_finer_lattice(samples: Samples, support: AbstractSupport, press: Press, cells, is_cell):
@@ -180,25 +187,27 @@ def _pressures_on_finer_lattice(samples: Samples, support: AbstractSupport, pres
     If the press touches no point of the finer lattice either, the nearest sample carries the load. Raises `ValueError`
     for a press that touches no skin.
     """
-    points = samples.lattice_points(cells, _FINE_LATTICE)
-    num_fine_samples, num_samples = points.shape[1], samples.points.shape[1]
+    fine_points = samples.lattice_points(cells, _FINE_LATTICE)
+    num_fine_samples, num_samples = fine_points.shape[1], samples.points.shape[1]
     local_points, height_differences, area_ratios = samples.to_indenter_coordinates(
-        [press], cells[None], points.reshape(1, -1, points.shape[-1])
+        [press], cells[None], fine_points.reshape(1, -1, fine_points.shape[-1])
     )
     sample_areas = np.repeat(
         area_ratios[0] * samples.area[cells] * is_cell * num_samples / num_fine_samples, num_fine_samples
     )[None]
-    loads = np.array([press.load])
-    pressure = support.spread(
-        press.indenter, loads, local_points, sample_areas, _depth_below_plane(samples, height_differences)
+    press_loads = np.array([press.load])
+    sample_pressures = support.spread(
+        press.indenter, press_loads, local_points, sample_areas, _depth_below_plane(samples, height_differences)
     ) * (sample_areas > 0)
-    if pressure.any():
-        return np.repeat(pressure.reshape(-1, num_fine_samples).mean(axis=1, keepdims=True), num_samples, axis=1)
-    pressure = np.zeros((len(cells), num_samples))
-    distances = np.linalg.norm(local_points.reshape(-1, num_fine_samples, 2), axis=-1).min(axis=1)
-    nearest_cell = np.where(is_cell, distances, np.inf).argmin()
+    if sample_pressures.any():
+        return np.repeat(
+            sample_pressures.reshape(-1, num_fine_samples).mean(axis=1, keepdims=True), num_samples, axis=1
+        )
+    sample_pressures = np.zeros((len(cells), num_samples))
+    origin_distances = np.linalg.norm(local_points.reshape(-1, num_fine_samples, 2), axis=-1).min(axis=1)
+    nearest_cell = np.where(is_cell, origin_distances, np.inf).argmin()
     if not (
-        distances[nearest_cell] < _RESOLVED_CELL_RADIUS_FRACTION * samples.radius
+        origin_distances[nearest_cell] < _RESOLVED_CELL_RADIUS_FRACTION * samples.radius
         and np.isfinite(press.indenter.gap(np.zeros(2)))
     ):
         raise ValueError(
@@ -207,14 +216,14 @@ def _pressures_on_finer_lattice(samples: Samples, support: AbstractSupport, pres
             "cell's width; move it, or give a wider indenter or a finer mesh."
         )
     nearest_sample = np.linalg.norm(samples.points[cells[nearest_cell]] - press.position, axis=-1).argmin()
-    origin, cell_area = (
+    indenter_origin, cell_area = (
         np.zeros((1, 1, 2)),
         (area_ratios[0, nearest_cell] * samples.area[cells[nearest_cell]]).reshape(1, 1),
     )
-    pressure[nearest_cell, nearest_sample] = support.spread(DiscIndenter(samples.radius), loads, origin, cell_area)[
-        0, 0
-    ]
-    return pressure
+    sample_pressures[nearest_cell, nearest_sample] = support.spread(
+        DiscIndenter(samples.radius), press_loads, indenter_origin, cell_area
+    )[0, 0]
+    return sample_pressures
 
 
 def _depth_below_plane(samples: Samples, depth_below_plane):
@@ -223,9 +232,9 @@ def _depth_below_plane(samples: Samples, depth_below_plane):
     return None if samples.curved is None else depth_below_plane
 
 
-def _pad_and_stack(rows_of_cells: list, pressures: list) -> PressedCells:
+def _pad_and_stack(rows_of_cells: list, pressures_of_touches: list) -> PressedCells:
     """Stack the cells and pressures of all touches. Rows are padded with zeros to the largest number of cells."""
-    cells, is_cell = pad_rows(rows_of_cells)
-    pressure = np.zeros((*cells.shape, pressures[0].shape[-1]))
-    pressure[is_cell] = np.concatenate(pressures)
-    return PressedCells(cells, pressure)
+    padded_cells, is_cell = pad_rows(rows_of_cells)
+    padded_pressures = np.zeros((*padded_cells.shape, pressures_of_touches[0].shape[-1]))
+    padded_pressures[is_cell] = np.concatenate(pressures_of_touches)
+    return PressedCells(padded_cells, padded_pressures)

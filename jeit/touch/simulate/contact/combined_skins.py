@@ -64,7 +64,7 @@ class TwoSheets(Module):
             raise ValueError("model must be of a sheet (2-D mesh), with electrodes that have a contact impedance.")
         num_nodes = model.mesh.num_points
         lower_cells = np.asarray(model.mesh.cells)
-        contact_nodes = [np.asarray(nodes) for nodes in model.electrodes.contact_nodes(model.mesh)]
+        contact_nodes = [np.asarray(electrode_nodes) for electrode_nodes in model.electrodes.contact_nodes(model.mesh)]
         self.model = model
         self.pattern = SparsityPattern.from_elements(
             [np.hstack([lower_cells, lower_cells + num_nodes]), *contact_nodes], size=2 * num_nodes
@@ -81,37 +81,49 @@ class TwoSheets(Module):
         Raises `ValueError` for other shapes, conductivities that are not positive, and negative conductances.
         """
         mesh, electrodes = on_host((self.model.mesh, self.model.electrodes))
-        conductivities = [
+        sheet_conductivities = [
             cell_conductivity(mesh, host.asarray(check_conductivity(mesh, sheet_conductivity)))
             for sheet_conductivity in (conductivity, upper_conductivity)
         ]
         lower_matrices, upper_matrices = (
             _symmetric_matrices(np.asarray(stiffness(mesh, sheet_conductivity)))
-            for sheet_conductivity in conductivities
+            for sheet_conductivity in sheet_conductivities
         )
-        areas = np.asarray(measures(mesh))
-        conductances = np.maximum(
-            _check_conductance(conductance, mesh.num_cells), _MIN_RELATIVE_CONDUCTANCE * conductivities[1] / areas.sum()
+        cell_areas = np.asarray(measures(mesh))
+        cell_conductances = np.maximum(
+            _check_conductance(conductance, mesh.num_cells),
+            _MIN_RELATIVE_CONDUCTANCE * sheet_conductivities[1] / cell_areas.sum(),
         )
-        coupling = (conductances * areas / 12)[:, None, None] * (1 + np.eye(3))
-        element_matrices = host.block([[lower_matrices + coupling, -coupling], [-coupling, upper_matrices + coupling]])
-        contact = electrodes.contact(mesh)
-        loads = host.concatenate([contact.load, np.zeros_like(contact.load)])
-        matrix = self.pattern.assemble(element_matrices, *[None] * len(contact.mass))
-        ground_conductances = ground_conductance(self.pattern.diagonal(matrix), loads)
-        matrix = matrix + self.pattern.assemble(None, *contact.mass)
-        matrix[: len(ground_conductances)] += ground_conductances
-        admittance = quadratic_form(self.plan, factorise(self.plan, matrix), append_ground(loads, ground_conductances))
-        impedance = electrode_impedance(admittance, contact_resistance(electrodes, contact))
-        return np.asarray(channel_voltages(on_host(self.model.protocol), impedance))
+        coupling_matrices = (cell_conductances * cell_areas / 12)[:, None, None] * (1 + np.eye(3))
+        element_matrices = host.block(
+            [
+                [lower_matrices + coupling_matrices, -coupling_matrices],
+                [-coupling_matrices, upper_matrices + coupling_matrices],
+            ]
+        )
+        electrode_contact = electrodes.contact(mesh)
+        electrode_loads = host.concatenate([electrode_contact.load, np.zeros_like(electrode_contact.load)])
+        system_matrix = self.pattern.assemble(element_matrices, *[None] * len(electrode_contact.mass))
+        ground_conductances = ground_conductance(self.pattern.diagonal(system_matrix), electrode_loads)
+        system_matrix = system_matrix + self.pattern.assemble(None, *electrode_contact.mass)
+        system_matrix[: len(ground_conductances)] += ground_conductances
+        electrode_admittance = quadratic_form(
+            self.plan, factorise(self.plan, system_matrix), append_ground(electrode_loads, ground_conductances)
+        )
+        transfer_impedance = electrode_impedance(
+            electrode_admittance, contact_resistance(electrodes, electrode_contact)
+        )
+        return np.asarray(channel_voltages(on_host(self.model.protocol), transfer_impedance))
 
 
-def _symmetric_matrices(packed: Float[np.ndarray, "6 m"]) -> Float[np.ndarray, "m 3 3"]:
+def _symmetric_matrices(packed_triangles: Float[np.ndarray, "6 m"]) -> Float[np.ndarray, "m 3 3"]:
     """Build m symmetric matrices (m, 3, 3) from the six entries (6, m) of their lower triangles."""
-    rows, columns = np.tril_indices(3)
-    matrices = np.zeros((packed.shape[1], 3, 3))
-    matrices[:, rows, columns] = matrices[:, columns, rows] = packed.T
-    return matrices
+    row_indices, column_indices = np.tril_indices(3)
+    symmetric_matrices = np.zeros((packed_triangles.shape[1], 3, 3))
+    symmetric_matrices[:, row_indices, column_indices] = symmetric_matrices[:, column_indices, row_indices] = (
+        packed_triangles.T
+    )
+    return symmetric_matrices
 
 
 def _check_conductance(conductance, num_cells: int) -> Float[np.ndarray, " m"]:
@@ -182,18 +194,18 @@ class JoinedIndenters(AbstractIndenter):
                 "parts: give one indenter at least, such as JoinedIndenters(DiscIndenter(0.01), "
                 "PlacedIndenter(DiscIndenter(0.01), (0.02, 0)))"
             )
-        for part_index, part in enumerate(parts):
-            check_indenter(f"part {part_index}", part)
+        for part_index, indenter_part in enumerate(parts):
+            check_indenter(f"part {part_index}", indenter_part)
         self.parts = parts
 
     def gap(self, points):
         """Return the minimum over the parts of the height of the surface at `points` (…, 2), metres."""
-        return np.min([part.gap(points) for part in self.parts], axis=0)
+        return np.min([indenter_part.gap(points) for indenter_part in self.parts], axis=0)
 
     @property
     def reach(self) -> float:
         """Maximum reach of the parts from the origin, metres."""
-        return max(part.reach for part in self.parts)
+        return max(indenter_part.reach for indenter_part in self.parts)
 
 
 def check_position(position, *, in_space: bool = False) -> Float[np.ndarray, " d"]:

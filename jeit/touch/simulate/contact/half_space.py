@@ -32,9 +32,9 @@ _MIN_LOAD_FRACTION = 0.2
 # Fraction of the load carried by sample points above which `_MIN_LOAD_FRACTION` is not checked.
 _CHECKED_LOAD_FRACTION = 0.5
 # Share of the load that a step moves between pixels, below which the iteration stops.
-_TOLERANCE = 1e-8
+_PRESSURE_TOLERANCE = 1e-8
 # Maximum number of steps of the iteration.
-_MAX_STEPS = 2000
+_MAX_CONTACT_STEPS = 2000
 
 
 class HalfSpace(AbstractSupport):
@@ -78,15 +78,17 @@ class HalfSpace(AbstractSupport):
         """
         check_load(load)
 
-        def is_pressed(window, num_pixels: int) -> np.ndarray:
-            return self._solve_pressure(indenter, load, window, num_pixels)[0] > 0
+        def is_pressed(half_widths, num_pixels: int) -> np.ndarray:
+            return self._solve_pressure(indenter, load, half_widths, num_pixels)[0] > 0
 
-        window = contact_window(is_pressed, indenter.reach, _NUM_COARSE_PIXELS)
-        values, approach = self._solve_pressure(indenter, load, window, self.pixels)
-        points, pixel = raster(window, self.pixels)
-        check_resolved(values > 0, pixel)
-        reach = float(np.linalg.norm(points[values > 0], axis=-1).max() + np.hypot(*pixel))
-        return PressureRaster(float(load), approach, reach, values, pixel)
+        half_widths = contact_window(is_pressed, indenter.reach, _NUM_COARSE_PIXELS)
+        pixel_pressures, approach = self._solve_pressure(indenter, load, half_widths, self.pixels)
+        pixel_centres, pixel_sides = raster(half_widths, self.pixels)
+        check_resolved(pixel_pressures > 0, pixel_sides)
+        contact_reach = float(
+            np.linalg.norm(pixel_centres[pixel_pressures > 0], axis=-1).max() + np.hypot(*pixel_sides)
+        )
+        return PressureRaster(float(load), approach, contact_reach, pixel_pressures, pixel_sides)
 
     def spread(self, indenter: AbstractIndenter, loads, points, areas, fall=None):
         """Compute pressures (n, q) at the q points of each of n loads, scaled so that the points carry the load.
@@ -97,43 +99,49 @@ class HalfSpace(AbstractSupport):
         if fall is not None:
             raise ValueError("support: a HalfSpace is flat, and the skin is curved; take a Foundation.")
         unbounded_pressures = [self.pressure(indenter, load) for load in loads]
-        pressures = np.stack(
+        point_pressures = np.stack(
             [
                 unbounded_pressure.at(press_points)
                 for unbounded_pressure, press_points in zip(unbounded_pressures, points, strict=True)
             ]
         )
-        supported_loads = np.sum(pressures * areas, axis=1)
+        supported_loads = np.sum(point_pressures * areas, axis=1)
         for press_index in np.flatnonzero(
             (supported_loads > 0) & (supported_loads < _CHECKED_LOAD_FRACTION * np.asarray(loads))
         ):
             _check_on_skin(unbounded_pressures[press_index], points[press_index], areas[press_index])
         return (
-            pressures
+            point_pressures
             * np.where(supported_loads > 0, loads / np.where(supported_loads > 0, supported_loads, 1.0), 0.0)[:, None]
         )
 
-    def _solve_pressure(self, indenter: AbstractIndenter, load: float, window, num_pixels: int):
-        points, pixel = raster(window, num_pixels)
-        gap = indenter.gap(points)
-        if not np.isfinite(gap).any():
-            return np.zeros_like(gap), 0.0
-        return rigid_contact(gap, displacement_function(num_pixels, pixel, self.plane_modulus), load / pixel.prod())
+    def _solve_pressure(self, indenter: AbstractIndenter, load: float, half_widths, num_pixels: int):
+        pixel_centres, pixel_sides = raster(half_widths, num_pixels)
+        pixel_gaps = indenter.gap(pixel_centres)
+        if not np.isfinite(pixel_gaps).any():
+            return np.zeros_like(pixel_gaps), 0.0
+        return rigid_contact(
+            pixel_gaps, displacement_function(num_pixels, pixel_sides, self.plane_modulus), load / pixel_sides.prod()
+        )
 
 
-def _check_on_skin(pressure: PressureRaster, points, areas) -> None:
-    """Raise `ValueError` if less than a fifth of a load lies on the skin, which `points` (q, 2) with `areas` (q,)
-    represent."""
-    is_on_skin = areas > 0
-    pixel_centres, pixel = raster(pressure.pixel * len(pressure.values) / 2, len(pressure.values))
-    distances, nearest_cells = KDTree(points[is_on_skin]).query(pixel_centres[pressure.values > 0])
-    forces = pressure.values[pressure.values > 0] * pixel.prod()
-    load_fraction = forces[distances < np.sqrt(areas[is_on_skin][nearest_cells])].sum() / pressure.load
+def _check_on_skin(unbounded_pressure: PressureRaster, skin_points, point_areas) -> None:
+    """Raise `ValueError` if less than a fifth of a load lies on the skin, which `skin_points` (q, 2) with `point_areas`
+    (q,) represent."""
+    is_on_skin = point_areas > 0
+    pixel_centres, pixel_sides = raster(
+        unbounded_pressure.pixel * len(unbounded_pressure.values) / 2, len(unbounded_pressure.values)
+    )
+    skin_distances, nearest_cells = KDTree(skin_points[is_on_skin]).query(pixel_centres[unbounded_pressure.values > 0])
+    pixel_forces = unbounded_pressure.values[unbounded_pressure.values > 0] * pixel_sides.prod()
+    load_fraction = (
+        pixel_forces[skin_distances < np.sqrt(point_areas[is_on_skin][nearest_cells])].sum() / unbounded_pressure.load
+    )
     if load_fraction < _MIN_LOAD_FRACTION:
         raise ValueError(
-            f"position: of {pressure.load:g} N on a half-space, {100 * load_fraction:.0f} % of its pressure would lie "
-            f"on the skin, less than {100 * _MIN_LOAD_FRACTION:.0f} %; press farther from the edge, or take a "
-            "Foundation."
+            f"position: of {unbounded_pressure.load:g} N on a half-space, {100 * load_fraction:.0f} % of its pressure "
+            f"would lie on the skin, less than {100 * _MIN_LOAD_FRACTION:.0f} %; press farther from the edge, or take "
+            "a Foundation."
         )
 
 
@@ -155,11 +163,13 @@ def displacement_function(num_pixels: int, pixel, plane_modulus: float):
         for sign_of_x in (1, -1)
         for sign_of_y in (1, -1)
     ) / (np.pi * plane_modulus)
-    spectrum = np.fft.rfft2(np.fft.ifftshift(influence_function))
+    influence_spectrum = np.fft.rfft2(np.fft.ifftshift(influence_function))
 
     def displacements(pressure):
         pressure_spectrum = np.fft.rfft2(pressure, s=(2 * num_pixels, 2 * num_pixels))
-        return np.fft.irfft2(pressure_spectrum * spectrum, s=(2 * num_pixels, 2 * num_pixels))[:num_pixels, :num_pixels]
+        return np.fft.irfft2(pressure_spectrum * influence_spectrum, s=(2 * num_pixels, 2 * num_pixels))[
+            :num_pixels, :num_pixels
+        ]
 
     return displacements
 
@@ -173,35 +183,41 @@ def rigid_contact(gap: np.ndarray, displacements, total_pressure: float) -> tupl
     """
     is_below_indenter = np.isfinite(gap)
     gap = np.where(is_below_indenter, gap, 0.0)
-    pressure = is_below_indenter * (total_pressure / is_below_indenter.sum())
-    direction, previous_square, has_previous_direction = np.zeros_like(gap), 1.0, False
-    for _ in range(_MAX_STEPS):
-        is_touching = pressure > 0
-        residual = displacements(pressure) + gap
-        residual -= residual[is_touching].mean()
-        squared_residual = np.sum(residual[is_touching] ** 2)
-        direction = np.where(
+    contact_pressure = is_below_indenter * (total_pressure / is_below_indenter.sum())
+    search_direction, previous_squared_residual, has_previous_direction = np.zeros_like(gap), 1.0, False
+    for _ in range(_MAX_CONTACT_STEPS):
+        is_touching = contact_pressure > 0
+        gap_residual = displacements(contact_pressure) + gap
+        gap_residual -= gap_residual[is_touching].mean()
+        squared_residual = np.sum(gap_residual[is_touching] ** 2)
+        search_direction = np.where(
             is_touching,
-            residual + (squared_residual / previous_square if has_previous_direction else 0.0) * direction,
+            gap_residual
+            + (squared_residual / previous_squared_residual if has_previous_direction else 0.0) * search_direction,
             0.0,
         )
-        previous_square = squared_residual
-        direction_displacements = displacements(direction)
+        previous_squared_residual = squared_residual
+        direction_displacements = displacements(search_direction)
         direction_displacements -= direction_displacements[is_touching].mean()
-        curvature = np.sum(direction_displacements * direction)
-        if squared_residual == 0 or curvature <= 0:  # converged to rounding errors, or only one pixel is in contact
+        direction_curvature = np.sum(direction_displacements * search_direction)
+        if (
+            squared_residual == 0 or direction_curvature <= 0
+        ):  # converged to rounding errors, or only one pixel is in contact
             break
-        step_length = np.sum(residual[is_touching] * direction[is_touching]) / curvature
-        previous_pressure, pressure = (
-            pressure,
-            np.where(is_touching, np.maximum(pressure - step_length * direction, 0.0), 0.0),
+        step_length = np.sum(gap_residual[is_touching] * search_direction[is_touching]) / direction_curvature
+        previous_pressure, contact_pressure = (
+            contact_pressure,
+            np.where(is_touching, np.maximum(contact_pressure - step_length * search_direction, 0.0), 0.0),
         )
-        is_overlapping = is_below_indenter & (pressure == 0) & (residual < 0)
+        is_overlapping = is_below_indenter & (contact_pressure == 0) & (gap_residual < 0)
         has_previous_direction = not is_overlapping.any()
-        pressure[is_overlapping] -= step_length * residual[is_overlapping]
-        pressure *= total_pressure / pressure.sum()
-        if has_previous_direction and np.abs(pressure - previous_pressure).sum() < _TOLERANCE * total_pressure:
+        contact_pressure[is_overlapping] -= step_length * gap_residual[is_overlapping]
+        contact_pressure *= total_pressure / contact_pressure.sum()
+        if (
+            has_previous_direction
+            and np.abs(contact_pressure - previous_pressure).sum() < _PRESSURE_TOLERANCE * total_pressure
+        ):
             break
     else:
-        raise RuntimeError(f"the contact was not found in {_MAX_STEPS} steps; give the support fewer pixels.")
-    return pressure, float((displacements(pressure) + gap)[pressure > 0].mean())
+        raise RuntimeError(f"the contact was not found in {_MAX_CONTACT_STEPS} steps; give the support fewer pixels.")
+    return contact_pressure, float((displacements(contact_pressure) + gap)[contact_pressure > 0].mean())

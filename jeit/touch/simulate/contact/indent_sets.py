@@ -17,7 +17,7 @@ from jeit.design.study.contents import Contents
 from jeit.touch.simulate.contact.indents import IndentDraws, depth_maps, relative_changes, resting_skin
 
 # Version of the simulation, which must be increased if a change of the code changes the results.
-_VERSION = 2
+_FINGERPRINT_VERSION = 2
 # Lock that lets only one thread of a worker compute the data shared by all chunks.
 _RESTING_SKIN_LOCK = Lock()
 _UNITS_AND_MEANINGS = {
@@ -47,9 +47,9 @@ class IndentSet:
         thickness."""
         check_kind("skin", skin, Skin, "a Skin, as of Skin.create(named_layout('park-inner'))")
         check_kind("draws", draws, IndentDraws, "IndentDraws([ball_indenter(0.015)], skin.flat_outline, (1e-3, 8e-3))")
-        for name, value in (("number", number), ("chunk", chunk)):
-            if not (isinstance(value, int) and value >= 1):
-                raise ValueError(f"{name} must be a whole number, 1 or more; it is {value!r}.")
+        for argument_name, argument_value in (("number", number), ("chunk", chunk)):
+            if not (isinstance(argument_value, int) and argument_value >= 1):
+                raise ValueError(f"{argument_name} must be a whole number, 1 or more; it is {argument_value!r}.")
         if not (isinstance(seed, int) and 0 <= seed < 2**63):
             raise ValueError(f"seed must be a whole number, 0 or more; it is {describe(seed)}.")
         if draws.depth[1] >= float(skin.thickness):
@@ -65,51 +65,64 @@ class IndentSet:
     @property
     def chunks(self) -> list[range]:
         """Numbers of the touches in each chunk."""
-        return [range(self.number)[start : start + self.chunk] for start in range(0, self.number, self.chunk)]
+        return [
+            range(self.number)[first_touch : first_touch + self.chunk]
+            for first_touch in range(0, self.number, self.chunk)
+        ]
 
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 hash of everything that determines the simulated data: skin, draws, seed, sizes, version."""
         model = self.skin.model
-        arrays = model.mesh, model.electrodes, model.protocol, self.skin.conductivity, self.skin.thickness, self.draws
-        settings = _VERSION, self.number, self.seed, self.chunk, self.shape
-        return _digest(arrays, str(settings))
+        hashed_arrays = (
+            model.mesh,
+            model.electrodes,
+            model.protocol,
+            self.skin.conductivity,
+            self.skin.thickness,
+            self.draws,
+        )
+        hashed_settings = _FINGERPRINT_VERSION, self.number, self.seed, self.chunk, self.shape
+        return _hash_arrays(hashed_arrays, str(hashed_settings))
 
     def solve(self, chunk: int) -> dict[str, np.ndarray]:
         """Simulate a chunk of k touches; return relative changes of voltages (k, M) and depth maps (k, rows, columns),
         by the names of their arrays in the store."""
-        key = jax.random.fold_in(jax.random.key(self.seed), chunk)
-        touches = self.draws.draw(key, len(self.chunks[chunk]))
-        depths = depth_maps(touches, self.places) / float(self.skin.thickness)
+        chunk_key = jax.random.fold_in(jax.random.key(self.seed), chunk)
+        touches = self.draws.draw(chunk_key, len(self.chunks[chunk]))
+        relative_depths = depth_maps(touches, self.places) / float(self.skin.thickness)
         with _RESTING_SKIN_LOCK:
-            resting = _shared_resting_skin(_SkinAndDepth(self.skin, self.draws.depth[1]))
-        return {"change": relative_changes(self.skin, touches, resting), "depth": depths.astype(np.float32)}
+            resting_data = _shared_resting_skin(_SkinAndDepth(self.skin, self.draws.depth[1]))
+        return {
+            "change": relative_changes(self.skin, touches, resting_data),
+            "depth": relative_depths.astype(np.float32),
+        }
 
     def contents(self) -> Contents:
         """Describe the arrays in the Zarr store of the set."""
 
         def create_arrays(zarr_group: Any) -> None:
-            channels = self.skin.model.protocol.num_measurements
+            num_channels = self.skin.model.protocol.num_measurements
             array_types = {
-                "change": ((channels,), ("channel",), "float64"),
+                "change": ((num_channels,), ("channel",), "float64"),
                 "depth": (self.shape, ("row", "column"), "float32"),
             }
-            for name, (shape, dimensions, dtype) in array_types.items():
-                unit, meaning = _UNITS_AND_MEANINGS[name]
+            for array_name, (touch_shape, dimension_names, data_type) in array_types.items():
+                array_unit, array_meaning = _UNITS_AND_MEANINGS[array_name]
                 zarr_group.create_array(
-                    name,
-                    shape=(self.number, *shape),
-                    chunks=(min(self.chunk, self.number), *shape),
-                    dtype=dtype,
+                    array_name,
+                    shape=(self.number, *touch_shape),
+                    chunks=(min(self.chunk, self.number), *touch_shape),
+                    dtype=data_type,
                     fill_value=np.nan,
-                    dimension_names=("touch", *dimensions),
-                    attributes={"units": unit, "long_name": meaning},
+                    dimension_names=("touch", *dimension_names),
+                    attributes={"units": array_unit, "long_name": array_meaning},
                 )
 
-        names = [*_UNITS_AND_MEANINGS]
-        attributes = {"seed": self.seed}
+        array_names = [*_UNITS_AND_MEANINGS]
+        set_attributes = {"seed": self.seed}
         return Contents(
-            "indent set", "simulate_presses", self.fingerprint, self.chunks, names, attributes, create_arrays
+            "indent set", "simulate_presses", self.fingerprint, self.chunks, array_names, set_attributes, create_arrays
         )
 
 
@@ -119,10 +132,12 @@ class _SkinAndDepth:
     def __init__(self, skin: Skin, depth: float):
         self.skin, self.depth = skin, depth
         model = skin.model
-        self._digest_text = _digest((model.mesh, model.electrodes, model.protocol, skin.model_conductivity), str(depth))
+        self._digest_text = _hash_arrays(
+            (model.mesh, model.electrodes, model.protocol, skin.model_conductivity), str(depth)
+        )
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _SkinAndDepth) and other._digest_text == self._digest_text
+    def __eq__(self, other_key: object) -> bool:
+        return isinstance(other_key, _SkinAndDepth) and other_key._digest_text == self._digest_text
 
     def __hash__(self) -> int:
         return hash(self._digest_text)
@@ -135,13 +150,13 @@ def _shared_resting_skin(skin_and_depth: _SkinAndDepth) -> RestingSkin | None:
     return resting_skin(skin_and_depth.skin, skin_and_depth.depth)
 
 
-def _digest(arrays: Any, text: str) -> str:
+def _hash_arrays(array_tree: Any, settings_text: str) -> str:
     """Compute the SHA-256 hash of a tree of arrays and a text."""
-    leaves, structure = jax.tree.flatten(arrays)
-    sha256 = hashlib.sha256(f"{text} {structure}".encode())
-    for leaf in leaves:
-        sha256.update(np.asarray(leaf).tobytes())
-    return sha256.hexdigest()
+    tree_leaves, tree_structure = jax.tree.flatten(array_tree)
+    hash_state = hashlib.sha256(f"{settings_text} {tree_structure}".encode())
+    for tree_leaf in tree_leaves:
+        hash_state.update(np.asarray(tree_leaf).tobytes())
+    return hash_state.hexdigest()
 
 
 def image_places(skin: Skin, columns: int, rows: int) -> np.ndarray:

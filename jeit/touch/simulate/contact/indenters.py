@@ -89,8 +89,8 @@ class RingIndenter(AbstractIndenter):
 
     def gap(self, points):
         """Return zero at points beneath the wall of the tube, infinity elsewhere."""
-        distances = _distance_from_origin(points)
-        return _flat_gap((distances <= self.outer_diameter / 2) & (distances >= self.inner_diameter / 2))
+        origin_distances = _distance_from_origin(points)
+        return _flat_gap((origin_distances <= self.outer_diameter / 2) & (origin_distances >= self.inner_diameter / 2))
 
     @property
     def reach(self) -> float:
@@ -189,10 +189,10 @@ class RevolvedIndenter(AbstractIndenter):
     def gap(self, points):
         """Return the depth of the profile in its middle minus its depth at `points`; infinity beyond the reach of the
         indenter."""
-        distances = _distance_from_origin(points)
+        origin_distances = _distance_from_origin(points)
         max_depth = float(self.indentation.depth_at(host.zeros(())))
-        gaps = max_depth - np.asarray(self.indentation.depth_at(distances))
-        return np.where(distances < self.reach, gaps, np.inf)
+        profile_gaps = max_depth - np.asarray(self.indentation.depth_at(origin_distances))
+        return np.where(origin_distances < self.reach, profile_gaps, np.inf)
 
     @property
     def reach(self) -> float:
@@ -255,8 +255,8 @@ class DepthMapIndenter(AbstractIndenter):
         centre_pixel = (np.array(self.height.shape) - 1) / 2
         pixel_coordinates = np.moveaxis(np.asarray(points)[..., ::-1] / self.pixel + centre_pixel, -1, 0)
         flat_heights = map_coordinates(self.height, pixel_coordinates.reshape(2, -1), order=1, cval=np.nan)
-        heights = flat_heights.reshape(pixel_coordinates.shape[1:])
-        return np.where(np.isnan(heights), np.inf, np.nanmax(self.height) - heights)
+        surface_heights = flat_heights.reshape(pixel_coordinates.shape[1:])
+        return np.where(np.isnan(surface_heights), np.inf, np.nanmax(self.height) - surface_heights)
 
     @property
     def reach(self) -> float:
@@ -269,10 +269,10 @@ def check_indenter(name: str, value) -> None:
     check_kind(name, value, AbstractIndenter, "an indenter, such as DiscIndenter(0.02) or ball_indenter(0.015)")
 
 
-def _check_size(name: str, value, maximum: float = np.inf, limit_text: str = "") -> None:
-    """Check that a length is positive metres, not above `maximum`, and warn if it looks like millimetres."""
-    check_metres(name, value, maximum, limit_text)
-    check_length(name, value)
+def _check_size(argument_name: str, argument_value, max_length: float = np.inf, limit_text: str = "") -> None:
+    """Check that a length is positive metres, not above `max_length`, and warn if it looks like millimetres."""
+    check_metres(argument_name, argument_value, max_length, limit_text)
+    check_length(argument_name, argument_value)
 
 
 def _distance_from_origin(points):

@@ -70,13 +70,13 @@ class PressDraws(Module):
         indenters = tuple(indenters)
         if not indenters:
             raise ValueError("indenters: give one at least, such as [ball_indenter(0.015)].")
-        for number, indenter in enumerate(indenters):
-            check_indenter(f"indenters[{number}]", indenter)
+        for indenter_index, indenter in enumerate(indenters):
+            check_indenter(f"indenters[{indenter_index}]", indenter)
         check_kind("outline", outline, Domain, "an outline, such as Disk(0.05)")
-        requirement = "the least and the greatest, positive, in newtons, such as (0.3, 10.0)"
-        load_range = real_array("load", load, requirement)
+        load_requirement = "the least and the greatest, positive, in newtons, such as (0.3, 10.0)"
+        load_range = real_array("load", load, load_requirement)
         if load_range.shape != (2,) or not 0 < load_range[0] <= load_range[1] < np.inf:
-            raise ValueError(f"load must be {requirement}; it is {load!r}.")
+            raise ValueError(f"load must be {load_requirement}; it is {load!r}.")
         if not (isinstance(at_once, int) and at_once >= 1):
             raise ValueError(f"at_once must be a whole number, 1 or more; it is {at_once!r}.")
         if not (is_number(margin) and margin >= 0):
@@ -91,24 +91,27 @@ class PressDraws(Module):
         check_key(key)
         if not (isinstance(number, (int, np.integer)) and not isinstance(number, bool) and number >= 0):
             raise ValueError(f"number must be a whole number of touches, 0 or more; it is {describe(number)}.")
-        generator = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-        counts = generator.integers(1, self.at_once, number, endpoint=True)
-        num_presses = counts.sum()
-        indenter_indices = generator.integers(len(self.indenters), size=num_presses)
-        loads = np.exp(generator.uniform(np.log(self.load[0]), np.log(self.load[1]), num_presses))
-        angles = generator.uniform(-np.pi, np.pi, num_presses)
+        random_generator = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        press_counts = random_generator.integers(1, self.at_once, number, endpoint=True)
+        num_presses = press_counts.sum()
+        indenter_indices = random_generator.integers(len(self.indenters), size=num_presses)
+        press_loads = np.exp(random_generator.uniform(np.log(self.load[0]), np.log(self.load[1]), num_presses))
+        press_angles = random_generator.uniform(-np.pi, np.pi, num_presses)
         places = np.zeros((0, 2))
         while len(places) < num_presses:
-            candidate_places = self._random_places(generator, _NUM_CANDIDATES_PER_PLACE * int(num_presses))
+            candidate_places = self._random_places(random_generator, _NUM_CANDIDATES_PER_PLACE * int(num_presses))
             places = np.concatenate([places, candidate_places[self._is_inside(candidate_places)]])
         presses = [
-            Press(self.indenters[indenter_index], float(load), position, float(angle))
-            for indenter_index, load, position, angle in zip(
-                indenter_indices, loads, places[:num_presses], angles, strict=True
+            Press(self.indenters[indenter_index], float(press_load), press_position, float(press_angle))
+            for indenter_index, press_load, press_position, press_angle in zip(
+                indenter_indices, press_loads, places[:num_presses], press_angles, strict=True
             )
         ]
-        end_indices = np.cumsum(counts)
-        return [tuple(presses[end - count : end]) for end, count in zip(end_indices, counts, strict=True)]
+        end_indices = np.cumsum(press_counts)
+        return [
+            tuple(presses[end_index - press_count : end_index])
+            for end_index, press_count in zip(end_indices, press_counts, strict=True)
+        ]
 
     def innermost(self) -> np.ndarray:
         """Return the place (x, y), metres, approximately farthest from the edge of the skin: the farthest of a thousand
@@ -116,9 +119,9 @@ class PressDraws(Module):
         places = self._random_places(np.random.default_rng(0), 1000)
         return places[np.asarray(self.outline.signed_distance(places)).argmax()]
 
-    def _random_places(self, generator: np.random.Generator, count: int) -> np.ndarray:
+    def _random_places(self, random_generator: np.random.Generator, num_places: int) -> np.ndarray:
         low_x, high_x, low_y, high_y = map(float, self.outline.extent)
-        return generator.uniform((low_x, low_y), (high_x, high_y), (count, 2))
+        return random_generator.uniform((low_x, low_y), (high_x, high_y), (num_places, 2))
 
     def _is_inside(self, places: np.ndarray) -> np.ndarray:
         return np.asarray(self.outline.signed_distance(places)) >= self.margin
@@ -234,11 +237,11 @@ def depth_maps(
     print(depths.shape)  # (1, 64)
     ```
     """
-    depths = np.zeros((len(touches), *places.shape[:-1]))
+    indentation_depths = np.zeros((len(touches), *places.shape[:-1]))
     for touch_index, touch in enumerate(touches):
         for indent in touch:
-            depths[touch_index] = np.maximum(depths[touch_index], indent.depth_at(places))
-    return depths
+            indentation_depths[touch_index] = np.maximum(indentation_depths[touch_index], indent.depth_at(places))
+    return indentation_depths
 
 
 def indented_cells(skin: Skin, touches: Sequence[Sequence[Indent]]) -> TouchedCells:
@@ -255,28 +258,32 @@ def indented_cells(skin: Skin, touches: Sequence[Sequence[Indent]]) -> TouchedCe
         raise ValueError(
             f"depth is {1e3 * max_depth:.3g} mm, and the skin {1e3 * thickness:.3g} mm thick; indent it less."
         )
-    samples = lattice(np.asarray(mesh.points)[np.asarray(mesh.cells)], _LATTICE_FINENESS)
-    sample_depths = samples[..., 2].max() - samples[..., 2] if skin.num_layers else None
+    sample_points = lattice(np.asarray(mesh.points)[np.asarray(mesh.cells)], _LATTICE_FINENESS)
+    sample_depths = sample_points[..., 2].max() - sample_points[..., 2] if skin.num_layers else None
     cell_centres = np.asarray(centroids(mesh))[:, :2]
-    radius = float(np.linalg.norm(samples[..., :2] - cell_centres[:, None], axis=-1).max())
-    tree = KDTree(cell_centres)
-    rows_of_cells, changes = [], []
+    max_cell_radius = float(np.linalg.norm(sample_points[..., :2] - cell_centres[:, None], axis=-1).max())
+    cell_tree = KDTree(cell_centres)
+    rows_of_cells, conductivity_changes = [], []
     for touch in touches:
-        nearby_cells = [tree.query_ball_point(indent.position, indent.indenter.reach + radius) for indent in touch]
-        cells = np.unique(np.concatenate([np.zeros(1, int), *(np.asarray(indices, int) for indices in nearby_cells)]))
-        depths = depth_maps([touch], samples[cells, :, :2])[0]
+        nearby_cells = [
+            cell_tree.query_ball_point(indent.position, indent.indenter.reach + max_cell_radius) for indent in touch
+        ]
+        touch_cells = np.unique(
+            np.concatenate([np.zeros(1, int), *(np.asarray(nearby_indices, int) for nearby_indices in nearby_cells)])
+        )
+        indentation_depths = depth_maps([touch], sample_points[touch_cells, :, :2])[0]
         if sample_depths is None:
-            fractions = np.minimum(depths.mean(axis=1) / thickness, 1 - _MIN_CONDUCTIVITY_RATIO)
+            indented_fractions = np.minimum(indentation_depths.mean(axis=1) / thickness, 1 - _MIN_CONDUCTIVITY_RATIO)
         else:
-            fractions = (depths > sample_depths[cells]).mean(axis=1)
-        is_indented = fractions > 0
-        rows_of_cells.append(cells[is_indented])
-        changes.append(-fractions[is_indented])
-    cells, is_entry = pad_rows(rows_of_cells)
-    padded_changes = np.zeros(cells.shape)
-    padded_changes[is_entry] = np.concatenate(changes)
-    places = np.array([touch[0].position if touch else np.zeros(2) for touch in touches])
-    return TouchedCells(as_array(places), as_array(cells), as_array(padded_changes), mesh.num_cells)
+            indented_fractions = (indentation_depths > sample_depths[touch_cells]).mean(axis=1)
+        is_indented_cell = indented_fractions > 0
+        rows_of_cells.append(touch_cells[is_indented_cell])
+        conductivity_changes.append(-indented_fractions[is_indented_cell])
+    touch_cells, is_row_entry = pad_rows(rows_of_cells)
+    padded_changes = np.zeros(touch_cells.shape)
+    padded_changes[is_row_entry] = np.concatenate(conductivity_changes)
+    touch_places = np.array([touch[0].position if touch else np.zeros(2) for touch in touches])
+    return TouchedCells(as_array(touch_places), as_array(touch_cells), as_array(padded_changes), mesh.num_cells)
 
 
 def relative_changes(
@@ -300,14 +307,16 @@ def relative_changes(
     frames = rest * (1 + changes)
     ```
     """
-    touched = indented_cells(skin, touches)
+    changed_cells = indented_cells(skin, touches)
     if resting is not None:
         rest_voltages = np.asarray(resting.voltages)
-        return relative_voltage_changes(rest_voltages, rest_voltages + resting.changes(touched))
+        return relative_voltage_changes(rest_voltages, rest_voltages + resting.changes(changed_cells))
     # The choice of material does not matter: only exact voltages are used, without gains and noise.
-    pressed = PressedSkin(jax.random.key(0), skin.model, material("hydrogel"), conductivity=skin.model_conductivity)
+    pressed_skin = PressedSkin(
+        jax.random.key(0), skin.model, material("hydrogel"), conductivity=skin.model_conductivity
+    )
     rest_voltages = np.asarray(skin.model.voltages(skin.model_conductivity))
-    return relative_voltage_changes(rest_voltages, pressed.voltages_under(touched))
+    return relative_voltage_changes(rest_voltages, pressed_skin.voltages_under(changed_cells))
 
 
 def resting_skin(skin: Skin, depth: float) -> RestingSkin | None:
@@ -328,5 +337,5 @@ def relative_voltage_changes(
 
     The divisor is at least a thousandth of the maximum reference voltage.
     """
-    magnitudes = np.abs(reference)
-    return (voltages - reference) / np.maximum(magnitudes, _MIN_RELATIVE_DIVISOR * magnitudes.max())
+    reference_magnitudes = np.abs(reference)
+    return (voltages - reference) / np.maximum(reference_magnitudes, _MIN_RELATIVE_DIVISOR * reference_magnitudes.max())

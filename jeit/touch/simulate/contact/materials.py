@@ -89,23 +89,25 @@ class Foundation(AbstractSupport):
         """
         check_load(load)
 
-        def balance_load(window, num_pixels: int) -> tuple[np.ndarray, float]:
-            points, pixel = raster(window, num_pixels)
-            gap = indenter.gap(points)
-            area = np.full(gap.size, pixel.prod())
-            return gap, float(solve_contact_displacement(gap.ravel(), area, load / self.stiffness))
+        def balance_load(half_widths, num_pixels: int) -> tuple[np.ndarray, float]:
+            pixel_centres, pixel_sides = raster(half_widths, num_pixels)
+            pixel_gaps = indenter.gap(pixel_centres)
+            pixel_areas = np.full(pixel_gaps.size, pixel_sides.prod())
+            return pixel_gaps, float(solve_contact_displacement(pixel_gaps.ravel(), pixel_areas, load / self.stiffness))
 
-        def is_pressed(window, num_pixels: int) -> np.ndarray:
-            gap, approach = balance_load(window, num_pixels)
-            return gap < approach
+        def is_pressed(half_widths, num_pixels: int) -> np.ndarray:
+            pixel_gaps, approach = balance_load(half_widths, num_pixels)
+            return pixel_gaps < approach
 
-        window = contact_window(is_pressed, indenter.reach, _NUM_COARSE_PIXELS)
-        gap, approach = balance_load(window, _NUM_FINE_PIXELS)
-        points, pixel = raster(window, _NUM_FINE_PIXELS)
-        check_resolved(gap < approach, pixel)
+        half_widths = contact_window(is_pressed, indenter.reach, _NUM_COARSE_PIXELS)
+        pixel_gaps, approach = balance_load(half_widths, _NUM_FINE_PIXELS)
+        pixel_centres, pixel_sides = raster(half_widths, _NUM_FINE_PIXELS)
+        check_resolved(pixel_gaps < approach, pixel_sides)
         self._check_approach(approach, load)
-        reach = float(np.linalg.norm(points[gap < approach], axis=-1).max() + np.hypot(*pixel))
-        return FoundationPressure(float(load), approach, reach, indenter, self.stiffness)
+        contact_reach = float(
+            np.linalg.norm(pixel_centres[pixel_gaps < approach], axis=-1).max() + np.hypot(*pixel_sides)
+        )
+        return FoundationPressure(float(load), approach, contact_reach, indenter, self.stiffness)
 
     def spread(self, indenter: AbstractIndenter, loads, points, areas, fall=None):
         """Compute pressures (n, q), pascals, at q points under each of n loads, which the points carry.
@@ -113,11 +115,11 @@ class Foundation(AbstractSupport):
         On a curved skin, `fall` is added to the height of the indenter above the skin. Raises `ValueError` for a load
         that presses through the layer.
         """
-        gaps = indenter.gap(points) if fall is None else indenter.gap(points) + fall
-        indentation_depths = solve_contact_displacement(gaps, areas, loads / self.stiffness)
+        point_gaps = indenter.gap(points) if fall is None else indenter.gap(points) + fall
+        indentation_depths = solve_contact_displacement(point_gaps, areas, loads / self.stiffness)
         deepest_press_index = indentation_depths.argmax()
         self._check_approach(indentation_depths[deepest_press_index], loads[deepest_press_index])
-        return self.stiffness * np.maximum(indentation_depths[:, None] - gaps, 0.0)
+        return self.stiffness * np.maximum(indentation_depths[:, None] - point_gaps, 0.0)
 
     def _check_approach(self, approach: float, load: float) -> None:
         if approach >= self.thickness:
@@ -137,16 +139,16 @@ def solve_contact_displacement(
     area over these points. The result is exact for the smallest m for which the next point is above the level.
     """
     sort_order = np.argsort(gap, axis=-1)
-    heights = np.take_along_axis(gap, sort_order, axis=-1)
-    areas = np.where(np.isfinite(heights), np.take_along_axis(area, sort_order, axis=-1), 0.0)
-    weighted_heights = areas * np.where(areas > 0, heights, 0.0)
-    cumulative_heights, cumulative_areas = np.cumsum(weighted_heights, axis=-1), np.cumsum(areas, axis=-1)
-    levels = (np.asarray(volume)[..., None] + cumulative_heights) / np.where(
+    sorted_gaps = np.take_along_axis(gap, sort_order, axis=-1)
+    sorted_areas = np.where(np.isfinite(sorted_gaps), np.take_along_axis(area, sort_order, axis=-1), 0.0)
+    weighted_gaps = sorted_areas * np.where(sorted_areas > 0, sorted_gaps, 0.0)
+    cumulative_gaps, cumulative_areas = np.cumsum(weighted_gaps, axis=-1), np.cumsum(sorted_areas, axis=-1)
+    candidate_levels = (np.asarray(volume)[..., None] + cumulative_gaps) / np.where(
         cumulative_areas > 0, cumulative_areas, np.inf
     )
-    next_heights = np.concatenate([heights[..., 1:], np.full((*heights.shape[:-1], 1), np.inf)], axis=-1)
-    first_level = np.argmax((levels <= next_heights) & (cumulative_areas > 0), axis=-1)
-    return np.take_along_axis(levels, first_level[..., None], axis=-1)[..., 0]
+    next_gaps = np.concatenate([sorted_gaps[..., 1:], np.full((*sorted_gaps.shape[:-1], 1), np.inf)], axis=-1)
+    first_level = np.argmax((candidate_levels <= next_gaps) & (cumulative_areas > 0), axis=-1)
+    return np.take_along_axis(candidate_levels, first_level[..., None], axis=-1)[..., 0]
 
 
 def check_modulus(modulus) -> None:
@@ -202,14 +204,16 @@ class Material(Module):
         """Check the fields. Raises `ValueError` for values out of range."""
         check_metres("thickness", self.thickness)
         check_support("support", self.support)
-        for name in ("conductivity", "half_pressure"):
-            _check_number(name, getattr(self, name), lambda value: value > 0, "positive")
-        _check_number("saturation", self.saturation, lambda value: value > -1, "above −1, where nothing conducts")
-        _check_number("hysteresis", self.hysteresis, lambda value: 0 <= value < 1, "from 0 to below 1")
-        for name in ("conductivity_walk", "contact_walk", "noise", "gain_spread"):
-            _check_number(name, getattr(self, name), lambda value: value >= 0, "zero or more")
-        for name in ("conductivity_trend", "contact_trend"):
-            _check_number(name, getattr(self, name), lambda _: True, "a number")
+        for field_name in ("conductivity", "half_pressure"):
+            _check_number(field_name, getattr(self, field_name), lambda field_value: field_value > 0, "positive")
+        _check_number(
+            "saturation", self.saturation, lambda field_value: field_value > -1, "above −1, where nothing conducts"
+        )
+        _check_number("hysteresis", self.hysteresis, lambda field_value: 0 <= field_value < 1, "from 0 to below 1")
+        for field_name in ("conductivity_walk", "contact_walk", "noise", "gain_spread"):
+            _check_number(field_name, getattr(self, field_name), lambda field_value: field_value >= 0, "zero or more")
+        for field_name in ("conductivity_trend", "contact_trend"):
+            _check_number(field_name, getattr(self, field_name), lambda _: True, "a number")
         if not _are_creep_branches(self.creep):
             raise ValueError(
                 f"creep: give (share, seconds) of every branch, shares of sum below 1, such as ((0.1, 1.0), (0.1, "
@@ -222,22 +226,23 @@ class Material(Module):
         return self.saturation * pressure / (pressure + self.half_pressure)
 
 
-def _check_number(name: str, value, is_valid: Callable[[float], bool], requirement: str) -> None:
-    if not (is_number(value) and is_valid(value)):
-        raise ValueError(f"{name} must be {requirement}; it is {describe(value)}.")
+def _check_number(field_name: str, field_value, is_valid: Callable[[float], bool], value_requirement: str) -> None:
+    if not (is_number(field_value) and is_valid(field_value)):
+        raise ValueError(f"{field_name} must be {value_requirement}; it is {describe(field_value)}.")
 
 
 def _are_creep_branches(creep) -> bool:
     """Whether `creep` consists of pairs (share, seconds) whose shares have a sum below 1."""
     if not isinstance(creep, (tuple, list)) or not all(
-        isinstance(branch, (tuple, list)) and len(branch) == 2 for branch in creep
+        isinstance(creep_branch, (tuple, list)) and len(creep_branch) == 2 for creep_branch in creep
     ):
         return False
     if not all(
-        is_number(fraction) and is_number(seconds) and fraction >= 0 and seconds > 0 for fraction, seconds in creep
+        is_number(branch_fraction) and is_number(time_constant) and branch_fraction >= 0 and time_constant > 0
+        for branch_fraction, time_constant in creep
     ):
         return False
-    return sum(fraction for fraction, _ in creep) < 1
+    return sum(branch_fraction for branch_fraction, _ in creep) < 1
 
 
 # Values from papers are cited; all other values are assumptions, chosen so that materials differ as their authors
@@ -341,16 +346,16 @@ def advance_state(
 ) -> tuple[MaterialState, Float[np.ndarray, " m"]]:
     """Advance a material's `state` by a time step of `seconds`, at the end of which the material bears `pressure` (m,);
     return the new state and the effective pressure (m,), pascals."""
-    output = np.maximum(pressure, np.minimum(state.hysteresis_output, pressure / (1 - material.hysteresis)))
-    creep_fractions, times = _creep_branches(material)
+    hysteresis_output = np.maximum(pressure, np.minimum(state.hysteresis_output, pressure / (1 - material.hysteresis)))
+    creep_fractions, time_constants = _creep_branches(material)
     branch_states = state.branch_states
     if seconds > 0:
-        relative_times = seconds / times
+        relative_times = seconds / time_constants
         decay_factors = np.exp(-relative_times)
         ramp_response = 1 + np.expm1(-relative_times) / relative_times
         branch_states = decay_factors * branch_states + (1 - decay_factors) * state.hysteresis_output
-        branch_states += ramp_response * (output - state.hysteresis_output)
-    return MaterialState(output, branch_states), (1 - creep_fractions.sum()) * output + np.sum(
+        branch_states += ramp_response * (hysteresis_output - state.hysteresis_output)
+    return MaterialState(hysteresis_output, branch_states), (1 - creep_fractions.sum()) * hysteresis_output + np.sum(
         creep_fractions * branch_states, axis=0
     )
 
@@ -358,11 +363,11 @@ def advance_state(
 def creep_pressure(material: Material, pressure: Float[np.ndarray, "..."], seconds: float) -> Float[np.ndarray, "..."]:
     """Compute the effective pressure (…), pascals, under the first `pressure` on a material, applied suddenly and
     constant for `seconds`."""
-    creep_fractions, times = _creep_branches(material)
-    return np.asarray(pressure) * (1 - np.sum(creep_fractions * np.exp(-seconds / times)))
+    creep_fractions, time_constants = _creep_branches(material)
+    return np.asarray(pressure) * (1 - np.sum(creep_fractions * np.exp(-seconds / time_constants)))
 
 
 def _creep_branches(material: Material) -> tuple[np.ndarray, np.ndarray]:
     """Return the shares (k, 1) and time constants (k, 1), seconds, of a material's k branches of creep."""
-    pairs = np.array(material.creep, float).reshape(-1, 2)
-    return pairs[:, :1], pairs[:, 1:]
+    branch_parameters = np.array(material.creep, float).reshape(-1, 2)
+    return branch_parameters[:, :1], branch_parameters[:, 1:]

@@ -86,9 +86,9 @@ def raster(half_widths, num_pixels: int) -> tuple[Float[np.ndarray, "N N 2"], Fl
 
     `half_widths`: half the sides of the rectangle, metres; `num_pixels`: N.
     """
-    pixel = 2 * np.asarray(half_widths, float) / num_pixels
+    pixel_sides = 2 * np.asarray(half_widths, float) / num_pixels
     pixel_indices = np.arange(num_pixels) - (num_pixels - 1) / 2
-    return np.stack(np.meshgrid(pixel[0] * pixel_indices, pixel[1] * pixel_indices), axis=-1), pixel
+    return np.stack(np.meshgrid(pixel_sides[0] * pixel_indices, pixel_sides[1] * pixel_indices), axis=-1), pixel_sides
 
 
 def contact_window(is_pressed, reach: float, num_pixels: int) -> Float[np.ndarray, "2"]:
@@ -101,14 +101,14 @@ def contact_window(is_pressed, reach: float, num_pixels: int) -> Float[np.ndarra
     """
     half_widths = np.full(2, reach)
     while True:
-        points, pixel = raster(half_widths, num_pixels)
-        touched_points = points[is_pressed(half_widths, num_pixels)]
+        pixel_centres, pixel_sides = raster(half_widths, num_pixels)
+        touched_points = pixel_centres[is_pressed(half_widths, num_pixels)]
         if not len(touched_points):
             return half_widths
-        extent = np.abs(touched_points).max(axis=0) + pixel
-        if (extent > half_widths / 2).all():
-            return extent + pixel
-        half_widths = np.minimum(half_widths, extent + pixel)
+        contact_extent = np.abs(touched_points).max(axis=0) + pixel_sides
+        if (contact_extent > half_widths / 2).all():
+            return contact_extent + pixel_sides
+        half_widths = np.minimum(half_widths, contact_extent + pixel_sides)
 
 
 def check_load(load) -> None:
@@ -207,7 +207,10 @@ class MovingPress(Module):
                 "load, position and angle must be (T,), (T, 2) and (T,) for T frames, or one for all; they have shapes "
                 f"{load.shape}, {position.shape} and {angle.shape}."
             ) from None
-        if not all(np.isfinite(values).all() for values in (load, position, angle)) or (load < 0).any():
+        if (
+            not all(np.isfinite(argument_values).all() for argument_values in (load, position, angle))
+            or (load < 0).any()
+        ):
             raise ValueError("load, position and angle must be finite, and loads, in newtons, zero or more.")
         self.indenter, self.load, self.position, self.angle = indenter, load, position, angle
 
@@ -225,12 +228,12 @@ def convert_to_touches(presses) -> list[tuple[Press, ...]]:
     if not presses:
         raise ValueError("presses: give one at least.")
     touches = []
-    for touch_index, touch in enumerate(presses):
-        requirement = "a Press, or a tuple of those that are there at once"
-        check_kind(f"presses[{touch_index}]", touch, (Press, tuple), requirement)
-        touches.append((touch,) if isinstance(touch, Press) else touch)
+    for touch_index, touch_presses in enumerate(presses):
+        press_requirement = "a Press, or a tuple of those that are there at once"
+        check_kind(f"presses[{touch_index}]", touch_presses, (Press, tuple), press_requirement)
+        touches.append((touch_presses,) if isinstance(touch_presses, Press) else touch_presses)
         for press in touches[-1]:
-            check_kind(f"presses[{touch_index}]", press, Press, requirement)
+            check_kind(f"presses[{touch_index}]", press, Press, press_requirement)
     return touches
 
 

@@ -26,7 +26,7 @@ from jeit.touch.simulate.contact.press import Press
 from jeit.touch.simulate.contact.pressed_skin import PressedSkin, check_seconds
 
 # Version of the simulation, which must be increased if a change of the code changes the results.
-_VERSION = 1
+_FINGERPRINT_VERSION = 1
 _UNITS_AND_MEANINGS = {
     "voltages": ("V", "what the channels read"),
     "position": ("m", "where the presses are, NaN where there are fewer"),
@@ -76,9 +76,9 @@ class PressSet:
             PressDraws,
             "PressDraws, such as PressDraws([ball_indenter(0.015)], Disk(0.05), (0.1, 10.0))",
         )
-        for name, value in (("number", number), ("chunk", chunk)):
-            if not (isinstance(value, int) and value >= 1):
-                raise ValueError(f"{name} must be a whole number, 1 or more; it is {value!r}.")
+        for argument_name, argument_value in (("number", number), ("chunk", chunk)):
+            if not (isinstance(argument_value, int) and argument_value >= 1):
+                raise ValueError(f"{argument_name} must be a whole number, 1 or more; it is {argument_value!r}.")
         if not (isinstance(seed, int) and 0 <= seed < 2**63):
             raise ValueError(f"seed must be a whole number, 0 or more; it is {describe(seed)}.")
         check_seconds("held", held)
@@ -91,72 +91,81 @@ class PressSet:
     @property
     def chunks(self) -> list[range]:
         """Numbers of the touches in each chunk."""
-        return [range(self.number)[start : start + self.chunk] for start in range(0, self.number, self.chunk)]
+        return [
+            range(self.number)[first_touch : first_touch + self.chunk]
+            for first_touch in range(0, self.number, self.chunk)
+        ]
 
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 hash of everything that determines the simulated data: skin, draws, seed, times, version."""
-        model, settings = self.skin.model, (_VERSION, self.number, self.seed, self.held, self.elapsed, self.chunk)
-        arrays = model.mesh, model.electrodes, model.protocol, self.skin.material, self.skin.conductivity
-        leaves, structure = jax.tree.flatten((arrays, self.skin.gain, self.draws))
-        sha256 = hashlib.sha256(f"{settings} {structure}".encode())
-        for leaf in leaves:
-            sha256.update(np.asarray(leaf).tobytes())
-        return sha256.hexdigest()
+        model, hashed_settings = (
+            self.skin.model,
+            (_FINGERPRINT_VERSION, self.number, self.seed, self.held, self.elapsed, self.chunk),
+        )
+        hashed_arrays = model.mesh, model.electrodes, model.protocol, self.skin.material, self.skin.conductivity
+        tree_leaves, tree_structure = jax.tree.flatten((hashed_arrays, self.skin.gain, self.draws))
+        hash_state = hashlib.sha256(f"{hashed_settings} {tree_structure}".encode())
+        for tree_leaf in tree_leaves:
+            hash_state.update(np.asarray(tree_leaf).tobytes())
+        return hash_state.hexdigest()
 
     def solve(self, chunk: int) -> dict[str, np.ndarray]:
         """Simulate a chunk of k touches; return arrays (k, …) of voltages and of the parameters of presses, by their
         names in the store. Parameters are NaN where a touch has fewer presses than `draws.at_once`."""
         draw_key, frame_key = jax.random.split(jax.random.fold_in(jax.random.key(self.seed), chunk))
         touches = self.draws.draw(draw_key, len(self.chunks[chunk]))
-        results = {name: np.full((len(touches), *shape), np.nan) for name, (shape, _) in self._shapes().items()}
-        results["voltages"] = self.skin.frames(frame_key, touches, held=self.held, elapsed=self.elapsed)
+        touch_arrays = {
+            array_name: np.full((len(touches), *touch_shape), np.nan)
+            for array_name, (touch_shape, _) in self._array_shapes().items()
+        }
+        touch_arrays["voltages"] = self.skin.frames(frame_key, touches, held=self.held, elapsed=self.elapsed)
         indenter_numbers = {
             id(indenter): indenter_number for indenter_number, indenter in enumerate(self.draws.indenters)
         }
-        for touch_index, touch in enumerate(touches):
-            for press_index, press in enumerate(touch):
-                results["position"][touch_index, press_index], results["force"][touch_index, press_index] = (
+        for touch_index, touch_presses in enumerate(touches):
+            for press_index, press in enumerate(touch_presses):
+                touch_arrays["position"][touch_index, press_index], touch_arrays["force"][touch_index, press_index] = (
                     press.position,
                     press.load,
                 )
-                results["angle"][touch_index, press_index], results["indenter"][touch_index, press_index] = (
+                touch_arrays["angle"][touch_index, press_index], touch_arrays["indenter"][touch_index, press_index] = (
                     press.angle,
                     indenter_numbers[id(press.indenter)],
                 )
-        return results
+        return touch_arrays
 
     def contents(self) -> Contents:
         """Describe the arrays in the Zarr store of the set."""
 
         def create_arrays(zarr_group: Any) -> None:
-            for name, (shape, dimensions) in self._shapes().items():
-                unit, meaning = _UNITS_AND_MEANINGS[name]
+            for array_name, (touch_shape, dimension_names) in self._array_shapes().items():
+                array_unit, array_meaning = _UNITS_AND_MEANINGS[array_name]
                 zarr_group.create_array(
-                    name,
-                    shape=(self.number, *shape),
-                    chunks=(min(self.chunk, self.number), *shape),
+                    array_name,
+                    shape=(self.number, *touch_shape),
+                    chunks=(min(self.chunk, self.number), *touch_shape),
                     dtype="float64",
                     fill_value=np.nan,
-                    dimension_names=("touch", *dimensions),
-                    attributes={"units": unit, "long_name": meaning},
+                    dimension_names=("touch", *dimension_names),
+                    attributes={"units": array_unit, "long_name": array_meaning},
                 )
 
-        attributes = {"seed": self.seed, "held_s": self.held, "elapsed_s": self.elapsed}
-        names = [*self._shapes()]
+        set_attributes = {"seed": self.seed, "held_s": self.held, "elapsed_s": self.elapsed}
+        array_names = [*self._array_shapes()]
         return Contents(
-            "press set", "simulate_presses", self.fingerprint, self.chunks, names, attributes, create_arrays
+            "press set", "simulate_presses", self.fingerprint, self.chunks, array_names, set_attributes, create_arrays
         )
 
-    def _shapes(self) -> dict[str, tuple[tuple[int, ...], tuple[str, ...]]]:
+    def _array_shapes(self) -> dict[str, tuple[tuple[int, ...], tuple[str, ...]]]:
         """Return, by name, the shape of each array for one touch, and the names of its dimensions."""
-        per_press = (self.draws.at_once,), ("press",)
+        press_shape = (self.draws.at_once,), ("press",)
         return {
             "voltages": ((self.skin.model.protocol.num_measurements,), ("channel",)),
             "position": ((self.draws.at_once, 2), ("press", "axis")),
-            "force": per_press,
-            "angle": per_press,
-            "indenter": per_press,
+            "force": press_shape,
+            "angle": press_shape,
+            "indenter": press_shape,
         }
 
 
@@ -192,11 +201,13 @@ def simulate_presses(
     check_kind("presses", presses, (PressSet, IndentSet), "a PressSet(skin, draws, number), or an IndentSet")
     with writing(presses.contents(), path) as store:
         finished_chunks = set(store.intact_chunks())
-        remaining_chunks = [number for number in range(len(presses.chunks)) if number not in finished_chunks]
-        report = ProgressReporter(presses.chunks, finished_chunks, progress)
-        for number, results in _solve_chunks(presses, remaining_chunks, client):
-            store.write(number, results)
-            report.report_finished_chunk(number)
+        remaining_chunks = [
+            chunk_number for chunk_number in range(len(presses.chunks)) if chunk_number not in finished_chunks
+        ]
+        progress_reporter = ProgressReporter(presses.chunks, finished_chunks, progress)
+        for chunk_number, chunk_results in _solve_chunks(presses, remaining_chunks, client):
+            store.write(chunk_number, chunk_results)
+            progress_reporter.report_finished_chunk(chunk_number)
     return open_presses(presses, path)
 
 
@@ -224,8 +235,8 @@ def open_presses(presses: PressSet | IndentSet, path: str | Path):
     require_extra("cluster", "a set of touches")
     store = Store(presses.contents(), path, create=False)
     is_finished = np.zeros(presses.number, bool)
-    for number in store.intact_chunks():
-        is_finished[list(presses.chunks[number])] = True
+    for chunk_number in store.intact_chunks():
+        is_finished[list(presses.chunks[chunk_number])] = True
     return store.open_dataset().assign_coords(finished=("touch", is_finished))
 
 
@@ -235,8 +246,8 @@ def solve_presses(presses: PressSet | IndentSet, chunk: int) -> dict[str, np.nda
 
 
 def _solve_chunks(
-    presses: PressSet | IndentSet, chunks: list[int], client: Any
+    presses: PressSet | IndentSet, chunk_numbers: list[int], cluster_client: Any
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-    if client is None:
-        return ((number, solve_presses(presses, number)) for number in chunks)
-    return solve_on_cluster(client, solve_presses, presses, chunks)
+    if cluster_client is None:
+        return ((chunk_number, solve_presses(presses, chunk_number)) for chunk_number in chunk_numbers)
+    return solve_on_cluster(cluster_client, solve_presses, presses, chunk_numbers)

@@ -45,7 +45,7 @@ def split_keys(key: Array, number: int) -> list[Array]:
     """Split a random key into a list of keys. Iterating over an array of keys would compile a program for each length
     of the array."""
     keys = jax.random.split(key, number)
-    return [keys[index] for index in range(number)]
+    return [keys[key_index] for key_index in range(number)]
 
 
 def random_walk(
@@ -141,7 +141,7 @@ class PressedSkin(Module):
 
     def __getstate__(self) -> dict[str, Any]:
         """The skin without its large inverse, which would be sent to each worker of a cluster."""
-        return {name: value for name, value in self.__dict__.items() if name != "_resting_skin"}
+        return {attribute: content for attribute, content in self.__dict__.items() if attribute != "_resting_skin"}
 
     def rest(self) -> Float[np.ndarray, " M"]:
         """Return the voltages (M,) of the untouched skin with gains, but without drift and noise."""
@@ -179,10 +179,10 @@ class PressedSkin(Module):
         """Compute which cells change their conductivity under n touches, and their relative changes. Arguments and
         errors: see `frames`."""
         touches = convert_to_touches(presses)
-        pressed = pressed_cells(Samples.from_mesh(self.model.mesh, self.face), self.material.support, touches, progress)
-        changes = self.material.change(creep_pressure(self.material, pressed.pressure, held)).mean(axis=-1)
+        contact = pressed_cells(Samples.from_mesh(self.model.mesh, self.face), self.material.support, touches, progress)
+        changes = self.material.change(creep_pressure(self.material, contact.pressure, held)).mean(axis=-1)
         places = np.array([touch[0].position if touch else np.zeros(self._dimension) for touch in touches])
-        return _collect_changes(places, pressed.cells, changes, self.model.mesh.num_cells)
+        return _collect_changes(places, contact.cells, changes, self.model.mesh.num_cells)
 
     def record(
         self,
@@ -219,11 +219,11 @@ class PressedSkin(Module):
         faster than one by one. Raises `ValueError` for elements that are not pairs, and as `record` does.
         """
         check_key(key)
-        requirement = "a list of pairs of motions and seconds, one for each recording"
-        check_kind("recordings", recordings, (list, tuple), requirement)
-        for recording_index, pair in enumerate(recordings):
-            if not (isinstance(pair, tuple) and len(pair) == 2):
-                raise ValueError(f"recordings[{recording_index}]: give {requirement}; it is {describe(pair)}.")
+        expected_kind = "a list of pairs of motions and seconds, one for each recording"
+        check_kind("recordings", recordings, (list, tuple), expected_kind)
+        for recording_index, recording in enumerate(recordings):
+            if not (isinstance(recording, tuple) and len(recording) == 2):
+                raise ValueError(f"recordings[{recording_index}]: give {expected_kind}; it is {describe(recording)}.")
         if not recordings:
             return []
         times = [_check_times(seconds) for _, seconds in recordings]
@@ -231,7 +231,7 @@ class PressedSkin(Module):
             self.touched_in_time(motions, recording_times)
             for (motions, _), recording_times in zip(recordings, times, strict=True)
         ]
-        exact_voltages = self.voltages_under(_concatenate(touched_of_recordings), progress=progress)
+        exact_voltages = self.voltages_under(_join_recordings(touched_of_recordings), progress=progress)
         voltages_of_recordings = np.split(
             exact_voltages, np.cumsum([len(recording_times) for recording_times in times])[:-1]
         )
@@ -254,20 +254,27 @@ class PressedSkin(Module):
         relative changes. The arguments are those of `record`, which raises the same errors."""
         seconds = _check_times(seconds)
         motions = convert_to_motions(motions, len(seconds))
-        presses_of_frames = [[motion.at(frame) for motion in motions] for frame in range(len(seconds))]
+        presses_of_frames = [[motion.at(frame_index) for motion in motions] for frame_index in range(len(seconds))]
         touches = [tuple(press for press in frame_presses if press is not None) for frame_presses in presses_of_frames]
-        pressed = pressed_cells(Samples.from_mesh(self.model.mesh, self.face), self.material.support, touches, progress)
-        is_pressed = [frame_pressure.any(axis=-1) for frame_pressure in pressed.pressure]
-        cells = np.unique(pressed.cells[np.array(is_pressed)]) if motions else np.zeros(1, int)
-        cell_positions = np.searchsorted(cells, pressed.cells)
-        shape = len(cells), pressed.pressure.shape[-1]
-        state, previous_time = unloaded_state(self.material, cells.size * shape[1]), seconds[0]
+        contact = pressed_cells(Samples.from_mesh(self.model.mesh, self.face), self.material.support, touches, progress)
+        is_pressed = [frame_pressure.any(axis=-1) for frame_pressure in contact.pressure]
+        cells = np.unique(contact.cells[np.array(is_pressed)]) if motions else np.zeros(1, int)
+        cell_positions = np.searchsorted(cells, contact.cells)
+        pressure_shape = len(cells), contact.pressure.shape[-1]
+        material_state, previous_time = unloaded_state(self.material, cells.size * pressure_shape[1]), seconds[0]
         changes = np.zeros((len(seconds), len(cells)))
-        for frame, time in enumerate(seconds):
-            pressure = np.zeros(shape)
-            pressure[cell_positions[frame][is_pressed[frame]]] = pressed.pressure[frame][is_pressed[frame]]
-            state, effective = advance_state(self.material, state, pressure.ravel(), time - previous_time)
-            changes[frame], previous_time = self.material.change(effective.reshape(shape)).mean(axis=-1), time
+        for frame_index, frame_time in enumerate(seconds):
+            cell_pressure = np.zeros(pressure_shape)
+            cell_pressure[cell_positions[frame_index][is_pressed[frame_index]]] = contact.pressure[frame_index][
+                is_pressed[frame_index]
+            ]
+            material_state, creep_pressures = advance_state(
+                self.material, material_state, cell_pressure.ravel(), frame_time - previous_time
+            )
+            changes[frame_index], previous_time = (
+                self.material.change(creep_pressures.reshape(pressure_shape)).mean(axis=-1),
+                frame_time,
+            )
         places = np.array([touch[0].position if touch else np.zeros(self._dimension) for touch in touches])
         return _collect_changes(places, np.broadcast_to(cells, changes.shape), changes, self.model.mesh.num_cells)
 
@@ -282,18 +289,18 @@ class PressedSkin(Module):
         num_finished = 0
         voltages = np.tile(self._rest_voltages, (len(touched.places), 1))
         places, cells, changes = (np.asarray(array) for array in (touched.places, touched.cells, touched.change))
-        for group in _groups_of_similar_cost(self.model.mesh, cells, changes):
-            for chunk in np.split(group, range(_TOUCHES_AT_ONCE, len(group), _TOUCHES_AT_ONCE)):
-                padded_chunk = chunk[np.minimum(np.arange(_round_up(len(chunk))), len(chunk) - 1)]
-                used_columns = slice(0, _round_up(int(np.count_nonzero(changes[chunk], axis=1).max())))
-                arrays = (
+        for touch_group in _groups_of_similar_cost(self.model.mesh, cells, changes):
+            for touch_chunk in np.split(touch_group, range(_TOUCHES_AT_ONCE, len(touch_group), _TOUCHES_AT_ONCE)):
+                padded_chunk = touch_chunk[np.minimum(np.arange(_round_up(len(touch_chunk))), len(touch_chunk) - 1)]
+                used_columns = slice(0, _round_up(int(np.count_nonzero(changes[touch_chunk], axis=1).max())))
+                chunk_arrays = (
                     as_array(places[padded_chunk]),
                     as_array(cells[padded_chunk, used_columns]),
                     as_array(changes[padded_chunk, used_columns]),
                 )
-                rows = TouchedCells(*arrays, num_cells=touched.num_cells)
-                voltages[chunk] += self._changes(rows)[: len(chunk)]
-                num_finished += len(chunk)
+                chunk_touches = TouchedCells(*chunk_arrays, num_cells=touched.num_cells)
+                voltages[touch_chunk] += self._exact_changes(chunk_touches)[: len(touch_chunk)]
+                num_finished += len(touch_chunk)
                 if progress is not None:
                     progress(f"voltages: {num_finished} of {len(voltages)}")
         return voltages
@@ -321,10 +328,10 @@ class PressedSkin(Module):
             exact = (exact + (contact_drift + conductivity_drift) @ self._contact_derivative) * np.exp(
                 -conductivity_drift
             )
-        deviation = material.noise * float(np.sqrt(np.mean(self._rest_voltages**2)))
-        return self.gain * (exact + white_noise(noise_key, deviation, exact.shape))
+        noise_deviation = material.noise * float(np.sqrt(np.mean(self._rest_voltages**2)))
+        return self.gain * (exact + white_noise(noise_key, noise_deviation, exact.shape))
 
-    def _changes(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
+    def _exact_changes(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
         """Exact changes (n, M), volts, of the voltages due to n touches of similar cost."""
         if self._resting_skin is None:
             return np.asarray(touch_changes(self.model, self.conductivity, touched))
@@ -355,52 +362,56 @@ class PressedSkin(Module):
         if electrodes.is_point:
             return np.zeros((electrodes.num_electrodes, protocol.num_measurements))
         fields, impedance = (np.asarray(array) for array in self.model.fields(self.conductivity))
-        derivative = ContactSensitivity(self.model.mesh, electrodes)(fields, impedance, electrodes.contact_impedance)
-        return np.stack([select_channels(*on_host((protocol, matrix))) for matrix in derivative])
+        derivatives = ContactSensitivity(self.model.mesh, electrodes)(fields, impedance, electrodes.contact_impedance)
+        return np.stack([select_channels(*on_host((protocol, derivative))) for derivative in derivatives])
 
 
 def _collect_changes(places, cells, changes, num_cells: int) -> TouchedCells:
     """Collect the changes of cells that are not negligible as `TouchedCells`, whose rows are padded with zeros."""
     is_significant = np.abs(changes) > _MIN_RELATIVE_CHANGE * np.abs(changes).max(axis=1, keepdims=True)
-    rows, is_not_padding = pad_rows([row[is_kept] for row, is_kept in zip(cells, is_significant, strict=True)])
-    num_padding = _round_up(rows.shape[1]) - rows.shape[1]
-    significant_changes = np.zeros(rows.shape)
+    padded_cells, is_not_padding = pad_rows(
+        [row_cells[is_kept] for row_cells, is_kept in zip(cells, is_significant, strict=True)]
+    )
+    num_padding = _round_up(padded_cells.shape[1]) - padded_cells.shape[1]
+    significant_changes = np.zeros(padded_cells.shape)
     significant_changes[is_not_padding] = changes[is_significant]
-    rows, significant_changes = (np.pad(array, ((0, 0), (0, num_padding))) for array in (rows, significant_changes))
-    return TouchedCells(as_array(places), as_array(rows), as_array(significant_changes), num_cells)
+    padded_cells, significant_changes = (
+        np.pad(array, ((0, 0), (0, num_padding))) for array in (padded_cells, significant_changes)
+    )
+    return TouchedCells(as_array(places), as_array(padded_cells), as_array(significant_changes), num_cells)
 
 
-def _concatenate(touched_of_recordings: Sequence[TouchedCells]) -> TouchedCells:
+def _join_recordings(touched_of_recordings: Sequence[TouchedCells]) -> TouchedCells:
     """Concatenate the touched cells of several recordings, padded with zeros at the end of each row."""
     max_num_cells = max(touched.cells.shape[1] for touched in touched_of_recordings)
 
-    def concatenate(name: str) -> Array:
-        arrays = [np.asarray(getattr(touched, name)) for touched in touched_of_recordings]
+    def join_field(field_name: str) -> Array:
+        arrays = [np.asarray(getattr(touched, field_name)) for touched in touched_of_recordings]
         return as_array(
             np.concatenate([np.pad(touched, ((0, 0), (0, max_num_cells - touched.shape[1]))) for touched in arrays])
         )
 
     places = as_array(np.concatenate([np.asarray(touched.places) for touched in touched_of_recordings]))
-    return TouchedCells(places, concatenate("cells"), concatenate("change"), touched_of_recordings[0].num_cells)
+    return TouchedCells(places, join_field("cells"), join_field("change"), touched_of_recordings[0].num_cells)
 
 
 def _groups_of_similar_cost(
-    mesh: Mesh, cells: Int[np.ndarray, "n c"], change: Float[np.ndarray, "n c"]
+    mesh: Mesh, cells: Int[np.ndarray, "n c"], relative_changes: Float[np.ndarray, "n c"]
 ) -> list[np.ndarray]:
     """Group touches whose voltages cost similar computing time; return the numbers of the touches in each group.
 
     Groups differ in the number of touched cells, and in whether the cells are close together or form separate contacts.
     Touches without changes are left out.
     """
-    is_changed = change != 0
+    is_changed = relative_changes != 0
     num_changed = is_changed.sum(axis=1)
     cell_centres = np.asarray(centroids(mesh))[:, : 3 if is_curved(mesh) else 2][cells]
     lower_corners, upper_corners = (
-        reduce_times(np.where(is_changed[..., None], cell_centres, padding), axis=1)
-        for reduce_times, padding in ((np.min, 1), (np.max, -1))
+        extremum(np.where(is_changed[..., None], cell_centres, padding_coordinate), axis=1)
+        for extremum, padding_coordinate in ((np.min, 1), (np.max, -1))
     )
-    areas = np.sum(np.where(is_changed, np.asarray(measures(mesh))[cells], 0.0), axis=1)
-    is_far_apart = np.linalg.norm(upper_corners - lower_corners, axis=1) > _MIN_SEPARATION * np.sqrt(areas)
+    changed_areas = np.sum(np.where(is_changed, np.asarray(measures(mesh))[cells], 0.0), axis=1)
+    is_far_apart = np.linalg.norm(upper_corners - lower_corners, axis=1) > _MIN_SEPARATION * np.sqrt(changed_areas)
     group_numbers = np.where(
         num_changed > 0, 1 + 2 * np.searchsorted(_GROUP_CELL_LIMITS, num_changed) + is_far_apart, 0
     )
@@ -409,9 +420,10 @@ def _groups_of_similar_cost(
     ]
 
 
-def _round_up(count: int) -> int:
-    """Round `count` up to a power of two, 16 or more: JAX compiles a program for every number of touches and cells."""
-    return 2 ** max(4, (count - 1).bit_length())
+def _round_up(num_items: int) -> int:
+    """Round `num_items` up to a power of two, 16 or more: JAX compiles a program for every number of touches and
+    cells."""
+    return 2 ** max(4, (num_items - 1).bit_length())
 
 
 def check_seconds(name: str, value) -> None:

@@ -61,30 +61,39 @@ class Samples(NamedTuple):
         if is_curved(mesh):
             return cls._from_curved_mesh(mesh, face)
         check_flat(mesh, "these presses")
-        corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
-        thickness = np.ptp(corners[..., 2]) if mesh.dimension == 3 else 1.0
-        corners = corners[..., :2]
-        points = lattice(corners, _LATTICE_FINENESS)
-        areas = np.asarray(measures(mesh)) / thickness / points.shape[1]
-        return cls(points, areas, _largest_cell_radius(corners), corners)
+        cell_corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
+        thickness = np.ptp(cell_corners[..., 2]) if mesh.dimension == 3 else 1.0
+        cell_corners = cell_corners[..., :2]
+        sample_points = lattice(cell_corners, _LATTICE_FINENESS)
+        sample_areas = np.asarray(measures(mesh)) / thickness / sample_points.shape[1]
+        return cls(sample_points, sample_areas, _largest_cell_radius(cell_corners), cell_corners)
 
     @classmethod
     def _from_curved_mesh(cls, mesh: Mesh, face: str) -> "Samples":
-        surface, cells, cell_measures = touched_surface(mesh, face), np.asarray(mesh.cells), np.asarray(measures(mesh))
-        nearest_points = surface.nearest(np.asarray(mesh.points))
-        corners, normals = nearest_points.points[cells], surface.normals_at(nearest_points)[cells]
-        triangle_indices = surface.nearest(corners.mean(axis=1)).triangle
-        points = _curved_lattice(corners, normals, _LATTICE_FINENESS)
+        touched_triangles, mesh_cells, cell_measures = (
+            touched_surface(mesh, face),
+            np.asarray(mesh.cells),
+            np.asarray(measures(mesh)),
+        )
+        nearest_points = touched_triangles.nearest(np.asarray(mesh.points))
+        cell_corners, corner_normals = (
+            nearest_points.points[mesh_cells],
+            touched_triangles.normals_at(nearest_points)[mesh_cells],
+        )
+        triangle_indices = touched_triangles.nearest(cell_corners.mean(axis=1)).triangle
+        sample_points = _curved_lattice(cell_corners, corner_normals, _LATTICE_FINENESS)
         # In a layer, the area of a triangle of the surface is divided among the cells beneath the triangle in
         # proportion to their volumes.
-        area_shares = cell_measures / np.bincount(triangle_indices, cell_measures, len(surface.cells))[triangle_indices]
-        sample_areas = area_shares * surface.areas[triangle_indices] / points.shape[1]
+        area_shares = (
+            cell_measures / np.bincount(triangle_indices, cell_measures, len(touched_triangles.cells))[triangle_indices]
+        )
+        sample_areas = area_shares * touched_triangles.areas[triangle_indices] / sample_points.shape[1]
         return cls(
-            points,
+            sample_points,
             sample_areas,
-            _largest_cell_radius(corners),
-            corners,
-            CurvedGeometry(surface, normals, surface.normals[triangle_indices]),
+            _largest_cell_radius(cell_corners),
+            cell_corners,
+            CurvedGeometry(touched_triangles, corner_normals, touched_triangles.normals[triangle_indices]),
         )
 
     def lattice_points(self, cells: Int[np.ndarray, " c"], fineness: int) -> Float[np.ndarray, "c s d"]:
@@ -107,26 +116,29 @@ class Samples(NamedTuple):
                 )
         if self.curved is None:
             return
-        positions = np.array([press.position for press in presses])
-        distances = self.curved.surface.nearest(positions).away
-        invalid_presses = np.flatnonzero(distances > _MAX_RELATIVE_DISTANCE * np.sqrt(self.curved.surface.areas.max()))
+        press_positions = np.array([press.position for press in presses])
+        surface_distances = self.curved.surface.nearest(press_positions).away
+        invalid_presses = np.flatnonzero(
+            surface_distances > _MAX_RELATIVE_DISTANCE * np.sqrt(self.curved.surface.areas.max())
+        )
         if invalid_presses.size:
             raise ValueError(
                 f"position: {invalid_presses.size} of {len(presses)} presses lie off the skin, the first at "
-                f"{millimetre_text(positions[invalid_presses[0]])} mm, by {1e3 * distances[invalid_presses[0]]:.3g} "
-                "mm; places are in metres, on the touched face."
+                f"{millimetre_text(press_positions[invalid_presses[0]])} mm, by "
+                f"{1e3 * surface_distances[invalid_presses[0]]:.3g} mm; places are in metres, on the touched face."
             )
 
     def facing_cells(self, presses: Sequence[Press], cells: Sequence) -> list[Int[np.ndarray, " c"]]:
         """Select, from the `cells` near each press, the cells whose normals point towards the indenter. Cells on the
         opposite side of a tube are thus left out."""
-        arrays = [np.asarray(indices, int) for indices in cells]
+        cell_arrays = [np.asarray(cell_indices, int) for cell_indices in cells]
         if self.curved is None:
-            return arrays
-        axes = _indenter_axes(self.curved.surface, presses)[1][:, 2]
-        normals = self.curved.cells
+            return cell_arrays
+        press_axes = _indenter_axes(self.curved.surface, presses)[1][:, 2]
+        cell_normals = self.curved.cells
         return [
-            indices[normals[indices] @ axis > _MIN_NORMAL_COSINE] for indices, axis in zip(arrays, axes, strict=True)
+            cell_indices[cell_normals[cell_indices] @ press_axis > _MIN_NORMAL_COSINE]
+            for cell_indices, press_axis in zip(cell_arrays, press_axes, strict=True)
         ]
 
     @property
@@ -144,15 +156,23 @@ class Samples(NamedTuple):
         frames (b, q, 2); the distance (b, q) of the points below the tangent plane at the place pressed, 0 on a flat
         skin; and the ratio (b, c) of each cell's area projected along this normal to its area.
         """
-        cos, sin = (function([press.angle for press in presses])[:, None] for function in (np.cos, np.sin))
+        cos, sin = (
+            trigonometric_function([press.angle for press in presses])[:, None]
+            for trigonometric_function in (np.cos, np.sin)
+        )
         if self.curved is None:
             x, y = np.moveaxis(points - np.array([press.position for press in presses])[:, None], -1, 0)
-            depths, area_ratios = np.zeros(points.shape[:-1]), np.ones(cells.shape)
+            depths_below_plane, area_ratios = np.zeros(points.shape[:-1]), np.ones(cells.shape)
         else:
-            origins, axes = _indenter_axes(self.curved.surface, presses)
-            x, y, heights = np.moveaxis(np.einsum("bqd,bad->bqa", points - origins[:, None], axes), -1, 0)
-            depths, area_ratios = -heights, np.einsum("bcd,bd->bc", self.curved.cells[cells], axes[:, 2])
-        return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1), depths, area_ratios
+            press_origins, press_axes = _indenter_axes(self.curved.surface, presses)
+            x, y, heights_above_plane = np.moveaxis(
+                np.einsum("bqd,bad->bqa", points - press_origins[:, None], press_axes), -1, 0
+            )
+            depths_below_plane, area_ratios = (
+                -heights_above_plane,
+                np.einsum("bcd,bd->bc", self.curved.cells[cells], press_axes[:, 2]),
+            )
+        return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1), depths_below_plane, area_ratios
 
 
 def lattice(corners: Float[np.ndarray, "m k d"], fineness: int) -> Float[np.ndarray, "m s d"]:
@@ -160,21 +180,24 @@ def lattice(corners: Float[np.ndarray, "m k d"], fineness: int) -> Float[np.ndar
     return np.einsum("sk,mkd->msd", _barycentric_weights(corners.shape[1], fineness), corners)
 
 
-def _barycentric_weights(num_corners: int, fineness: int) -> Float[np.ndarray, "s k"]:
+def _barycentric_weights(num_corners: int, lattice_fineness: int) -> Float[np.ndarray, "s k"]:
     lattice_integers = [
         index_tuple
-        for index_tuple in itertools.product(range(fineness + 1), repeat=num_corners)
-        if sum(index_tuple) == fineness
+        for index_tuple in itertools.product(range(lattice_fineness + 1), repeat=num_corners)
+        if sum(index_tuple) == lattice_fineness
     ]
-    return (np.array(lattice_integers) + 1 / num_corners) / (fineness + 1)
+    return (np.array(lattice_integers) + 1 / num_corners) / (lattice_fineness + 1)
 
 
-def _curved_lattice(corners, normals, fineness: int) -> Float[np.ndarray, "m s 3"]:
+def _curved_lattice(cell_corners, corner_normals, lattice_fineness: int) -> Float[np.ndarray, "m s 3"]:
     """Return the points of `lattice`, moved from the flat triangles onto the curved surface that the triangles
     approximate."""
-    weights = _barycentric_weights(corners.shape[1], fineness)
+    barycentric_weights = _barycentric_weights(cell_corners.shape[1], lattice_fineness)
     return project_to_curved_surface(
-        np.einsum("sk,mkd->msd", weights, corners), weights, corners[:, None], normals[:, None]
+        np.einsum("sk,mkd->msd", barycentric_weights, cell_corners),
+        barycentric_weights,
+        cell_corners[:, None],
+        corner_normals[:, None],
     )
 
 
@@ -194,9 +217,12 @@ def _indenter_axes(surface: Triangles, presses: Sequence[Press]):
     """Return the points (b, 3) of a surface where b indenters press, and the axes (b, 3, 3) of the indenters' frames:
     right, up and outwards, as seen from outside with z upwards."""
     nearest_points = surface.nearest(np.array([press.position for press in presses]))
-    corners = surface.cells[nearest_points.triangle]
-    origins = project_to_curved_surface(
-        nearest_points.points, nearest_points.weights, surface.points[corners], surface.node_normals[corners]
+    triangle_corners = surface.cells[nearest_points.triangle]
+    press_origins = project_to_curved_surface(
+        nearest_points.points,
+        nearest_points.weights,
+        surface.points[triangle_corners],
+        surface.node_normals[triangle_corners],
     )
     outward_axes = surface.normals_at(nearest_points)
     upward_directions = np.where(
@@ -204,8 +230,8 @@ def _indenter_axes(surface: Triangles, presses: Sequence[Press]):
     )
     upward_directions -= np.sum(upward_directions * outward_axes, axis=1, keepdims=True) * outward_axes
     upward_directions /= np.linalg.norm(upward_directions, axis=1, keepdims=True)
-    return origins, np.stack([np.cross(upward_directions, outward_axes), upward_directions, outward_axes], axis=1)
+    return press_origins, np.stack([np.cross(upward_directions, outward_axes), upward_directions, outward_axes], axis=1)
 
 
-def _largest_cell_radius(corners) -> float:
-    return float(np.linalg.norm(corners - corners.mean(axis=1, keepdims=True), axis=-1).max())
+def _largest_cell_radius(cell_corners) -> float:
+    return float(np.linalg.norm(cell_corners - cell_corners.mean(axis=1, keepdims=True), axis=-1).max())

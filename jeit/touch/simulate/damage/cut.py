@@ -70,11 +70,13 @@ class Cut(Module):
         """Return points (n, 2) on the cut, metres, at most `step` metres apart. Raises `ValueError` for a step that is
         not positive."""
         check_metres("step", step)
-        segments_points = [
-            np.linspace(start, end, max(2, int(np.ceil(np.linalg.norm(end - start) / step)) + 1))
-            for start, end in itertools.pairwise(self.path)
+        points_of_segments = [
+            np.linspace(
+                segment_start, segment_end, max(2, int(np.ceil(np.linalg.norm(segment_end - segment_start) / step)) + 1)
+            )
+            for segment_start, segment_end in itertools.pairwise(self.path)
         ]
-        return np.concatenate([segment_points[:-1] for segment_points in segments_points] + [self.path[-1:]])
+        return np.concatenate([segment_points[:-1] for segment_points in points_of_segments] + [self.path[-1:]])
 
     def cells(self, mesh: Mesh) -> Int[np.ndarray, " c"]:
         """Return the numbers of the cells of a mesh that the cut crosses; in a layer, only cells whose centroid is
@@ -85,46 +87,55 @@ class Cut(Module):
         """
         check_kind("mesh", mesh, Mesh, "a Mesh, that of the skin")
         check_flat(mesh, "cuts")
-        points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
-        is_crossed = np.zeros(len(cells), bool)
-        for start, end in itertools.pairwise(self.path):
-            for first_corner, second_corner in itertools.combinations(range(cells.shape[1]), 2):
-                is_crossed |= _segments_cross(
-                    start, end, points[cells[:, first_corner], :2], points[cells[:, second_corner], :2]
+        mesh_points, mesh_cells = np.asarray(mesh.points), np.asarray(mesh.cells)
+        is_crossed_cell = np.zeros(len(mesh_cells), bool)
+        for segment_start, segment_end in itertools.pairwise(self.path):
+            for first_corner, second_corner in itertools.combinations(range(mesh_cells.shape[1]), 2):
+                is_crossed_cell |= _segments_cross(
+                    segment_start,
+                    segment_end,
+                    mesh_points[mesh_cells[:, first_corner], :2],
+                    mesh_points[mesh_cells[:, second_corner], :2],
                 )
         if mesh.dimension == 3:
-            top = points[:, 2].max()
-            is_crossed &= np.asarray(centroids(mesh))[:, 2] > top - self.depth * (top - points[:, 2].min())
-        if not is_crossed.any():
+            top_height = mesh_points[:, 2].max()
+            is_crossed_cell &= np.asarray(centroids(mesh))[:, 2] > top_height - self.depth * (
+                top_height - mesh_points[:, 2].min()
+            )
+        if not is_crossed_cell.any():
             raise ValueError("cut: it crosses no cell of the mesh; are both in metres, with the same origin?")
-        return np.flatnonzero(is_crossed)
+        return np.flatnonzero(is_crossed_cell)
 
     def conductivity(
         self, mesh: Mesh, conductivity: ArrayLike, thickness: float | None = None
     ) -> Float[np.ndarray, " m"]:
         """Compute the conductivity (m,) of the cut skin, S/m (2-D: S), from the `conductivity` of the intact skin.
 
-        The conductivities of the cells that the cut crosses are multiplied by `residual`. In a sheet of `thickness` h
-        metres that is partly cut, with a remaining thickness r, the resistance across the cut is that of a sheet longer
-        by (4h/π) ln csc(πr/2h), as for a diaphragm in a channel (Lamb, Hydrodynamics, 6th edition, §306). Raises
-        `ValueError` for an invalid conductivity, and for a partial cut of a sheet without its thickness.
+        The conductivities of the cells that the cut crosses are multiplied by `residual_fraction`. In a sheet of
+        `thickness` h metres that is partly cut, with a remaining thickness r, the resistance across the cut is that of
+        a sheet longer by (4h/π) ln csc(πr/2h), as for a diaphragm in a channel (Lamb, Hydrodynamics, 6th edition,
+        §306). Raises `ValueError` for an invalid conductivity, and for a partial cut of a sheet without its thickness.
         """
-        values = np.asarray(check_conductivity(mesh, conductivity))
-        if values.ndim > 1 or np.iscomplexobj(values) or values.size not in (1, mesh.num_cells):
+        cell_conductivities = np.asarray(check_conductivity(mesh, conductivity))
+        if (
+            cell_conductivities.ndim > 1
+            or np.iscomplexobj(cell_conductivities)
+            or cell_conductivities.size not in (1, mesh.num_cells)
+        ):
             raise ValueError("conductivity must be real, one number or one for each cell.")
-        values = np.broadcast_to(values, mesh.num_cells).astype(float)
-        cells, residual = self.cells(mesh), self.residual
+        cell_conductivities = np.broadcast_to(cell_conductivities, mesh.num_cells).astype(float)
+        cut_cells, residual_fraction = self.cells(mesh), self.residual
         if mesh.dimension == 2 and self.depth < 1:
             if thickness is None:
                 raise ValueError(
                     "thickness: give that of the sheet, metres; the resistance across a partial cut depends on it."
                 )
             check_metres("thickness", thickness)
-            width = float(np.asarray(measures(mesh))[cells].sum()) / self.length
+            crossed_width = float(np.asarray(measures(mesh))[cut_cells].sum()) / self.length
             additional_length = -4 * thickness / np.pi * np.log(np.sin(np.pi * (1 - self.depth) / 2))
-            residual = max(residual, width / (width + additional_length))
-        values[cells] *= residual
-        return values
+            residual_fraction = max(residual_fraction, crossed_width / (crossed_width + additional_length))
+        cell_conductivities[cut_cells] *= residual_fraction
+        return cell_conductivities
 
 
 def draw_cut(
@@ -165,42 +176,51 @@ def draw_cut(
         raise ValueError(f"bent must be a probability, from 0 to 1; it is {describe(bent)}.")
     if not (is_number(margin) and margin >= 0):
         raise ValueError(f"margin must be metres, zero or more; it is {describe(margin)}.")
-    generator = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    random_generator = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     low_x, high_x, low_y, high_y = map(float, outline.extent)
-    cut_length, is_bent = generator.uniform(*length_range), generator.random() < bent
+    cut_length, is_bent = random_generator.uniform(*length_range), random_generator.random() < bent
     for _ in range(_MAX_TRIED_CUTS):
-        start, angle = generator.uniform((low_x, low_y), (high_x, high_y)), generator.uniform(-np.pi, np.pi)
-        length_fraction, bend_angle = (
-            generator.uniform(0.3, 0.7),
-            generator.choice((-1, 1)) * generator.uniform(_MIN_BEND_ANGLE, _MAX_BEND_ANGLE),
+        cut_start, cut_angle = (
+            random_generator.uniform((low_x, low_y), (high_x, high_y)),
+            random_generator.uniform(-np.pi, np.pi),
         )
-        segments = [(length_fraction, angle), (1 - length_fraction, angle + bend_angle)] if is_bent else [(1.0, angle)]
+        length_fraction, bend_angle = (
+            random_generator.uniform(0.3, 0.7),
+            random_generator.choice((-1, 1)) * random_generator.uniform(_MIN_BEND_ANGLE, _MAX_BEND_ANGLE),
+        )
+        cut_segments = (
+            [(length_fraction, cut_angle), (1 - length_fraction, cut_angle + bend_angle)]
+            if is_bent
+            else [(1.0, cut_angle)]
+        )
         segment_vectors = [
             segment_fraction * cut_length * np.array([np.cos(segment_angle), np.sin(segment_angle)])
-            for segment_fraction, segment_angle in segments
+            for segment_fraction, segment_angle in cut_segments
         ]
-        cut = Cut(np.cumsum([start, *segment_vectors], axis=0), depth)
-        if (np.asarray(outline.signed_distance(cut.along(cut_length / 20))) > margin).all():
-            return cut
+        candidate_cut = Cut(np.cumsum([cut_start, *segment_vectors], axis=0), depth)
+        if (np.asarray(outline.signed_distance(candidate_cut.along(cut_length / 20))) > margin).all():
+            return candidate_cut
     raise ValueError(
         f"length: no cut of {1e3 * cut_length:.3g} mm was found that lies within the skin; give a shorter length."
     )
 
 
-def _segments_cross(start, end, other_starts: np.ndarray, other_ends: np.ndarray) -> np.ndarray:
-    """Return whether the segments from `other_starts` to `other_ends` (m, 2) cross the segment from `start` to
-    `end`."""
-    direction, second_direction = end - start, other_ends - other_starts
+def _segments_cross(segment_start, segment_end, other_starts: np.ndarray, other_ends: np.ndarray) -> np.ndarray:
+    """Return whether the segments from `other_starts` to `other_ends` (m, 2) cross the segment from `segment_start` to
+    `segment_end`."""
+    segment_direction, other_directions = segment_end - segment_start, other_ends - other_starts
     first_orientation, second_orientation = (
-        _orientation(direction, other_starts - start),
-        _orientation(direction, other_ends - start),
+        _cross_products(segment_direction, other_starts - segment_start),
+        _cross_products(segment_direction, other_ends - segment_start),
     )
     return (first_orientation * second_orientation <= 0) & (
-        _orientation(second_direction, start - other_starts) * _orientation(second_direction, end - other_starts) <= 0
+        _cross_products(other_directions, segment_start - other_starts)
+        * _cross_products(other_directions, segment_end - other_starts)
+        <= 0
     )
 
 
-def _orientation(first_vectors, second_vectors) -> np.ndarray:
+def _cross_products(first_vectors, second_vectors) -> np.ndarray:
     return first_vectors[..., 0] * second_vectors[..., 1] - first_vectors[..., 1] * second_vectors[..., 0]
 
 
@@ -237,8 +257,10 @@ def mend_cut(
     check_kind("material", material, Material, 'a Material, such as material("hydrogel")')
     if not (is_number(share) and share > 0):
         raise ValueError(f"share must be positive, about 0.9 to 1.1; it is {describe(share)}.")
-    conductivities = np.array(
+    mended_conductivities = np.array(
         np.broadcast_to(np.asarray(check_conductivity(mesh, conductivity)), mesh.num_cells), float
     )
-    conductivities[cut.cells(mesh)] *= share
-    return conductivities, dataclasses.replace(material, hysteresis=min(0.9, _HYSTERESIS_FACTOR * material.hysteresis))
+    mended_conductivities[cut.cells(mesh)] *= share
+    return mended_conductivities, dataclasses.replace(
+        material, hysteresis=min(0.9, _HYSTERESIS_FACTOR * material.hysteresis)
+    )

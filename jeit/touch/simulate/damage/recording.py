@@ -103,52 +103,58 @@ class ElectrodeFault(Module):
             is_driven | is_measured, measured_changes, (dead_voltages - rest_voltages) * np.ones_like(stray_voltages)
         )
 
-    def _with_contact_factor(self, model: ForwardModel, factor: float) -> ForwardModel:
-        impedances = np.array(np.broadcast_to(model.electrodes.contact_impedance, model.protocol.num_electrodes), float)
-        impedances[self.electrode] *= factor
+    def _with_contact_factor(self, model: ForwardModel, contact_factor: float) -> ForwardModel:
+        contact_impedances = np.array(
+            np.broadcast_to(model.electrodes.contact_impedance, model.protocol.num_electrodes), float
+        )
+        contact_impedances[self.electrode] *= contact_factor
         faulty_electrodes = eqx.tree_at(
-            lambda electrodes: electrodes.contact_impedance, model.electrodes, jax.numpy.asarray(impedances)
+            lambda electrodes_to_change: electrodes_to_change.contact_impedance,
+            model.electrodes,
+            jax.numpy.asarray(contact_impedances),
         )
         return model.with_electrodes(faulty_electrodes)
 
     def _dead_electrode_voltages(self, model: ForwardModel, conductivity) -> Float[np.ndarray, " M"]:
         """Compute voltages (M,) of a skin with a dead electrode and a current source of limited voltage."""
         initial_impedance, faulty_impedance = (
-            np.asarray(state.transfer_impedance(conductivity))
-            for state in (model, self._with_contact_factor(model, _DEAD_CONTACT_FACTOR))
+            np.asarray(model_state.transfer_impedance(conductivity))
+            for model_state in (model, self._with_contact_factor(model, _DEAD_CONTACT_FACTOR))
         )
-        drives = np.asarray(model.protocol.drive)
+        drive_patterns = np.asarray(model.protocol.drive)
         voltage_ranges = [
-            np.ptp(np.where(drives != 0, drives @ impedance.T, 0.0), axis=1)
-            for impedance in (initial_impedance, faulty_impedance)
+            np.ptp(np.where(drive_patterns != 0, drive_patterns @ transfer_impedance.T, 0.0), axis=1)
+            for transfer_impedance in (initial_impedance, faulty_impedance)
         ]
         relative_currents = np.minimum(1.0, _MAX_VOLTAGE_RATIO * voltage_ranges[0].max() / voltage_ranges[1])
-        voltages = np.asarray(select_channels(*on_host((model.protocol, faulty_impedance))))
-        return voltages * relative_currents[np.asarray(model.protocol.drive_index)]
+        full_current_voltages = np.asarray(select_channels(*on_host((model.protocol, faulty_impedance))))
+        return full_current_voltages * relative_currents[np.asarray(model.protocol.drive_index)]
 
     def _loose_contact_voltages(self, key: Array, model: ForwardModel, conductivity, seconds: np.ndarray) -> np.ndarray:
         """Compute voltages (T, M) for a fluctuating contact impedance, interpolated between the voltages at a few
         levels of the impedance's logarithm."""
         min_log_factor, max_log_factor = np.log(_LOOSE_CONTACT_FACTORS)
-        levels = np.linspace(min_log_factor, max_log_factor, _NUM_LEVELS)
+        log_factor_levels = np.linspace(min_log_factor, max_log_factor, _NUM_LEVELS)
         voltages_of_levels = [
             np.asarray(self._with_contact_factor(model, float(np.exp(log_factor))).voltages(conductivity))
-            for log_factor in levels
+            for log_factor in log_factor_levels
         ]
         normal_draws = np.asarray(jax.random.normal(key, (len(seconds),)))
-        fluctuation, time_steps = np.empty(len(seconds)), np.diff(seconds, prepend=seconds[:1])
+        fluctuation_values, time_steps = np.empty(len(seconds)), np.diff(seconds, prepend=seconds[:1])
         fluctuation_value = 0.0
-        for frame, (time_step, log_factor) in enumerate(zip(time_steps, normal_draws, strict=True)):
-            decay = np.exp(-time_step / _FLUCTUATION_TIME) if frame else 0.0
-            fluctuation_value = decay * fluctuation_value + np.sqrt(1 - decay**2) * log_factor
-            fluctuation[frame] = fluctuation_value
+        for frame_index, (time_step, log_factor) in enumerate(zip(time_steps, normal_draws, strict=True)):
+            decay_factor = np.exp(-time_step / _FLUCTUATION_TIME) if frame_index else 0.0
+            fluctuation_value = decay_factor * fluctuation_value + np.sqrt(1 - decay_factor**2) * log_factor
+            fluctuation_values[frame_index] = fluctuation_value
         # The normal distribution function, applied to the fluctuation, makes the factor's logarithm uniformly
         # distributed.
-        level_positions = ndtr(fluctuation) * (_NUM_LEVELS - 1)
+        level_positions = ndtr(fluctuation_values) * (_NUM_LEVELS - 1)
         lower_level_indices = np.minimum(level_positions.astype(int), _NUM_LEVELS - 2)
         upper_weights = (level_positions - lower_level_indices)[:, None]
-        table = np.array(voltages_of_levels)
-        return (1 - upper_weights) * table[lower_level_indices] + upper_weights * table[lower_level_indices + 1]
+        voltage_table = np.array(voltages_of_levels)
+        return (1 - upper_weights) * voltage_table[lower_level_indices] + upper_weights * voltage_table[
+            lower_level_indices + 1
+        ]
 
 
 def check_fault(name: str, value) -> None:
@@ -228,15 +234,15 @@ def record_damage(
     end_times = [*(event.time for event in events), np.inf]
     if list(end_times) != sorted(end_times):
         raise ValueError("events must be in order of their times.")
-    stages = [DamageEvent(0.0, skin), *events]
+    damage_stages = [DamageEvent(0.0, skin), *events]
     voltages, current_skin = np.zeros((len(seconds), skin.gain.size)), skin
-    for event_index, (stage, end) in enumerate(zip(stages, end_times, strict=True)):
-        current_skin = current_skin if stage.skin is None else stage.skin
-        is_frame_of_stage = (seconds >= stage.time if event_index else seconds >= 0) & (seconds < end)
+    for event_index, (damage_stage, end_time) in enumerate(zip(damage_stages, end_times, strict=True)):
+        current_skin = current_skin if damage_stage.skin is None else damage_stage.skin
+        is_frame_of_stage = (seconds >= damage_stage.time if event_index else seconds >= 0) & (seconds < end_time)
         if not is_frame_of_stage.any():
             continue
         exact_voltages = exact_record(current_skin, motions, seconds, is_frame_of_stage)
-        for fault_index, fault in enumerate(stage.faults):
+        for fault_index, fault in enumerate(damage_stage.faults):
             stage_fault_key = jax.random.fold_in(jax.random.fold_in(key, event_index), fault_index)
             exact_voltages[is_frame_of_stage] += fault.changes(
                 stage_fault_key, current_skin.model, current_skin.conductivity, seconds[is_frame_of_stage]
@@ -258,11 +264,11 @@ def exact_record(
     voltages = np.tile(np.asarray(skin.model.voltages(skin.conductivity)), (len(seconds), 1))
     if not np.any([np.any(motion.load) for motion in ([motions] if isinstance(motions, MovingPress) else motions)]):
         return voltages
-    touched = skin.touched_in_time(motions, seconds)
-    cells, changes = np.asarray(touched.cells), np.asarray(touched.change)
+    changed_cells = skin.touched_in_time(motions, seconds)
+    touched_numbers, relative_changes = np.asarray(changed_cells.cells), np.asarray(changed_cells.change)
     rest_conductivity = np.array(np.broadcast_to(skin.conductivity, skin.model.mesh.num_cells))
-    for frame in np.flatnonzero(selected_frames & (changes != 0).any(axis=1)):
-        conductivity = rest_conductivity.copy()
-        np.multiply.at(conductivity, cells[frame], 1 + changes[frame])
-        voltages[frame] = np.asarray(skin.model.voltages(conductivity))
+    for frame_index in np.flatnonzero(selected_frames & (relative_changes != 0).any(axis=1)):
+        frame_conductivity = rest_conductivity.copy()
+        np.multiply.at(frame_conductivity, touched_numbers[frame_index], 1 + relative_changes[frame_index])
+        voltages[frame_index] = np.asarray(skin.model.voltages(frame_conductivity))
     return voltages

@@ -56,13 +56,17 @@ class Manner:
     @property
     def medians(self) -> Float[np.ndarray, " 5"]:
         """Medians (5,) of the parameters `TRAITS` among people, in SI units; speed and path may be 0."""
-        return np.array([*(parameters[0] for parameters in self._word_parameters), self.speed, self.path])
+        return np.array([*(word_parameters[0] for word_parameters in self._word_parameters), self.speed, self.path])
 
     @property
     def spread(self) -> Float[np.ndarray, " 5"]:
         """Standard deviations (5,) of the logarithms of the parameters `TRAITS` among people."""
         return np.array(
-            [*(parameters[1] for parameters in self._word_parameters), _PATH_LOG_DEVIATION, _PATH_LOG_DEVIATION]
+            [
+                *(word_parameters[1] for word_parameters in self._word_parameters),
+                _PATH_LOG_DEVIATION,
+                _PATH_LOG_DEVIATION,
+            ]
         )
 
     @property
@@ -127,59 +131,72 @@ def gesture_motion(
     Returns the moving press and the times (T,) of its frames, seconds, at `rate` frames/s. The frames begin 0.1 s
     before the gesture, and end 0.5 s or more after it, since the skin recovers slowly.
     """
-    force, radius, duration, speed, path = traits
+    press_force, contact_radius, touch_duration, sweep_speed, path_length = traits
     gesture_manner = MANNERS[gesture]
-    force = min(force, _MAX_PRESSURE * np.pi * radius**2)
-    num_frames = int(np.ceil((_TIME_BEFORE + duration + _TIME_AFTER) * rate))
+    press_force = min(press_force, _MAX_PRESSURE * np.pi * contact_radius**2)
+    num_frames = int(np.ceil((_TIME_BEFORE + touch_duration + _TIME_AFTER) * rate))
     seconds = np.arange(_FRAME_MULTIPLE * -(-num_frames // _FRAME_MULTIPLE)) / rate
     # Touches begin at a random time between two frames.
-    progress = (seconds - _TIME_BEFORE - rng.uniform(0, 1) / rate) / duration
-    is_touching = (progress > 0) & (progress < 1)
-    progress = np.clip(progress, 0, 1)
-    num_sweeps = max(1, round(speed * duration / path)) if gesture_manner.moves else 1
-    loads = force * np.where(is_touching, _relative_loads(rng, progress, gesture, num_sweeps), 0.0)
-    length = path if gesture_manner.moves else _MAX_ROLLING_PATH_LENGTH * rng.uniform(0, 1)
-    path_centre, angle, length = _random_path(rng, outline, length)
-    path_offsets = (1 - np.abs((num_sweeps * progress) % 2 - 1) - 0.5) * length
-    positions = path_centre + path_offsets[:, None] * np.array([np.cos(angle), np.sin(angle)])
-    indenter: DiscIndenter | JoinedIndenters = DiscIndenter(2 * radius)
+    touch_progress = (seconds - _TIME_BEFORE - rng.uniform(0, 1) / rate) / touch_duration
+    is_touching = (touch_progress > 0) & (touch_progress < 1)
+    touch_progress = np.clip(touch_progress, 0, 1)
+    num_sweeps = max(1, round(sweep_speed * touch_duration / path_length)) if gesture_manner.moves else 1
+    press_loads = press_force * np.where(is_touching, _relative_loads(rng, touch_progress, gesture, num_sweeps), 0.0)
+    sweep_length = path_length if gesture_manner.moves else _MAX_ROLLING_PATH_LENGTH * rng.uniform(0, 1)
+    path_centre, path_angle, sweep_length = _random_path(rng, outline, sweep_length)
+    path_offsets = (1 - np.abs((num_sweeps * touch_progress) % 2 - 1) - 0.5) * sweep_length
+    press_positions = path_centre + path_offsets[:, None] * np.array([np.cos(path_angle), np.sin(path_angle)])
+    indenter: DiscIndenter | JoinedIndenters = DiscIndenter(2 * contact_radius)
     if gesture == "scratch":
-        fingertip_radius = radius / np.sqrt(_NUM_FINGERTIPS)
-        offsets = _FINGERTIP_SPACING * fingertip_radius * (np.arange(_NUM_FINGERTIPS) - (_NUM_FINGERTIPS - 1) / 2)
+        fingertip_radius = contact_radius / np.sqrt(_NUM_FINGERTIPS)
+        fingertip_offsets = (
+            _FINGERTIP_SPACING * fingertip_radius * (np.arange(_NUM_FINGERTIPS) - (_NUM_FINGERTIPS - 1) / 2)
+        )
         indenter = JoinedIndenters(
-            *(PlacedIndenter(DiscIndenter(2 * fingertip_radius), (0.0, offset)) for offset in offsets)
+            *(
+                PlacedIndenter(DiscIndenter(2 * fingertip_radius), (0.0, fingertip_offset))
+                for fingertip_offset in fingertip_offsets
+            )
         )
     # The hand may extend over the edge of the skin, but its path lies on the skin.
-    return MovingPress(indenter, loads, positions, angle), seconds
+    return MovingPress(indenter, press_loads, press_positions, path_angle), seconds
 
 
-def _relative_loads(rng: np.random.Generator, progress: np.ndarray, gesture: str, num_sweeps: int) -> np.ndarray:
-    """Compute loads (T,), as fractions of the touch's force, at times `progress` (T,), fractions of its duration."""
+def _relative_loads(rng: np.random.Generator, touch_progress: np.ndarray, gesture: str, num_sweeps: int) -> np.ndarray:
+    """Compute loads (T,), as fractions of the touch's force, at times `touch_progress` (T,), fractions of its
+    duration."""
     if MANNERS[gesture].duration == "short":
-        return np.sin(np.pi * progress)
-    ramp_factors = np.clip(np.minimum(progress, 1 - progress) / _RAMP_FRACTION, 0, 1)
-    loads = np.sin(np.pi / 2 * ramp_factors) ** 2
-    cycles, phase = rng.uniform(0.5, 4, 3), rng.uniform(0, 2 * np.pi, 3)
-    loads = loads * (1 + _FLUCTUATION_AMPLITUDE * np.sin(2 * np.pi * progress[:, None] * cycles + phase).sum(axis=1))
+        return np.sin(np.pi * touch_progress)
+    ramp_factors = np.clip(np.minimum(touch_progress, 1 - touch_progress) / _RAMP_FRACTION, 0, 1)
+    relative_loads = np.sin(np.pi / 2 * ramp_factors) ** 2
+    fluctuation_cycles, fluctuation_phases = rng.uniform(0.5, 4, 3), rng.uniform(0, 2 * np.pi, 3)
+    relative_loads = relative_loads * (
+        1
+        + _FLUCTUATION_AMPLITUDE
+        * np.sin(2 * np.pi * touch_progress[:, None] * fluctuation_cycles + fluctuation_phases).sum(axis=1)
+    )
     if gesture == "scratch":
-        loads = loads * (
-            1 - _LOAD_REDUCTION_AT_TURNS + _LOAD_REDUCTION_AT_TURNS * np.abs(np.sin(np.pi * num_sweeps * progress))
+        relative_loads = relative_loads * (
+            1
+            - _LOAD_REDUCTION_AT_TURNS
+            + _LOAD_REDUCTION_AT_TURNS * np.abs(np.sin(np.pi * num_sweeps * touch_progress))
         )
-    return loads
+    return relative_loads
 
 
-def _random_path(rng: np.random.Generator, outline: Domain, length: float) -> tuple[np.ndarray, float, float]:
-    """Draw the centre, angle and length of a straight path on the skin, shorter than `length` if no place is found."""
+def _random_path(rng: np.random.Generator, outline: Domain, path_length: float) -> tuple[np.ndarray, float, float]:
+    """Draw the centre, angle and length of a straight path on the skin, shorter than `path_length` if no place is
+    found."""
     low_x, high_x, low_y, high_y = map(float, outline.extent)
     while True:
         for _ in range(_NUM_TRIED_PLACES):
-            centre = rng.uniform((low_x, low_y), (high_x, high_y))
-            angle = rng.uniform(0, 2 * np.pi)
-            half_path_vector = length / 2 * np.array([np.cos(angle), np.sin(angle)])
-            path_points = np.stack([centre - half_path_vector, centre, centre + half_path_vector])
+            path_centre = rng.uniform((low_x, low_y), (high_x, high_y))
+            path_angle = rng.uniform(0, 2 * np.pi)
+            half_path_vector = path_length / 2 * np.array([np.cos(path_angle), np.sin(path_angle)])
+            path_points = np.stack([path_centre - half_path_vector, path_centre, path_centre + half_path_vector])
             if (np.asarray(outline.signed_distance(path_points)) >= _EDGE_MARGIN).all():
-                return centre, float(angle), length
-        length *= _SHORTENING_FACTOR
+                return path_centre, float(path_angle), path_length
+        path_length *= _SHORTENING_FACTOR
 
 
 # Minimum width and height of a skin for a hand, in metres.
@@ -216,11 +233,12 @@ class Person(Module):
         gesture. Raises `ValueError` for an invalid key."""
         check_key(key)
         normal_draws = np.asarray(jax.random.normal(key, (len(GESTURES), len(TRAITS))))
-        manners = MANNERS.values()
-        medians, spreads = (
-            np.stack([getattr(gesture_manner, name) for gesture_manner in manners]) for name in ("medians", "spread")
+        gesture_manners = MANNERS.values()
+        gesture_medians, log_deviations = (
+            np.stack([getattr(gesture_manner, statistic_name) for gesture_manner in gesture_manners])
+            for statistic_name in ("medians", "spread")
         )
-        return cls(medians * np.exp(spreads * normal_draws))
+        return cls(gesture_medians * np.exp(log_deviations * normal_draws))
 
     def touch(
         self, key: Array, gesture: str, outline: Domain, *, rate: float = 60.0

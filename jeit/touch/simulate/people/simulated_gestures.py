@@ -76,13 +76,13 @@ def simulate_gestures(
     if not (isinstance(each, int) and each >= 1):
         raise ValueError(f"each must be a number of touches, 1 or more; it is {describe(each)}.")
     reference_key, untouched_key, touch_key, time_key = jax.random.split(key, 4)
-    reference = skin.record(reference_key, [], np.arange(_NUM_REFERENCE_FRAMES) / rate).mean(axis=0)
-    generator = np.random.default_rng(np.asarray(jax.random.bits(time_key, (4,))).tolist())
+    reference_voltages = skin.record(reference_key, [], np.arange(_NUM_REFERENCE_FRAMES) / rate).mean(axis=0)
+    random_generator = np.random.default_rng(np.asarray(jax.random.bits(time_key, (4,))).tolist())
     untouched_motions = [
-        ([], np.arange(_NUM_UNTOUCHED_FRAMES) / rate + generator.uniform(0, _MAX_DRIFT_TIME))
+        ([], np.arange(_NUM_UNTOUCHED_FRAMES) / rate + random_generator.uniform(0, _MAX_DRIFT_TIME))
         for _ in range(_NUM_UNTOUCHED_RECORDINGS)
     ]
-    untouched = skin.record_each(untouched_key, untouched_motions)
+    untouched_voltages = skin.record_each(untouched_key, untouched_motions)
     person_gesture_pairs = [
         (person, gesture) for person in range(len(people)) for gesture in gestures for _ in range(each)
     ]
@@ -95,21 +95,21 @@ def simulate_gestures(
         for row_key, (person, gesture) in zip(
             row_keys[1:], person_gesture_pairs[first_row : first_row + _RECORDINGS_AT_ONCE], strict=False
         ):
-            motion, times = people[person].touch(row_key, gesture, outline, rate=rate)
-            motions_and_times.append((motion, times + generator.uniform(0, _MAX_DRIFT_TIME)))
-            seconds.append(times)
+            motion, motion_times = people[person].touch(row_key, gesture, outline, rate=rate)
+            motions_and_times.append((motion, motion_times + random_generator.uniform(0, _MAX_DRIFT_TIME)))
+            seconds.append(motion_times)
         recordings = skin.record_each(row_keys[0], motions_and_times)
-        voltages += [recording.astype(np.float32) for recording in recordings]
+        voltages += [recorded_voltages.astype(np.float32) for recorded_voltages in recordings]
         if progress is not None:
             progress(f"gestures: {len(voltages)} of {len(person_gesture_pairs)}")
     return GestureSet(
         gesture=np.array([gesture for _, gesture in person_gesture_pairs]),
         person=np.array([person for person, _ in person_gesture_pairs]),
-        start=np.concatenate([[0], np.cumsum([len(times) for times in seconds])]),
+        start=np.concatenate([[0], np.cumsum([len(motion_times) for motion_times in seconds])]),
         seconds=np.concatenate(seconds),
         voltages=np.concatenate(voltages),
-        reference=reference,
-        untouched=np.concatenate(untouched),
+        reference=reference_voltages,
+        untouched=np.concatenate(untouched_voltages),
     )
 
 
@@ -183,19 +183,27 @@ def simulate_gesture_stream(
     gestures, person_indices = rng.choice(GESTURES, number), rng.integers(len(people), size=number)
     touch_motions, next_frame, first_frames = [], int(_TIME_BEFORE_FIRST * rate), []
     for motion_key, gesture, person_index in zip(split_keys(touch_key, number), gestures, person_indices, strict=True):
-        motion, times = people[person_index].touch(motion_key, str(gesture), outline, rate=rate)
+        motion, motion_times = people[person_index].touch(motion_key, str(gesture), outline, rate=rate)
         touch_motions.append(motion)
         first_frames.append(next_frame)
-        next_frame += len(times) + int(rng.uniform(1, 2) * pause * rate)
+        next_frame += len(motion_times) + int(rng.uniform(1, 2) * pause * rate)
     seconds = np.arange(next_frame) / rate
-    motions, onset, offset = [], [], []
+    motions, onset_times, offset_times = [], [], []
     for motion, first_frame in zip(touch_motions, first_frames, strict=True):
-        loads, positions, angles = np.zeros(next_frame), np.zeros((next_frame, 2)), np.zeros(next_frame)
+        frame_loads, frame_positions, frame_angles = (
+            np.zeros(next_frame),
+            np.zeros((next_frame, 2)),
+            np.zeros(next_frame),
+        )
         touch_frames = slice(first_frame, first_frame + len(motion.load))
-        loads[touch_frames], positions[touch_frames], angles[touch_frames] = motion.load, motion.position, motion.angle
-        motions.append(MovingPress(motion.indenter, loads, positions, angles))
-        pressed_frames = np.flatnonzero(loads)
-        onset.append(seconds[pressed_frames[0]] if pressed_frames.size else seconds[first_frame])
-        offset.append(seconds[pressed_frames[-1]] if pressed_frames.size else seconds[first_frame])
+        frame_loads[touch_frames], frame_positions[touch_frames], frame_angles[touch_frames] = (
+            motion.load,
+            motion.position,
+            motion.angle,
+        )
+        motions.append(MovingPress(motion.indenter, frame_loads, frame_positions, frame_angles))
+        pressed_frames = np.flatnonzero(frame_loads)
+        onset_times.append(seconds[pressed_frames[0]] if pressed_frames.size else seconds[first_frame])
+        offset_times.append(seconds[pressed_frames[-1]] if pressed_frames.size else seconds[first_frame])
     voltages = skin.record(frame_key, motions, seconds)
-    return GestureStream(seconds, voltages, gestures, person_indices, np.array(onset), np.array(offset))
+    return GestureStream(seconds, voltages, gestures, person_indices, np.array(onset_times), np.array(offset_times))
