@@ -120,14 +120,16 @@ class Description:
         default_protocol = self.protocol(path)
         if default_protocol is None or self.protocol_section is None:
             return []
-        num_electrodes, candidates = (
+        num_electrodes, candidate_protocols = (
             None if self.electrodes is None else self.electrodes.num_electrodes,
             [(default_protocol, "")],
         )
-        for table, options in protocol_table_variants(self.protocol_section)[1:]:
+        for table_variant, option_text in protocol_table_variants(self.protocol_section)[1:]:
             with suppress(ValueError):  # no channel is left
-                candidates.append((described_protocol(table, num_electrodes, Path(path), self.origin), options))
-        return candidates
+                candidate_protocols.append(
+                    (described_protocol(table_variant, num_electrodes, Path(path), self.origin), option_text)
+                )
+        return candidate_protocols
 
     def protocol(self, path: str | Path) -> Protocol | None:
         """The protocol of the data file at `path`; None if no protocol is described. The name of the data file may
@@ -149,19 +151,19 @@ class Description:
     def mean_removed(self) -> bool:
         """Whether the data file stores currents, and potentials of all electrodes from which their mean is
         subtracted."""
-        section = self.protocol_section
-        if section is None or section.kind != "measured" or section.measurement_key is not None:
+        protocol_table = self.protocol_section
+        if protocol_table is None or protocol_table.kind != "measured" or protocol_table.measurement_key is not None:
             return False
-        return section.measurement == "mean-removed"
+        return protocol_table.measurement == "mean-removed"
 
     @property
     def reading(self) -> tuple[Reading, int | None]:
         """If current patterns are stored in the data file: the way in which the potentials of all electrodes are read,
         such as "adjacent", and the index of the reference electrode or None."""
-        section = self.protocol_section
-        if section is None or section.kind != "measured":
+        protocol_table = self.protocol_section
+        if protocol_table is None or protocol_table.kind != "measured":
             return "mean-removed", None
-        return section.measurement, section.reference
+        return protocol_table.measurement, protocol_table.reference
 
     def model(self, path: str | Path, *, num_points: int | None = None) -> ForwardModel:
         """A forward model of the described body with the protocol of the data file at `path`. A new mesh has about
@@ -170,13 +172,21 @@ class Description:
         Raises `ValueError` if geometry, electrodes or protocol are not described, if `num_points` is missing, and if
         `num_points` is specified for a mesh.
         """
-        domain, electrodes, protocol = self.domain, self.electrodes, self.protocol(path)
-        if domain is None or electrodes is None or protocol is None:
-            sections = {"geometry": domain, "electrodes": electrodes, "protocol": protocol}
-            missing_sections = ", ".join(f"[{section}]" for section, value in sections.items() if value is None)
+        described_domain, described_electrode_set, file_protocol = self.domain, self.electrodes, self.protocol(path)
+        if described_domain is None or described_electrode_set is None or file_protocol is None:
+            parts_by_section = {
+                "geometry": described_domain,
+                "electrodes": described_electrode_set,
+                "protocol": file_protocol,
+            }
+            missing_sections = ", ".join(
+                f"[{section_name}]"
+                for section_name, part_of_section in parts_by_section.items()
+                if part_of_section is None
+            )
             raise ValueError(f"{self.origin}: a model needs {missing_sections} too; describe it.")
-        mesh = body_mesh(domain, electrodes, num_points)
-        return ForwardModel(mesh, electrodes, protocol)
+        mesh = body_mesh(described_domain, described_electrode_set, num_points)
+        return ForwardModel(mesh, described_electrode_set, file_protocol)
 
 
 def load_description(which: str | Path) -> Description:
@@ -196,9 +206,9 @@ def load_description(which: str | Path) -> Description:
     ```
     """
     if str(which) in BUNDLED_DESCRIPTIONS:
-        origin = f"{which}.toml"
-        text = resources.files("jeit.data").joinpath(origin).read_text("utf-8")
-        return parse_description(tomllib.loads(text), origin)
+        file_name = f"{which}.toml"
+        text = resources.files("jeit.data").joinpath(file_name).read_text("utf-8")
+        return parse_description(tomllib.loads(text), file_name)
     path = Path(which)
     if not path.is_file():
         raise ValueError(
@@ -217,56 +227,73 @@ def parse_description(table: dict[str, Any], origin: str, folder: str | Path = "
     from jeit.data.description_tables import DescriptionTable
     from jeit.files.schema import validated
 
-    tables = validated(DescriptionTable, table, origin)
-    domain = None if tables.geometry is None else described_body(tables.geometry, Path(folder), origin)
-    electrodes = None if tables.electrodes is None else described_electrodes(tables.electrodes, domain, origin)
+    checked_tables = validated(DescriptionTable, table, origin)
+    described_domain = (
+        None if checked_tables.geometry is None else described_body(checked_tables.geometry, Path(folder), origin)
+    )
+    electrodes = (
+        None
+        if checked_tables.electrodes is None
+        else described_electrodes(checked_tables.electrodes, described_domain, origin)
+    )
     return Description(
         origin=origin,
-        title=tables.title,
-        domain=domain,
+        title=checked_tables.title,
+        domain=described_domain,
         electrodes=electrodes,
-        layout=_layout(tables.data),
-        notes=tuple(tables.notes.text),
-        protocol_section=tables.protocol,
-        uncertainty=None if tables.uncertainty is None else _uncertainty(tables.uncertainty, domain, origin),
+        layout=_described_layout(checked_tables.data),
+        notes=tuple(checked_tables.notes.text),
+        protocol_section=checked_tables.protocol,
+        uncertainty=None
+        if checked_tables.uncertainty is None
+        else _described_uncertainty(checked_tables.uncertainty, described_domain, origin),
     )
 
 
-def _uncertainty(table: UncertaintyTable, domain: Body | None, origin: str) -> Uncertainty:
+def _described_uncertainty(
+    uncertainty_table: UncertaintyTable, described_domain: Body | None, file_name: str
+) -> Uncertainty:
     """Uncertainty from the section `[uncertainty]`. Raises `ValueError` if `position_degrees` is specified for a body
     that is not round."""
-    position = table.position
-    if table.position_degrees is not None:
-        outline = domain.outline if isinstance(domain, Solid) else domain
-        if not isinstance(outline, Disk):
+    position_error = uncertainty_table.position
+    if uncertainty_table.position_degrees is not None:
+        body_outline = described_domain.outline if isinstance(described_domain, Solid) else described_domain
+        if not isinstance(body_outline, Disk):
             raise ValueError(
-                f"{origin}: [uncertainty] position_degrees is of a disk or a cylinder; give position, in metres."
+                f"{file_name}: [uncertainty] position_degrees is of a disk or a cylinder; give position, in metres."
             )
-        position = float(np.deg2rad(table.position_degrees) * np.asarray(outline.radius))
-    drift, size, other_error = (
-        percentage / 100 for percentage in (table.contact_drift_percent, table.size_percent, table.other_percent)
+        position_error = float(np.deg2rad(uncertainty_table.position_degrees) * np.asarray(body_outline.radius))
+    contact_drift, size_error, other_relative_error = (
+        error_percentage / 100
+        for error_percentage in (
+            uncertainty_table.contact_drift_percent,
+            uncertainty_table.size_percent,
+            uncertainty_table.other_percent,
+        )
     )
-    return Uncertainty(position, drift, size, other_error)
+    return Uncertainty(position_error, contact_drift, size_error, other_relative_error)
 
 
-def _layout(data: DataTable) -> TableLayout:
-    scale = _VOLTAGE_UNITS[data.unit] / data.gain * (-1 if data.polarity == "reversed" else 1)
+def _described_layout(data_table: DataTable) -> TableLayout:
+    volts_per_unit = (
+        _VOLTAGE_UNITS[data_table.unit] / data_table.gain * (-1 if data_table.polarity == "reversed" else 1)
+    )
     return TableLayout(
-        frames_in=data.frames_in,
-        delimiter=data.delimiter,
-        skip_rows=data.skip_rows,
-        time_column=data.time_column,
-        complex_pairs=data.complex_pairs,
-        component=data.component,
-        scale=scale,
-        polarity=data.polarity,
-        gains=() if data.gains is None else tuple(data.gains.tolist()),
+        frames_in=data_table.frames_in,
+        delimiter=data_table.delimiter,
+        skip_rows=data_table.skip_rows,
+        time_column=data_table.time_column,
+        complex_pairs=data_table.complex_pairs,
+        component=data_table.component,
+        scale=volts_per_unit,
+        polarity=data_table.polarity,
+        gains=() if data_table.gains is None else tuple(data_table.gains.tolist()),
         # The saturation level is stated in the unit of the file, but compared with voltages from which the gain is
         # removed.
-        saturation=None if data.saturation is None else data.saturation * abs(scale),
-        frame_names=tuple(data.frame_names),
-        keys=tuple(data.keys),
-        axes=tuple(data.axes),
-        averaged=data.frames == "mean",
-        frame_rate=data.frame_rate,
+        saturation=None if data_table.saturation is None else data_table.saturation * abs(volts_per_unit),
+        frame_names=tuple(data_table.frame_names),
+        keys=tuple(data_table.keys),
+        axes=tuple(data_table.axes),
+        averaged=data_table.frames == "mean",
+        frame_rate=data_table.frame_rate,
     )

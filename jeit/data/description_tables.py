@@ -122,7 +122,7 @@ class PlacedTable(Table):
     def _check_positions(self) -> "PlacedTable":
         layout_keys = ("layout", "number", "start_angle_degrees", "clockwise", "start", "levels")
         if self.positions is not None:
-            unused_keys = [key for key in layout_keys if key in self.model_fields_set]
+            unused_keys = [layout_key for layout_key in layout_keys if layout_key in self.model_fields_set]
             if unused_keys:
                 raise fault("has no effect beside positions; leave out one or the other.", unused_keys[0])
         elif self.layout is None:
@@ -195,19 +195,19 @@ class DrivenTable(Table):
 
     @model_validator(mode="after")
     def _check_current(self) -> "DrivenTable":
-        pattern = self.current_from_name
-        if pattern is None and self.current is None:
+        name_pattern = self.current_from_name
+        if name_pattern is None and self.current is None:
             raise fault(
                 "is missing; give it, or current_from_name. If it is not known, write 1e-3 (A): it scales "
                 "conductivities alone, and relative changes not at all.",
                 "current",
             )
-        if pattern is not None and self.current is not None:
+        if name_pattern is not None and self.current is not None:
             raise fault("has no effect beside current_from_name; leave out one or the other.", "current")
-        if pattern is not None and pattern.count("{current}") != 1:
+        if name_pattern is not None and name_pattern.count("{current}") != 1:
             raise fault(
                 "must be the file's name with {current} in place of the number, once, and * for anything, such as "
-                f"'*_{{current}}uA_*' (older jeits took a regular expression); it is {pattern[:60]!r}.",
+                f"'*_{{current}}uA_*' (older jeits took a regular expression); it is {name_pattern[:60]!r}.",
                 "current_from_name",
             )
         return self
@@ -434,18 +434,18 @@ ConstructedTable = (
 )  # fmt: skip
 ProtocolTable = ConstructedTable | OptimalTable | MatricesTable | ChannelsTable | MeasuredTable
 
-_SHAPE = TableOfKind(
+_SHAPE_TABLES = TableOfKind(
     "shape", DiskTable, RectangleTable, PolygonTable, BoxTable, CylinderTable,
     alternative_key="mesh", alternative_table=MeshTable,
     synonyms={"circle": "disk", "tank": "cylinder", "tube": "cylinder", "cube": "box", "cuboid": "box",
               "square": "rectangle"},
 )  # fmt: skip
-_ELECTRODES = TableOfKind(
+_ELECTRODES_TABLES = TableOfKind(
     "kind", BoundaryTable, DiscTable, PatchTable, PointTable, FacetsTable,
     synonyms={"strip": "patch", "plate": "patch", "bar": "patch", "rectangle": "patch", "square": "patch",
               "circle": "disc", "round": "disc", "arc": "boundary", "edge": "boundary", "mesh": "facets"},
 )  # fmt: skip
-_PROTOCOL = TableOfKind(
+_PROTOCOL_TABLES = TableOfKind(
     "kind", AdjacentTable, SkipTable, OppositeTable, AgainstOneTable, ReferenceTable, TwoTerminalTable,
     TrigonometricTable, HaarTable, OptimalTable, BipolarTable, MatricesTable, ChannelsTable, MeasuredTable,
 )  # fmt: skip
@@ -456,9 +456,9 @@ class DescriptionTable(Table):
 
     name_in_messages = "a description"
     title: Annotated[str, Field(max_length=1000)] = ""
-    geometry: Annotated[GeometryTable, _SHAPE] | None = None
-    electrodes: Annotated[ElectrodesTable, _ELECTRODES] | None = None
-    protocol: Annotated[ProtocolTable, _PROTOCOL] | None = None
+    geometry: Annotated[GeometryTable, _SHAPE_TABLES] | None = None
+    electrodes: Annotated[ElectrodesTable, _ELECTRODES_TABLES] | None = None
+    protocol: Annotated[ProtocolTable, _PROTOCOL_TABLES] | None = None
     data: DataTable = DataTable()
     notes: NotesTable = NotesTable()
     uncertainty: UncertaintyTable | None = None

@@ -50,23 +50,37 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
     data_path = Path(path)
     if data_path.suffix.lower() != ".npz":
         raise ValueError(f"write_table: {data_path.name} must end in .npz.")
-    lines = [f"title = {_toml(measurement.name)}"]
+    toml_lines = [f"title = {_toml_text(measurement.name)}"]
     if measurement.domain is not None:
-        lines += ["", "[geometry]", *assignments(_geometry(measurement.domain))]
+        toml_lines += ["", "[geometry]", *assignments(_geometry_section(measurement.domain))]
     if measurement.electrodes is not None:
-        lines += ["", "[electrodes]", *assignments(_electrodes(measurement.electrodes))]
+        toml_lines += ["", "[electrodes]", *assignments(_electrodes_section(measurement.electrodes))]
     protocol = measurement.protocol
-    lines += ["", "[protocol]", *assignments(_protocol(protocol))]
-    if (uncertainty := measurement.uncertainty) is not None:
-        relative_errors = {"contact_drift": uncertainty.drift, "size": uncertainty.size, "other": uncertainty.other}
-        section = {} if uncertainty.position is None else {"position": uncertainty.position}
-        section |= {f"{name}_percent": 100 * relative_error for name, relative_error in relative_errors.items()}
-        lines += ["", "[uncertainty]", *assignments(section)]
-    component = "complex" if np.iscomplexobj(measurement.voltages) else "real"
-    lines += ["", "[data]", *assignments({"frames_in": "rows", "component": component, "polarity": "normal"})]
-    arrays: dict[str, Any] = {array: np.asarray(getattr(protocol, array)) for array in PROTOCOL_ARRAYS}
+    toml_lines += ["", "[protocol]", *assignments(_protocol_section(protocol))]
+    if (measurement_uncertainty := measurement.uncertainty) is not None:
+        relative_errors = {
+            "contact_drift": measurement_uncertainty.drift,
+            "size": measurement_uncertainty.size,
+            "other": measurement_uncertainty.other,
+        }
+        uncertainty_section = (
+            {} if measurement_uncertainty.position is None else {"position": measurement_uncertainty.position}
+        )
+        uncertainty_section |= {
+            f"{name}_percent": 100 * relative_error for name, relative_error in relative_errors.items()
+        }
+        toml_lines += ["", "[uncertainty]", *assignments(uncertainty_section)]
+    voltage_component = "complex" if np.iscomplexobj(measurement.voltages) else "real"
+    toml_lines += [
+        "",
+        "[data]",
+        *assignments({"frames_in": "rows", "component": voltage_component, "polarity": "normal"}),
+    ]
+    stored_arrays: dict[str, Any] = {
+        array_name: np.asarray(getattr(protocol, array_name)) for array_name in PROTOCOL_ARRAYS
+    }
     if measurement.times is not None:
-        arrays["times"] = np.asarray(measurement.times)
+        stored_arrays["times"] = np.asarray(measurement.times)
     description_path = data_path.with_suffix(".toml")
     with atomically_written_files(data_path.parent) as temporary_folder:
         np.savez_compressed(
@@ -76,51 +90,57 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
             frame_names=np.array(measurement.frame_names, str),
             notes=np.array(measurement.notes, str),
             protocol_name=np.asarray(protocol.name),
-            **arrays,
+            **stored_arrays,
         )
-        (temporary_folder / description_path.name).write_text("\n".join(lines) + "\n", "utf-8")
+        (temporary_folder / description_path.name).write_text("\n".join(toml_lines) + "\n", "utf-8")
     return data_path, description_path
 
 
-def _geometry(domain: Body) -> dict:
-    section = domain.describe()
-    if section["shape"] not in OUTLINES:
+def _geometry_section(domain: Body) -> dict:
+    geometry_section = domain.describe()
+    if geometry_section["shape"] not in OUTLINES:
         raise ValueError(
             f"write_table: a description cannot say {type(domain).__name__}; it knows {', '.join(OUTLINES)} and solids "
             "above them. Set domain to None; save a mesh with jeit.mesh.write, and name it in [geometry] mesh."
         )
-    return section
+    return geometry_section
 
 
-def _electrodes(electrodes: AbstractElectrodes) -> dict:
-    kind = next((name for name, classes in ELECTRODES.items() if type(electrodes) in classes.values()), None)
-    geometry = {name: np.asarray(values).tolist() for name, values in electrodes.geometry().items()} if kind else {}
-    positions = geometry.pop("position", None)
-    if positions is None:
+def _electrodes_section(electrodes: AbstractElectrodes) -> dict:
+    electrode_kind = next(
+        (name for name, electrode_classes in ELECTRODES.items() if type(electrodes) in electrode_classes.values()), None
+    )
+    electrode_geometry = (
+        {name: np.asarray(geometry_values).tolist() for name, geometry_values in electrodes.geometry().items()}
+        if electrode_kind
+        else {}
+    )
+    electrode_positions = electrode_geometry.pop("position", None)
+    if electrode_positions is None:
         raise ValueError(
             f"write_table: a description cannot say {type(electrodes).__name__}; it knows {', '.join(ELECTRODES)}. Set "
             "electrodes to None, or save the model instead."
         )
-    section = {"kind": kind, **geometry, "positions": positions}
+    electrode_section = {"kind": electrode_kind, **electrode_geometry, "positions": electrode_positions}
     if electrodes.is_point:
-        return section
-    return {**section, "contact_impedance": np.asarray(electrodes.contact_impedance).tolist()}
+        return electrode_section
+    return {**electrode_section, "contact_impedance": np.asarray(electrodes.contact_impedance).tolist()}
 
 
-def _protocol(protocol: Protocol) -> dict:
-    arrays = {name: np.asarray(getattr(protocol, name)).tolist() for name in PROTOCOL_ARRAYS}
-    return {"kind": "channels", "name": protocol.name, **arrays}
+def _protocol_section(protocol: Protocol) -> dict:
+    protocol_arrays = {name: np.asarray(getattr(protocol, name)).tolist() for name in PROTOCOL_ARRAYS}
+    return {"kind": "channels", "name": protocol.name, **protocol_arrays}
 
 
 def assignments(section: dict[str, Any]) -> list[str]:
     """Lines of a TOML table, one for each key; values are text, booleans, numbers and nested lists."""
-    return [f"{key} = {_toml(value)}" for key, value in section.items()]
+    return [f"{table_key} = {_toml_text(table_value)}" for table_key, table_value in section.items()]
 
 
-def _toml(value) -> str:
+def _toml_text(toml_value) -> str:
     """TOML text of a string, a number or a nested list, in the form of JSON; floats are written with all digits
     (`repr`)."""
-    return json.dumps(value, ensure_ascii=False)
+    return json.dumps(toml_value, ensure_ascii=False)
 
 
 def from_pyeit(mesh: Any, protocol: Any, *, current: float = 1.0) -> ForwardModel:
@@ -143,9 +163,14 @@ def from_pyeit(mesh: Any, protocol: Any, *, current: float = 1.0) -> ForwardMode
     model = from_pyeit(shapes.create(16), create(16))
     ```
     """
-    fields = {"mesh": (mesh, ("node", "element", "el_pos")), "protocol": (protocol, ("ex_mat", "meas_mat"))}
-    for name, (instance, attributes) in fields.items():
-        missing_attributes = [attribute for attribute in attributes if not hasattr(instance, attribute)]
+    required_attributes = {
+        "mesh": (mesh, ("node", "element", "el_pos")),
+        "protocol": (protocol, ("ex_mat", "meas_mat")),
+    }
+    for name, (given_object, attribute_names) in required_attributes.items():
+        missing_attributes = [
+            attribute_name for attribute_name in attribute_names if not hasattr(given_object, attribute_name)
+        ]
         if missing_attributes:
             raise ValueError(
                 f"{name} has no {missing_attributes[0]}; give the {name} that pyEIT made, such as of its `create`."
@@ -153,11 +178,11 @@ def from_pyeit(mesh: Any, protocol: Any, *, current: float = 1.0) -> ForwardMode
     points, electrode_nodes = np.asarray(mesh.node, float), np.asarray(mesh.el_pos, int)
     cells = np.asarray(mesh.element, int)
     points = points[:, : cells.shape[1] - 1]  # in pyEIT, the nodes of two-dimensional meshes have a coordinate z = 0
-    drive = current * pair_patterns(np.asarray(protocol.ex_mat, int), len(electrode_nodes))
-    pairs = [np.asarray(drive_pairs, int)[:, :2] for drive_pairs in protocol.meas_mat]
-    measurement = pair_patterns(np.concatenate(pairs), len(electrode_nodes))
-    drive_index = np.repeat(np.arange(len(pairs)), [len(drive_pairs) for drive_pairs in pairs])
-    jeit_protocol = from_channels(drive, measurement, drive_index, name="pyEIT's protocol")
+    drive_currents = current * pair_patterns(np.asarray(protocol.ex_mat, int), len(electrode_nodes))
+    measurement_pairs = [np.asarray(drive_pairs, int)[:, :2] for drive_pairs in protocol.meas_mat]
+    measurement = pair_patterns(np.concatenate(measurement_pairs), len(electrode_nodes))
+    drive_index = np.repeat(np.arange(len(measurement_pairs)), [len(drive_pairs) for drive_pairs in measurement_pairs])
+    jeit_protocol = from_channels(drive_currents, measurement, drive_index, name="pyEIT's protocol")
     return ForwardModel(Mesh.create(points, cells), NodeElectrodes(electrode_nodes), jeit_protocol)
 
 
@@ -188,48 +213,67 @@ def from_eidors(path: str | Path, variable: str | None = None) -> ForwardModel:
         raise ValueError(f"path: there is no file {file}. Check the name and the working directory.")
     check_memory(file.name, file.stat().st_size)
     with read_as(f"{file.name} is not a readable .mat file of version 7 or less"):
-        variables = scipy.io.loadmat(str(file), simplify_cells=True, spmatrix=False)
-    models = {name: model for name, value in variables.items() if (model := _forward_model(value)) is not None}
-    if variable is None and len(models) != 1:
-        problem = (
-            f"has the models {names_text(sorted(models))}; name one" if models else "has no model; save a fwd_model"
+        file_variables = scipy.io.loadmat(str(file), simplify_cells=True, spmatrix=False)
+    forward_models = {
+        name: model
+        for name, variable_value in file_variables.items()
+        if (model := _forward_model(variable_value)) is not None
+    }
+    if variable is None and len(forward_models) != 1:
+        problem_text = (
+            f"has the models {names_text(sorted(forward_models))}; name one"
+            if forward_models
+            else "has no model; save a fwd_model"
         )
-        raise ValueError(f"variable: {file.name} {problem}.")
-    name = next(iter(models)) if variable is None else variable
-    if name not in models:
-        raise ValueError(f"variable: {file.name} has no model {name!r}; it has {names_text(sorted(models)) or 'none'}.")
-    fwd_model = models[name]
+        raise ValueError(f"variable: {file.name} {problem_text}.")
+    name = next(iter(forward_models)) if variable is None else variable
+    if name not in forward_models:
+        raise ValueError(
+            f"variable: {file.name} has no model {name!r}; it has {names_text(sorted(forward_models)) or 'none'}."
+        )
+    fwd_model = forward_models[name]
     mesh = Mesh.create(np.asarray(fwd_model["nodes"], float), np.asarray(fwd_model["elems"], int) - 1)
     electrode_tables = (
         [fwd_model["electrode"]] if isinstance(fwd_model["electrode"], dict) else list(fwd_model["electrode"])
     )
-    electrode_nodes = [np.atleast_1d(np.asarray(table["nodes"], int)) - 1 for table in electrode_tables]
+    electrode_nodes = [
+        np.atleast_1d(np.asarray(electrode_table["nodes"], int)) - 1 for electrode_table in electrode_tables
+    ]
     if all(len(node_list) == 1 for node_list in electrode_nodes):
         electrodes: AbstractElectrodes = NodeElectrodes(np.concatenate(electrode_nodes))
     else:
         electrodes = electrodes_from_nodes(
-            mesh, electrode_nodes, np.array([float(table["z_contact"]) for table in electrode_tables])
+            mesh,
+            electrode_nodes,
+            np.array([float(electrode_table["z_contact"]) for electrode_table in electrode_tables]),
         )
-    stimulation = fwd_model["stimulation"]
-    stimulations = [stimulation] if isinstance(stimulation, dict) else list(stimulation)
-    drive = np.stack([_dense(entry["stim_pattern"]).ravel() for entry in stimulations])
-    measurement_patterns = [_dense(entry["meas_pattern"]).reshape(-1, drive.shape[1]) for entry in stimulations]
-    drive_index = np.repeat(np.arange(len(stimulations)), [len(rows) for rows in measurement_patterns])
+    stimulation_entries = fwd_model["stimulation"]
+    stimulation_list = [stimulation_entries] if isinstance(stimulation_entries, dict) else list(stimulation_entries)
+    drive_currents = np.stack(
+        [_dense_matrix(stimulation_entry["stim_pattern"]).ravel() for stimulation_entry in stimulation_list]
+    )
+    measurement_patterns = [
+        _dense_matrix(stimulation_entry["meas_pattern"]).reshape(-1, drive_currents.shape[1])
+        for stimulation_entry in stimulation_list
+    ]
+    drive_index = np.repeat(
+        np.arange(len(stimulation_list)), [len(pattern_rows) for pattern_rows in measurement_patterns]
+    )
     return ForwardModel(
         mesh,
         electrodes,
-        from_channels(drive, np.concatenate(measurement_patterns), drive_index, name=f"of {file.stem}"),
+        from_channels(drive_currents, np.concatenate(measurement_patterns), drive_index, name=f"of {file.stem}"),
     )
 
 
-def _forward_model(value: Any) -> dict[str, Any] | None:
+def _forward_model(variable_value: Any) -> dict[str, Any] | None:
     """Return the EIDORS forward model (`fwd_model`) that a variable is or contains; None if there is none."""
-    if not isinstance(value, dict):
+    if not isinstance(variable_value, dict):
         return None
-    if {"nodes", "elems", "electrode", "stimulation"} <= value.keys():
-        return value
-    return _forward_model(value.get("fwd_model"))
+    if {"nodes", "elems", "electrode", "stimulation"} <= variable_value.keys():
+        return variable_value
+    return _forward_model(variable_value.get("fwd_model"))
 
 
-def _dense(matrix: Any) -> np.ndarray:
+def _dense_matrix(matrix: Any) -> np.ndarray:
     return np.asarray(matrix.toarray() if hasattr(matrix, "toarray") else matrix, float)

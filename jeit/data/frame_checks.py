@@ -151,13 +151,13 @@ def check_same_setup(measurement: Measurement, reference: Measurement) -> None:
             "one protocol."
         )
     if not protocol.same_patterns(reference_protocol):
-        ratio = float(np.linalg.norm(protocol.channel_drive) / np.linalg.norm(reference_protocol.channel_drive))
-        scaled_drive = ratio * np.asarray(reference_protocol.channel_drive)
+        current_ratio = float(np.linalg.norm(protocol.channel_drive) / np.linalg.norm(reference_protocol.channel_drive))
+        scaled_drive = current_ratio * np.asarray(reference_protocol.channel_drive)
         if np.allclose(protocol.channel_drive, scaled_drive, rtol=1e-6, atol=1e-12) and np.allclose(
             protocol.channel_measurement, reference_protocol.channel_measurement, rtol=1e-6
         ):
             raise ValueError(
-                f"'{measurement.name}' was driven with {ratio:.4g} times the current of the reference "
+                f"'{measurement.name}' was driven with {current_ratio:.4g} times the current of the reference "
                 f"'{reference.name}'. Their difference would show the current, not the body: use a reference "
                 "at the same current, or divide both by their currents first."
             )
@@ -170,23 +170,23 @@ def check_same_setup(measurement: Measurement, reference: Measurement) -> None:
             f"'{measurement.name}' and the reference '{reference.name}' are not both complex. Read both with "
             "the same component (real, imaginary, magnitude or complex)."
         )
-    for each_measurement, prefix in ((measurement, ""), (reference, "the reference ")):
+    for each_measurement, name_prefix in ((measurement, ""), (reference, "the reference ")):
         if not np.asarray(each_measurement.mask).any():
             raise ValueError(
-                f"{prefix}'{each_measurement.name}' has no usable voltage: each is NaN, infinite, or masked for what "
-                "its notes say. Give another frame."
+                f"{name_prefix}'{each_measurement.name}' has no usable voltage: each is NaN, infinite, or masked for "
+                "what its notes say. Give another frame."
             )
     common_channels = np.asarray(measurement.mask).any(axis=0) & np.asarray(reference.mask).any(axis=0)
     if not common_channels.any():
         raise ValueError(f"'{measurement.name}' and the reference '{reference.name}' have no usable channel in common.")
-    sizes = [
+    different_sizes = [
         np.median(np.abs(np.asarray(compared_measurement.mean_frame().voltages)[0, common_channels]))
         for compared_measurement in (measurement, reference)
     ]
-    ratio = sizes[0] / sizes[1] if sizes[1] > 0 else np.inf
-    if not 1 / 100 < ratio < 100:
+    current_ratio = different_sizes[0] / different_sizes[1] if different_sizes[1] > 0 else np.inf
+    if not 1 / 100 < current_ratio < 100:
         raise ValueError(
-            f"The voltages of '{measurement.name}' are {ratio:.3g} times those of the reference "
+            f"The voltages of '{measurement.name}' are {current_ratio:.3g} times those of the reference "
             f"'{reference.name}': the two are in different units (volts and millivolts?) or at different "
             "gains. Give both in volts."
         )
@@ -215,75 +215,87 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
     Raises `ValueError` if measurement and reference are not from the same set-up (`check_same_setup`).
     """
     check_same_setup(measurement, reference)
-    mean = reference.mean_frame()
-    reference_signs, reference_error = impossible_signs(mean), reciprocity_error(mean)
-    deviations = np.asarray(relative_noise(np.abs(np.asarray(mean.voltages)[0]), np.asarray(mean.mask)[0]))
-    results = []
+    mean_reference = reference.mean_frame()
+    reference_signs, reference_error = impossible_signs(mean_reference), reciprocity_error(mean_reference)
+    noise_deviations = np.asarray(
+        relative_noise(np.abs(np.asarray(mean_reference.voltages)[0]), np.asarray(mean_reference.mask)[0])
+    )
+    frame_qualities = []
     for frame_index in range(measurement.num_frames):
         frame = measurement.frame(frame_index)
-        mask_of_common_channels = np.asarray(frame.mask) & np.asarray(mean.mask)
-        change = Measurement(
-            np.where(mask_of_common_channels, np.asarray(frame.voltages) - np.asarray(mean.voltages), np.nan),
+        mask_of_common_channels = np.asarray(frame.mask) & np.asarray(mean_reference.mask)
+        voltage_change = Measurement(
+            np.where(mask_of_common_channels, np.asarray(frame.voltages) - np.asarray(mean_reference.voltages), np.nan),
             mask_of_common_channels,
             measurement.protocol,
         )
-        size = float(np.linalg.norm(np.asarray(change.filled())))
-        relative_difference = size / float(
-            np.linalg.norm(np.where(mask_of_common_channels, np.asarray(mean.filled()), 0)) or np.inf
+        change_norm = float(np.linalg.norm(np.asarray(voltage_change.filled())))
+        relative_difference = change_norm / float(
+            np.linalg.norm(np.where(mask_of_common_channels, np.asarray(mean_reference.filled()), 0)) or np.inf
         )
         sign_shares = [
-            float(fractions[0]) for fractions in (impossible_signs(frame), reference_signs) if fractions is not None
+            float(sign_fractions[0])
+            for sign_fractions in (impossible_signs(frame), reference_signs)
+            if sign_fractions is not None
         ]
         num_usable = int(mask_of_common_channels.sum())
-        cosine = _cosine_similarity(
+        frame_cosine = _cosine_similarity(
             *(
                 np.where(mask_of_common_channels, np.asarray(each_frame.filled()), 0).ravel()
-                for each_frame in (frame, mean)
+                for each_frame in (frame, mean_reference)
             )
         )
-        error, evidence = (
-            (reciprocity_error(change, deviations), signal_evidence(change, deviations))
-            if num_usable and size > 0
+        error, signal_to_noise = (
+            (reciprocity_error(voltage_change, noise_deviations), signal_evidence(voltage_change, noise_deviations))
+            if num_usable and change_norm > 0
             else (None, None)
         )
-        factor, common_share = _common_factor(change, mean, deviations)
+        common_factor, common_share = _find_common_factor(voltage_change, mean_reference, noise_deviations)
         noise_share, noisy_electrode = (
-            (None, None) if error is None else _find_noise_share(change, mean, deviations, factor)
+            (None, None)
+            if error is None
+            else _find_noise_share(voltage_change, mean_reference, noise_deviations, common_factor)
         )
         errors_by_name = {
             f"the reference '{reference.name}'": reference_error,
             "the frame": reciprocity_error(frame),
         }
         impossible_share = max(sign_shares) if sign_shares else None
-        rounding_fraction = float(np.linalg.norm(rounding_of_difference(frame, mean))) / size if size > 0 else 0.0
-        results.append(
+        rounding_fraction = (
+            float(np.linalg.norm(rounding_of_difference(frame, mean_reference))) / change_norm
+            if change_norm > 0
+            else 0.0
+        )
+        frame_qualities.append(
             FrameQuality(
                 difference=relative_difference,
-                difference_noise=estimate_noise(change) if num_usable and size > 0 else None,
-                trusted_noise=reciprocity_noise(change, deviations) if num_usable and size > 0 else None,
+                difference_noise=estimate_noise(voltage_change) if num_usable and change_norm > 0 else None,
+                trusted_noise=reciprocity_noise(voltage_change, noise_deviations)
+                if num_usable and change_norm > 0
+                else None,
                 difference_reciprocity_error=error,
                 impossible_signs=impossible_share,
                 usable_channels=num_usable,
                 rounding=rounding_fraction,
                 noise_share=noise_share,
                 noisy_electrode=noisy_electrode,
-                common_factor=float(np.real(factor)) if common_share > _MAX_COMMON_FACTOR_SHARE else 0.0,
+                common_factor=float(np.real(common_factor)) if common_share > _MAX_COMMON_FACTOR_SHARE else 0.0,
                 reason=_rejection_reason(
                     measurement.protocol.num_electrodes,
                     num_usable,
                     relative_difference,
                     rounding_fraction,
                     impossible_share,
-                    (error, evidence),
+                    (error, signal_to_noise),
                     errors_by_name,
-                    cosine,
+                    frame_cosine,
                 ),
             )
         )
-    return results
+    return frame_qualities
 
 
-def _common_factor(
+def _find_common_factor(
     change: Measurement, mean: Measurement, deviations: Float[np.ndarray, " M"]
 ) -> tuple[complex, float]:
     """Relative change that the voltages of a `change` from the reference `mean` have in common, and its share of the
@@ -330,12 +342,12 @@ def _find_noise_share(
 def rounding_of_difference(frame: Measurement, reference: Measurement) -> Float[np.ndarray, " M"]:
     """Standard deviation (channels,), in volts, of the difference of two frames due to rounding of their voltages; 0
     for channels that are not usable in both frames."""
-    deviations = [
+    rounding_deviations = [
         rounding_deviation(np.asarray(measurement.voltages)[0], np.asarray(measurement.mask)[0])
         for measurement in (frame, reference)
     ]
     mask_of_common_channels = np.asarray(frame.mask)[0] & np.asarray(reference.mask)[0]
-    return np.where(mask_of_common_channels, np.hypot(*deviations), 0.0)
+    return np.where(mask_of_common_channels, np.hypot(*rounding_deviations), 0.0)
 
 
 def check_imageable(measurement: Measurement, reference: Measurement) -> list[FrameQuality]:
@@ -355,12 +367,12 @@ def check_imageable(measurement: Measurement, reference: Measurement) -> list[Fr
     check_imageable(pressed, rest)[0].difference
     ```
     """
-    qualities = assess(measurement, reference)
-    for frame_index, quality in enumerate(qualities):
-        if not quality.imageable:
+    frame_qualities = assess(measurement, reference)
+    for frame_index, frame_quality in enumerate(frame_qualities):
+        if not frame_quality.imageable:
             frame_text = f", frame {frame_index}" if measurement.num_frames > 1 else ""
-            raise ValueError(f"'{measurement.name}'{frame_text} cannot be imaged: {quality.reason}")
-    return qualities
+            raise ValueError(f"'{measurement.name}'{frame_text} cannot be imaged: {frame_quality.reason}")
+    return frame_qualities
 
 
 def _rejection_reason(
@@ -371,11 +383,11 @@ def _rejection_reason(
     impossible_share: float | None,
     error_and_evidence: tuple[float | None, float | None],
     errors_by_name: dict[str, float | None],
-    cosine: float,
+    frame_cosine: float,
 ) -> str:
     """Reason why a frame cannot be imaged; empty if it can. `error_and_evidence`: reciprocity error of the difference
-    and the evidence that it is not noise; `errors_by_name`: reciprocity errors of frame and reference; `cosine`: cosine
-    of the angle between frame and reference."""
+    and the evidence that it is not noise; `errors_by_name`: reciprocity errors of frame and reference; `frame_cosine`:
+    cosine of the angle between frame and reference."""
     if num_usable < num_electrodes:
         return (
             f"only {counted(num_usable, 'channel')} usable in both it and its reference, for {num_electrodes} "
@@ -398,7 +410,7 @@ def _rejection_reason(
             f"too noisy: {percent(impossible_share)} of the voltages have a sign that no passive body gives, so that "
             "more than half of them lie below the instrument's noise or offset. Measure with more current or gain."
         )
-    if cosine < _OPPOSITE_POLARITY_COSINE:
+    if frame_cosine < _OPPOSITE_POLARITY_COSINE:
         return (
             "its voltages have the opposite sign of its reference's: reverse the polarity of it, or of its reference."
         )
@@ -408,8 +420,8 @@ def _rejection_reason(
                 f"{name} breaks reciprocity by {percent(error)} on its own: it is too noisy, or its channels are in "
                 "another order than described. See `jeit info`."
             )
-    error, evidence = error_and_evidence
-    if error is not None and evidence is not None and evidence < MIN_SIGNAL_EVIDENCE:
+    error, signal_to_noise = error_and_evidence
+    if error is not None and signal_to_noise is not None and signal_to_noise < MIN_SIGNAL_EVIDENCE:
         return (
             f"too noisy: the difference from the reference breaks reciprocity by {percent(error)}, as noise alone does "
             "(141 %, less with few channels). Average more frames, or use more current; and check that its channels "
@@ -421,5 +433,5 @@ def _rejection_reason(
 def _cosine_similarity(first_frame: np.ndarray, second_frame: np.ndarray) -> float:
     """Cosine of the angle between two frames as vectors: 1 if the frames differ by a positive factor only, 0 if one
     frame is zero."""
-    size = float(np.linalg.norm(first_frame) * np.linalg.norm(second_frame))
-    return float(np.real(np.vdot(first_frame, second_frame))) / size if size > 0 else 0.0
+    norm_product = float(np.linalg.norm(first_frame) * np.linalg.norm(second_frame))
+    return float(np.real(np.vdot(first_frame, second_frame))) / norm_product if norm_product > 0 else 0.0

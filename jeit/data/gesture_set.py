@@ -48,17 +48,19 @@ def join(measurements: Sequence[Measurement]) -> Measurement:
                 f"'{other_measurement.name}' ({other_measurement.protocol.name}) is read otherwise than "
                 f"'{first_measurement.name}'; join one set-up's."
             )
-    names = tuple(name for measurement in measurements for name in measurement.frame_names)
+    joined_names = tuple(name for measurement in measurements for name in measurement.frame_names)
     time_arrays: list[Any] = [measurement.times for measurement in measurements]
-    has_missing_times = any(times is None for times in time_arrays)
-    times = None if has_missing_times else np.concatenate([np.asarray(times) for times in time_arrays])
-    mask = np.concatenate([np.asarray(measurement.mask) for measurement in measurements])
+    has_missing_times = any(frame_times is None for frame_times in time_arrays)
+    joined_times = (
+        None if has_missing_times else np.concatenate([np.asarray(frame_times) for frame_times in time_arrays])
+    )
+    joined_mask = np.concatenate([np.asarray(measurement.mask) for measurement in measurements])
     return replace(
         first_measurement,
         voltages=np.concatenate([np.asarray(measurement.voltages) for measurement in measurements]),
-        mask=mask,
-        frame_names=names if len(names) == len(mask) else (),
-        times=None if times is None or (np.diff(times) <= 0).any() else times,
+        mask=joined_mask,
+        frame_names=joined_names if len(joined_names) == len(joined_mask) else (),
+        times=None if joined_times is None or (np.diff(joined_times) <= 0).any() else joined_times,
     )
 
 
@@ -118,73 +120,99 @@ def read_frame_recording(path: str | Path, description: Description | None = Non
         raise FileNotFoundError(f"'{path}': there is no such file.")
     if not table.recognises(path):
         raise ValueError(f"'{path}': give frames as {', '.join(table.SUFFIXES)}.")
-    layout = TableLayout() if description is None else description.layout
+    table_layout = TableLayout() if description is None else description.layout
     protocol = None if description is None else description.protocol(path)
     num_channels = None if protocol is None else protocol.num_measurements
     try:
-        arrays = npz_arrays(path, *_FRAME_KEYS, *_TIME_KEYS, "reference", *layout.keys) if path.suffix == ".npz" else {}
-        (values, heading), seconds = _table(path, arrays, layout), None
-        are_frames_in_rows = not arrays and layout.frames_in != "columns" and layout.time_column is not False
-        if are_frames_in_rows and num_channels is not None and values.shape[1] == num_channels + 1:
-            values, seconds, _ = frames_in_table(values, [num_channels], layout, heading)
-        frames = _frames(values, layout, path.name, num_channels)
-        seconds = next((_times(arrays[key], key, len(frames)) for key in _TIME_KEYS if key in arrays), seconds)
-        reference = None
-        if "reference" in arrays:
-            reference = _check_frames("reference", np.atleast_2d(arrays["reference"]) * layout.scale, frames.shape[1])
-        elif "reference" in layout.frame_names and len(layout.frame_names) == len(frames):
-            is_reference = np.array(layout.frame_names) == "reference"
-            frames, reference = frames[~is_reference], frames[is_reference]
+        stored_arrays = (
+            npz_arrays(path, *_FRAME_KEYS, *_TIME_KEYS, "reference", *table_layout.keys)
+            if path.suffix == ".npz"
+            else {}
+        )
+        (table_values, column_names), frame_times = _read_number_table(path, stored_arrays, table_layout), None
+        are_frames_in_rows = (
+            not stored_arrays and table_layout.frames_in != "columns" and table_layout.time_column is not False
+        )
+        if are_frames_in_rows and num_channels is not None and table_values.shape[1] == num_channels + 1:
+            table_values, frame_times, _ = frames_in_table(table_values, [num_channels], table_layout, column_names)
+        frames = _frames_in_volts(table_values, table_layout, path.name, num_channels)
+        frame_times = next(
+            (
+                _checked_times(stored_arrays[time_key], time_key, len(frames))
+                for time_key in _TIME_KEYS
+                if time_key in stored_arrays
+            ),
+            frame_times,
+        )
+        reference_frame = None
+        if "reference" in stored_arrays:
+            reference_frame = _check_frames(
+                "reference", np.atleast_2d(stored_arrays["reference"]) * table_layout.scale, frames.shape[1]
+            )
+        elif "reference" in table_layout.frame_names and len(table_layout.frame_names) == len(frames):
+            is_reference = np.array(table_layout.frame_names) == "reference"
+            frames, reference_frame = frames[~is_reference], frames[is_reference]
     except ValueError as error:
         raise ValueError(f"'{path}': {error}") from None
-    return FrameRecording(frames, seconds, reference, path.name)
+    return FrameRecording(frames, frame_times, reference_frame, path.name)
 
 
-def _table(path: Path, arrays: dict[str, np.ndarray], layout: TableLayout) -> tuple[np.ndarray, tuple[str, ...]]:
+def _read_number_table(
+    path: Path, stored_arrays: dict[str, np.ndarray], table_layout: TableLayout
+) -> tuple[np.ndarray, tuple[str, ...]]:
     """The numbers of a file, arranged as in the file, and the names of the columns, if the file has any."""
-    if not arrays:
-        values, heading = table.numbers(path, layout)
-        return np.atleast_2d(values), heading
-    key = next((name for name in (*layout.keys, *_FRAME_KEYS) if name in arrays), None)
-    if key is None:
-        raise ValueError(f"there is no array 'frames'; the file holds {', '.join(arrays[''][:12])}.")
-    return np.atleast_2d(arrays[key]), ()
+    if not stored_arrays:
+        table_values, column_names = table.numbers(path, table_layout)
+        return np.atleast_2d(table_values), column_names
+    frame_key = next((name for name in (*table_layout.keys, *_FRAME_KEYS) if name in stored_arrays), None)
+    if frame_key is None:
+        raise ValueError(f"there is no array 'frames'; the file holds {', '.join(stored_arrays[''][:12])}.")
+    return np.atleast_2d(stored_arrays[frame_key]), ()
 
 
-def _frames(values: np.ndarray, layout: TableLayout, name: str, num_channels: int | None) -> Float[np.ndarray, "F M"]:
+def _frames_in_volts(
+    table_values: np.ndarray, table_layout: TableLayout, name: str, num_channels: int | None
+) -> Float[np.ndarray, "F M"]:
     """Voltages (frames, channels) of a table, in volts."""
-    if values.dtype.kind not in "iufc":
-        raise ValueError(f"frames are {values.dtype}; give numbers, in volts.")
-    frames = table.arrange_frames(values, layout, name)
+    if table_values.dtype.kind not in "iufc":
+        raise ValueError(f"frames are {table_values.dtype}; give numbers, in volts.")
+    frames = table.arrange_frames(table_values, table_layout, name)
     if np.iscomplexobj(frames):
         raise ValueError("frames are complex; choose a part with [data] component: real, imaginary or magnitude.")
     return _check_frames(
-        "frames", measurable_values(frames) * layout.scale, frames.shape[-1] if num_channels is None else num_channels
+        "frames",
+        measurable_values(frames) * table_layout.scale,
+        frames.shape[-1] if num_channels is None else num_channels,
     )
 
 
-def _check_frames(name: str, values: np.ndarray, num_channels: int) -> Float[np.ndarray, "F M"]:
-    if values.dtype.kind not in "iuf" or values.ndim != 2 or values.shape[1] != num_channels:
-        raise ValueError(f"{name} have shape {values.shape}; give one row for each frame, of {num_channels} channels.")
-    if not len(values):
-        raise ValueError(f"{name}: there is none.")
-    return measurable_values(values.astype(float))
-
-
-def _times(values: np.ndarray, name: str, num_frames: int) -> Float[np.ndarray, " F"]:
-    if values.dtype.kind not in "iuf" or values.shape != (num_frames,):
+def _check_frames(name: str, frame_values: np.ndarray, num_channels: int) -> Float[np.ndarray, "F M"]:
+    if frame_values.dtype.kind not in "iuf" or frame_values.ndim != 2 or frame_values.shape[1] != num_channels:
         raise ValueError(
-            f"{name} is {values.dtype} of shape {values.shape}; give seconds for each of {num_frames} frames."
+            f"{name} have shape {frame_values.shape}; give one row for each frame, of {num_channels} channels."
         )
-    seconds = values.astype(float)
-    if not np.isfinite(seconds).all():
+    if not len(frame_values):
+        raise ValueError(f"{name}: there is none.")
+    return measurable_values(frame_values.astype(float))
+
+
+def _checked_times(time_values: np.ndarray, name: str, num_frames: int) -> Float[np.ndarray, " F"]:
+    if time_values.dtype.kind not in "iuf" or time_values.shape != (num_frames,):
+        raise ValueError(
+            f"{name} is {time_values.dtype} of shape {time_values.shape}; give seconds for each of {num_frames} frames."
+        )
+    frame_times = time_values.astype(float)
+    if not np.isfinite(frame_times).all():
         raise ValueError(f"{name}: some are not finite.")
-    if num_frames > 1 and seconds[0] == seconds[-1] and not np.diff(seconds).any():
-        raise ValueError(f"{name} are all {seconds[0]:g}: give when each frame came.")
-    decreases = np.flatnonzero(np.diff(seconds) < 0)
-    if decreases.size:
-        raise ValueError(f"{name} fall after frame {decreases[0]}, {seconds[decreases[0]]:g} s: sort frames by time.")
-    return seconds
+    if num_frames > 1 and frame_times[0] == frame_times[-1] and not np.diff(frame_times).any():
+        raise ValueError(f"{name} are all {frame_times[0]:g}: give when each frame came.")
+    decreasing_indices = np.flatnonzero(np.diff(frame_times) < 0)
+    if decreasing_indices.size:
+        raise ValueError(
+            f"{name} fall after frame {decreasing_indices[0]}, {frame_times[decreasing_indices[0]]:g} s: sort frames "
+            "by time."
+        )
+    return frame_times
 
 
 _ARRAY_NAMES = ("gesture", "person", "start", "seconds", "voltages", "reference", "untouched")
@@ -224,9 +252,9 @@ class GestureSet:
             ("person", "iuU", "whole numbers or text"),
             ("start", "iu", "whole numbers"),
         ):
-            values = getattr(self, name)
-            if values.dtype.kind not in dtype_kinds:
-                raise ValueError(f"{name} is {values.dtype}; give {expected_type}.")
+            field_values = getattr(self, name)
+            if field_values.dtype.kind not in dtype_kinds:
+                raise ValueError(f"{name} is {field_values.dtype}; give {expected_type}.")
         for name in ("seconds", "voltages", "reference", "untouched"):
             if getattr(self, name).dtype.kind not in "fiu":
                 raise ValueError(f"{name} is {getattr(self, name).dtype}; give real numbers.")
@@ -239,11 +267,11 @@ class GestureSet:
             "seconds": (num_frames,),
             "reference": (num_channels,),
         }
-        for name, shape in expected_shapes.items():
-            if getattr(self, name).shape != shape:
+        for name, expected_shape in expected_shapes.items():
+            if getattr(self, name).shape != expected_shape:
                 raise ValueError(
                     f"{name} has shape {getattr(self, name).shape}; with {num_recordings} gestures and voltages "
-                    f"({num_frames}, {num_channels}) it is {shape}."
+                    f"({num_frames}, {num_channels}) it is {expected_shape}."
                 )
         if self.untouched.shape[1:] != (num_channels,):
             raise ValueError(
@@ -271,8 +299,8 @@ class GestureSet:
     def changes(self, number: int) -> tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T M"]]:
         """Times (frames,) in seconds and voltage changes (frames, channels) from the reference, in volts, of one
         recording."""
-        seconds, voltages = self.recording(number)
-        return seconds, voltages - self.reference
+        frame_times, voltages = self.recording(number)
+        return frame_times, voltages - self.reference
 
     def write(self, path: str | Path) -> None:
         """Write the gesture set to an NPZ file. Raises `OSError` if the file cannot be written."""
@@ -285,10 +313,10 @@ class GestureSet:
         to one person. Raises `OSError` if the file does not exist and `ValueError` if it is not a gesture set. Nothing
         in the file is executed."""
         try:
-            arrays = npz_arrays(Path(path), *_ARRAY_NAMES, otherwise="not a set of gestures")
-            if "gesture" in arrays:
-                arrays.setdefault("person", np.zeros(arrays["gesture"].shape, int))
-            require_arrays(arrays, *_ARRAY_NAMES)
-            return cls(**{name: arrays[name] for name in _ARRAY_NAMES})
+            stored_arrays = npz_arrays(Path(path), *_ARRAY_NAMES, otherwise="not a set of gestures")
+            if "gesture" in stored_arrays:
+                stored_arrays.setdefault("person", np.zeros(stored_arrays["gesture"].shape, int))
+            require_arrays(stored_arrays, *_ARRAY_NAMES)
+            return cls(**{name: stored_arrays[name] for name in _ARRAY_NAMES})
         except ValueError as error:
             raise ValueError(f"'{path}': {error}") from None

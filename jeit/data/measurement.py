@@ -78,8 +78,8 @@ class Measurement(Module):
     ):
         """`voltages` and `mask`: (frames, channels), or (channels,) for one frame; `times`: (frames,). Raises
         `ValueError` if these shapes disagree, if times do not increase, and if `domain` is not a body."""
-        self.voltages = as_array(_frames(voltages))
-        self.mask = as_array(_frames(mask))
+        self.voltages = as_array(_frame_matrix(voltages))
+        self.mask = as_array(_frame_matrix(mask))
         self.protocol = protocol
         self.electrodes = electrodes
         self.domain = None if domain is None else as_body(domain)
@@ -146,8 +146,8 @@ class Measurement(Module):
         frames."""
         if self.times is None or self.num_frames < 2:
             return None
-        times = np.asarray(self.times)
-        return float((len(times) - 1) / (times[-1] - times[0]))
+        frame_times = np.asarray(self.times)
+        return float((len(frame_times) - 1) / (frame_times[-1] - frame_times[0]))
 
     def at_rate(self, rate: float) -> "Measurement":
         """The same frames with times from 0 s, at `rate` frames per second. Raises `ValueError` unless `rate` is a
@@ -161,17 +161,19 @@ class Measurement(Module):
 
         Raises `ValueError` for frames that do not exist, and if no frame is selected.
         """
-        indices = np.arange(self.num_frames)[which] if isinstance(which, slice) else np.atleast_1d(np.asarray(which))
-        if indices.dtype == bool and indices.shape == (self.num_frames,):
-            indices = np.flatnonzero(indices)
-        if indices.ndim != 1 or not indices.size or indices.dtype.kind not in "iu":
+        frame_indices = (
+            np.arange(self.num_frames)[which] if isinstance(which, slice) else np.atleast_1d(np.asarray(which))
+        )
+        if frame_indices.dtype == bool and frame_indices.shape == (self.num_frames,):
+            frame_indices = np.flatnonzero(frame_indices)
+        if frame_indices.ndim != 1 or not frame_indices.size or frame_indices.dtype.kind not in "iu":
             raise ValueError(
                 f"which: give a slice, whole numbers or a mask of {self.num_frames} frames that leaves some; got "
-                f"{indices.dtype} of shape {indices.shape}."
+                f"{frame_indices.dtype} of shape {frame_indices.shape}."
             )
-        if indices.min() < 0 or indices.max() >= self.num_frames or (np.diff(indices) <= 0).any():
+        if frame_indices.min() < 0 or frame_indices.max() >= self.num_frames or (np.diff(frame_indices) <= 0).any():
             raise ValueError(f"which: frames run from 0 to {self.num_frames - 1}; give numbers in rising order.")
-        return self._frames(indices)
+        return self._select_frames(frame_indices)
 
     def frame(self, which: int | str) -> "Measurement":
         """A single frame as a measurement, selected by its index from 0 (negative: counted from the end) or by its
@@ -179,7 +181,7 @@ class Measurement(Module):
 
         Raises `ValueError` for a frame that does not exist.
         """
-        return self._frames(np.array([self.frame_number(which)]))
+        return self._select_frames(np.array([self.frame_number(which)]))
 
     def frame_number(self, which: int | str) -> int:
         """The index, counted from 0, of the frame that has the index or name `which`. Raises `ValueError` for a frame
@@ -187,9 +189,9 @@ class Measurement(Module):
         if isinstance(which, str):
             if which not in self.frame_names:
                 known_names = ", ".join(self.frame_names) or "none: give a number"
-                suggestion = did_you_mean(which, self.frame_names)
+                suggested_name = did_you_mean(which, self.frame_names)
                 raise ValueError(
-                    f"'{self.name}' has no frame named {which!r}{suggestion}. Named frames: {known_names}."
+                    f"'{self.name}' has no frame named {which!r}{suggested_name}. Named frames: {known_names}."
                 )
             which = self.frame_names.index(which)
         if not -self.num_frames <= which < self.num_frames:
@@ -202,21 +204,21 @@ class Measurement(Module):
         Raises `ValueError` if no frame is named "reference", or if there is no other frame.
         """
         if "reference" not in self.frame_names or self.num_frames < 2:
-            remedy = "say which (--reference-frames 0-17; measurement.frames(slice(0, 18))), or "
+            remedy_text = "say which (--reference-frames 0-17; measurement.frames(slice(0, 18))), or "
             raise ValueError(
                 f"'{self.name}' holds no reference frame of its own. Measure the undisturbed body and give that file "
-                f"as the reference; or, if frames of this one are that, {remedy if self.num_frames > 1 else ''}"
+                f"as the reference; or, if frames of this one are that, {remedy_text if self.num_frames > 1 else ''}"
                 'name one "reference" in the description: [data] frame_names.'
             )
         reference_index = self.frame_names.index("reference")
         other_indices = np.array([k for k in range(self.num_frames) if k != reference_index])
-        return self._frames(other_indices), self._frames(np.array([reference_index]))
+        return self._select_frames(other_indices), self._select_frames(np.array([reference_index]))
 
     def mean_frame(self) -> "Measurement":
         """The mean of the usable voltages over all frames, as a measurement of one frame; a channel that is usable in
         no frame stays masked."""
-        mean, usable = _mean(self.voltages, self.mask)
-        return self._replace(mean, usable, frame_names=(), times=None)
+        mean_voltages, usable_mask = _masked_mean(self.voltages, self.mask)
+        return self._replace(mean_voltages, usable_mask, frame_names=(), times=None)
 
     def filled(self, value: float = 0.0) -> Inexact[Array, "F M"]:
         """Voltages (frames, channels) in volts, with `value` in place of masked voltages."""
@@ -234,14 +236,14 @@ class Measurement(Module):
                 f"usable has shape {usable_array.shape} of {usable_array.dtype}; give booleans of shape "
                 f"({self.num_channels},) or {self.mask.shape}."
             )
-        mask = self.mask & usable_array
-        note = reason
-        if has_values(mask):
-            num_masked = int(self.mask.sum() - mask.sum())
+        reduced_mask = self.mask & usable_array
+        mask_note = reason
+        if has_values(reduced_mask):
+            num_masked = int(self.mask.sum() - reduced_mask.sum())
             if num_masked == 0:
                 return self
-            note = f"{counted(num_masked, 'voltage')} masked: {reason}"
-        return self._replace(self.voltages, mask, notes=(*self.notes, note))
+            mask_note = f"{counted(num_masked, 'voltage')} masked: {reason}"
+        return self._replace(self.voltages, reduced_mask, notes=(*self.notes, mask_note))
 
     def without_electrodes(self, electrodes: int | Sequence[int]) -> "Measurement":
         """Mask the channels that drive or measure any of `electrodes` (counted from 0), e.g. missing or broken
@@ -249,60 +251,67 @@ class Measurement(Module):
 
         Raises `ValueError` for electrodes that do not exist.
         """
-        numbers = ", ".join(str(k + 1) for k in np.atleast_1d(electrodes))
-        return self.masked(self.protocol.mask_without(electrodes), f"electrodes {numbers} left out.")
+        electrode_numbers = ", ".join(str(k + 1) for k in np.atleast_1d(electrodes))
+        return self.masked(self.protocol.mask_without(electrodes), f"electrodes {electrode_numbers} left out.")
 
     def without_driven_channels(self) -> "Measurement":
         """Mask the channels that measure on an electrode that carries current, because their voltages include the
         contact impedance of this electrode."""
-        usable = ~self.protocol.channels_on_driven_electrodes()
-        return self.masked(usable, "they measure on driven electrodes.")
+        usable_channels = ~self.protocol.channels_on_driven_electrodes()
+        return self.masked(usable_channels, "they measure on driven electrodes.")
 
-    def _frames(self, frame_indices: np.ndarray) -> "Measurement":
-        names = tuple(self.frame_names[k] for k in frame_indices) if self.frame_names else ()
-        times = None if self.times is None else np.asarray(self.times)[frame_indices]
-        return self._replace(*_select_rows(self.voltages, self.mask, frame_indices), frame_names=names, times=times)
+    def _select_frames(self, frame_indices: np.ndarray) -> "Measurement":
+        selected_names = tuple(self.frame_names[k] for k in frame_indices) if self.frame_names else ()
+        selected_times = None if self.times is None else np.asarray(self.times)[frame_indices]
+        return self._replace(
+            *_select_rows(self.voltages, self.mask, frame_indices), frame_names=selected_names, times=selected_times
+        )
 
-    def _replace(self, voltages, mask, **changes) -> "Measurement":
-        fields = {"frame_names": self.frame_names, "notes": self.notes, "times": self.times, **changes}
+    def _replace(self, voltages, new_mask, **changed_fields) -> "Measurement":
+        measurement_fields = {
+            "frame_names": self.frame_names,
+            "notes": self.notes,
+            "times": self.times,
+            **changed_fields,
+        }
         return Measurement(
             voltages,
-            mask,
+            new_mask,
             self.protocol,
             electrodes=self.electrodes,
             domain=self.domain,
             name=self.name,
             source=self.source,
             uncertainty=self.uncertainty,
-            **fields,
+            **measurement_fields,
         )
 
 
-def _check_times(times: np.ndarray, num_frames: int) -> None:
-    if times.shape != (num_frames,):
-        raise ValueError(f"times have shape {times.shape}; give seconds for each of {num_frames} frames.")
-    if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+def _check_times(frame_times: np.ndarray, num_frames: int) -> None:
+    if frame_times.shape != (num_frames,):
+        raise ValueError(f"times have shape {frame_times.shape}; give seconds for each of {num_frames} frames.")
+    if not np.isfinite(frame_times).all() or (np.diff(frame_times) <= 0).any():
         raise ValueError("times must be finite and rise from frame to frame, in seconds; sort the frames by time.")
 
 
-def _frames(values):
+def _frame_matrix(frame_values):
     """Values of one frame (channels,) or of several frames, as an array (frames, channels)."""
-    return np.atleast_2d(on_host(values)) if has_values(values) else jnp.atleast_2d(values)
+    return np.atleast_2d(on_host(frame_values)) if has_values(frame_values) else jnp.atleast_2d(frame_values)
 
 
 @numpy_or_compiled
-def _fill_masked(voltages, mask, value):
-    return namespace(voltages, mask).where(mask, voltages, value)
+def _fill_masked(voltages, usable_mask, value):
+    return namespace(voltages, usable_mask).where(usable_mask, voltages, value)
 
 
 @numpy_or_compiled
-def _select_rows(voltages, mask, row_indices):
-    return voltages[row_indices], mask[row_indices]
+def _select_rows(voltages, usable_mask, row_indices):
+    return voltages[row_indices], usable_mask[row_indices]
 
 
 @numpy_or_compiled
-def _mean(voltages, mask):
-    xp = namespace(voltages, mask)
-    num_usable = mask.sum(axis=0)
-    voltage_sum = xp.where(mask, voltages, 0).sum(axis=0)
+def _masked_mean(voltages, usable_mask):
+    xp = namespace(voltages, usable_mask)
+    num_usable = usable_mask.sum(axis=0)
+    voltage_sum = xp.where(usable_mask, voltages, 0).sum(axis=0)
     return xp.where(num_usable > 0, voltage_sum / xp.maximum(num_usable, 1), xp.nan), num_usable > 0

@@ -71,13 +71,13 @@ def reciprocity_error(measurement: Measurement, deviation: Float[np.ndarray, " M
     error = reciprocity_error(pressed)
     ```
     """
-    error, noise, signal = _asymmetry(measurement, deviation)
+    error, noise, signal_entries = _transfer_asymmetry(measurement, deviation)
     if error.size == 0:
         return None
     if deviation is not None:
         error = error / noise
-    size = np.linalg.norm(signal)
-    return float(np.linalg.norm(error) / size) if size > 0 else 0.0
+    signal_norm = np.linalg.norm(signal_entries)
+    return float(np.linalg.norm(error) / signal_norm) if signal_norm > 0 else 0.0
 
 
 def channel_reciprocity_error(measurement: Measurement) -> Float[np.ndarray, "F M"]:
@@ -94,17 +94,17 @@ def channel_reciprocity_error(measurement: Measurement) -> Float[np.ndarray, "F 
     deviation = channel_reciprocity_error(pressed)
     ```
     """
-    pairs, ratio = measurement.protocol.reciprocal_pairs()
-    voltages, mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
-    result = np.full(voltages.shape, np.nan, dtype=voltages.dtype)
-    if len(pairs) == 0:
-        return np.abs(result)
-    first_channels, second_channels = pairs.T
-    usable_pairs = mask[:, first_channels] & mask[:, second_channels]
-    error = voltages[:, first_channels] - voltages[:, second_channels] / ratio
-    result[:, first_channels] = np.where(usable_pairs, error, np.nan)
-    result[:, second_channels] = np.where(usable_pairs, -error * ratio, np.nan)
-    return np.real(result) if np.isrealobj(voltages) else np.abs(result)
+    reciprocal_pairs, voltage_ratios = measurement.protocol.reciprocal_pairs()
+    voltages, usable_mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
+    channel_errors = np.full(voltages.shape, np.nan, dtype=voltages.dtype)
+    if len(reciprocal_pairs) == 0:
+        return np.abs(channel_errors)
+    first_channels, second_channels = reciprocal_pairs.T
+    usable_pairs = usable_mask[:, first_channels] & usable_mask[:, second_channels]
+    error = voltages[:, first_channels] - voltages[:, second_channels] / voltage_ratios
+    channel_errors[:, first_channels] = np.where(usable_pairs, error, np.nan)
+    channel_errors[:, second_channels] = np.where(usable_pairs, -error * voltage_ratios, np.nan)
+    return np.real(channel_errors) if np.isrealobj(voltages) else np.abs(channel_errors)
 
 
 def estimate_noise(measurement: Measurement) -> NoiseEstimate | None:
@@ -129,19 +129,21 @@ def estimate_noise(measurement: Measurement) -> NoiseEstimate | None:
     noise = estimate_noise(pressed)
     ```
     """
-    voltages, mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
-    size = float(np.sqrt(np.mean(np.abs(voltages[mask]) ** 2))) if mask.any() else 0.0
-    error, gain, _ = _asymmetry(measurement)
+    voltages, usable_mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
+    rms_voltage = float(np.sqrt(np.mean(np.abs(voltages[usable_mask]) ** 2))) if usable_mask.any() else 0.0
+    error, noise_gain, _ = _transfer_asymmetry(measurement)
     if error.size:
-        deviation = _robust_deviation(error / gain)
-        method = "reciprocity"
+        noise_deviation = _robust_deviation(error / noise_gain)
+        method_name = "reciprocity"
     elif measurement.num_frames >= 8 and not measurement.frame_names:
-        step = np.diff(voltages, axis=0)[mask[1:] & mask[:-1]]
-        deviation = _robust_deviation(step / np.sqrt(2)) if step.size else 0.0
-        method = "repeated frames"
+        frame_steps = np.diff(voltages, axis=0)[usable_mask[1:] & usable_mask[:-1]]
+        noise_deviation = _robust_deviation(frame_steps / np.sqrt(2)) if frame_steps.size else 0.0
+        method_name = "repeated frames"
     else:
         return None
-    return NoiseEstimate(deviation, deviation / size if size > 0 else float("inf"), method)
+    return NoiseEstimate(
+        noise_deviation, noise_deviation / rms_voltage if rms_voltage > 0 else float("inf"), method_name
+    )
 
 
 def expected_signs(protocol: Protocol, electrode_order: Int[np.ndarray, " L"]) -> Int[np.ndarray, " M"]:
@@ -157,22 +159,26 @@ def expected_signs(protocol: Protocol, electrode_order: Int[np.ndarray, " L"]) -
     num_electrodes = protocol.num_electrodes
     rank_of_electrode = np.empty(num_electrodes, dtype=int)
     rank_of_electrode[electrode_order] = np.arange(len(electrode_order))
-    drive, measurement = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
-    is_pair_of_electrodes = (np.count_nonzero(drive, axis=1) == 2) & (np.count_nonzero(measurement, axis=1) == 2)
-    source = rank_of_electrode[drive.argmax(axis=1)]
+    channel_drives, channel_measurements = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
+    is_pair_of_electrodes = (np.count_nonzero(channel_drives, axis=1) == 2) & (
+        np.count_nonzero(channel_measurements, axis=1) == 2
+    )
+    source_ranks = rank_of_electrode[channel_drives.argmax(axis=1)]
     # Ranks are positions along the boundary counted from the source: the potential falls from rank 0 to sink, and rises
     # from sink to num_electrodes.
-    sink_rank = (rank_of_electrode[drive.argmin(axis=1)] - source) % num_electrodes
-    positive_rank = (rank_of_electrode[measurement.argmax(axis=1)] - source) % num_electrodes
-    negative_rank = (rank_of_electrode[measurement.argmin(axis=1)] - source) % num_electrodes
+    sink_rank = (rank_of_electrode[channel_drives.argmin(axis=1)] - source_ranks) % num_electrodes
+    positive_rank = (rank_of_electrode[channel_measurements.argmax(axis=1)] - source_ranks) % num_electrodes
+    negative_rank = (rank_of_electrode[channel_measurements.argmin(axis=1)] - source_ranks) % num_electrodes
     is_falling = (positive_rank <= sink_rank) & (negative_rank <= sink_rank)
-    signs = np.where(is_falling, np.sign(negative_rank - positive_rank), 0)
+    voltage_signs = np.where(is_falling, np.sign(negative_rank - positive_rank), 0)
     positive_rank, negative_rank = (
         np.where(positive_rank == 0, num_electrodes, positive_rank),
         np.where(negative_rank == 0, num_electrodes, negative_rank),
     )
     is_rising = (positive_rank >= sink_rank) & (negative_rank >= sink_rank) & ~is_falling
-    return np.where(is_pair_of_electrodes, np.where(is_rising, np.sign(positive_rank - negative_rank), signs), 0)
+    return np.where(
+        is_pair_of_electrodes, np.where(is_rising, np.sign(positive_rank - negative_rank), voltage_signs), 0
+    )
 
 
 def impossible_signs(
@@ -199,9 +205,9 @@ def impossible_signs(
     order = boundary_order(measurement) if order is None else order
     if order is None:
         return None
-    expected = expected_signs(measurement.protocol, order)
-    has_known_sign = np.asarray(measurement.mask) & (expected != 0)
-    has_wrong_sign = has_known_sign & (np.sign(np.real(np.asarray(measurement.voltages))) == -expected)
+    expected_sign = expected_signs(measurement.protocol, order)
+    has_known_sign = np.asarray(measurement.mask) & (expected_sign != 0)
+    has_wrong_sign = has_known_sign & (np.sign(np.real(np.asarray(measurement.voltages))) == -expected_sign)
     num_known = has_known_sign.sum(axis=1)
     if not num_known.any():
         return None
@@ -211,20 +217,20 @@ def impossible_signs(
 def boundary_order(measurement: Measurement) -> Int[np.ndarray, " L"] | None:
     """Indices (electrodes,) of the electrodes in their order along the outer edge of the body; None if they are not
     known to lie on the edge."""
-    electrodes, domain = measurement.electrodes, measurement.domain
-    if not isinstance(electrodes, BoundaryElectrodes) or domain is None:
+    electrodes, body_domain = measurement.electrodes, measurement.domain
+    if not isinstance(electrodes, BoundaryElectrodes) or body_domain is None:
         return None
-    loops = domain.loops()
-    if not loops:
+    boundary_loops = body_domain.loops()
+    if not boundary_loops:
         return None
-    return np.argsort(project_to_loop(np.asarray(electrodes.position), np.asarray(loops[0])), kind="stable")
+    return np.argsort(project_to_loop(np.asarray(electrodes.position), np.asarray(boundary_loops[0])), kind="stable")
 
 
 def reciprocity_noise(measurement: Measurement, deviation: Float[np.ndarray, " M"]) -> float | None:
     """Noise of the channels estimated from reciprocity, in units of `deviation` (channels,), the expected errors of
     channels relative to each other. The estimator is as robust as `estimate_noise`. None if no two usable channels are
     related by reciprocity."""
-    error, noise, _ = _asymmetry(measurement, deviation)
+    error, noise, _ = _transfer_asymmetry(measurement, deviation)
     return _robust_deviation(error / noise) if error.size else None
 
 
@@ -247,14 +253,14 @@ def signal_evidence(measurement: Measurement, deviation: Float[np.ndarray, " M"]
     evidence = signal_evidence(difference, relative_noise(voltages))
     ```
     """
-    error, noise, signal = _asymmetry(measurement, deviation)
+    error, noise, signal_entries = _transfer_asymmetry(measurement, deviation)
     if error.size == 0:
         return None
-    # An entry of `signal` off the diagonal counts two entries of T, an entry of the diagonal half as much.
-    num_pairs, num_diagonal = error.size, signal.size - error.size
+    # An entry of `signal_entries` off the diagonal counts two entries of T, an entry of the diagonal half as much.
+    num_pairs, num_diagonal = error.size, signal_entries.size - error.size
     noise_power = float(np.mean(np.abs(error / noise) ** 2)) * (num_pairs / 2 + num_diagonal / 4)
-    power = float(np.sum(signal**2))
-    return (power / noise_power - 1) * np.sqrt(num_pairs) if noise_power > 0 else np.inf
+    signal_power = float(np.sum(signal_entries**2))
+    return (signal_power / noise_power - 1) * np.sqrt(num_pairs) if noise_power > 0 else np.inf
 
 
 def rounding_deviation(voltages: Float[np.ndarray, " M"], mask: Bool[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
@@ -265,41 +271,49 @@ def rounding_deviation(voltages: Float[np.ndarray, " M"], mask: Bool[np.ndarray,
     step. Reciprocal voltages are rounded in the same way, so reciprocity does not show the rounding error.
     """
     voltage_magnitudes, mask = np.abs(np.real(np.asarray(voltages))), np.asarray(mask)
-    values = voltage_magnitudes[mask & (voltage_magnitudes > 0)]
-    if len(values) < _MIN_VOLTAGES_FOR_ROUNDING_STEP:
+    positive_magnitudes = voltage_magnitudes[mask & (voltage_magnitudes > 0)]
+    if len(positive_magnitudes) < _MIN_VOLTAGES_FOR_ROUNDING_STEP:
         return np.zeros(len(voltage_magnitudes))
-    magnitudes = np.where(mask, np.maximum(voltage_magnitudes, values.min()), values.min())
-    steps = [
-        10.0 ** (np.floor(np.log10(magnitudes) + _RELATIVE_STEP_ACCURACY) - digits)
-        for digits in range(_MAX_SIGNIFICANT_DIGITS)
+    bounded_magnitudes = np.where(
+        mask, np.maximum(voltage_magnitudes, positive_magnitudes.min()), positive_magnitudes.min()
+    )
+    candidate_steps = [
+        10.0 ** (np.floor(np.log10(bounded_magnitudes) + _RELATIVE_STEP_ACCURACY) - num_digits)
+        for num_digits in range(_MAX_SIGNIFICANT_DIGITS)
     ]
-    gaps = np.diff(np.unique(np.append(0, values)))
-    smallest_gap = gaps[gaps > _RELATIVE_STEP_ACCURACY * values.max()].min()
-    steps += [np.full(len(voltage_magnitudes), smallest_gap / divisor) for divisor in (1, 2, 3)]
-    candidates = [step for step in steps if _are_multiples(voltage_magnitudes[mask], step[mask])]
+    value_gaps = np.diff(np.unique(np.append(0, positive_magnitudes)))
+    smallest_gap = value_gaps[value_gaps > _RELATIVE_STEP_ACCURACY * positive_magnitudes.max()].min()
+    candidate_steps += [np.full(len(voltage_magnitudes), smallest_gap / gap_divisor) for gap_divisor in (1, 2, 3)]
+    matching_steps = [
+        candidate_step
+        for candidate_step in candidate_steps
+        if _are_multiples(voltage_magnitudes[mask], candidate_step[mask])
+    ]
     coarsest_step = max(
-        candidates, key=lambda step: float(np.log(step[mask]).sum()), default=np.zeros(len(voltage_magnitudes))
+        matching_steps,
+        key=lambda candidate_step: float(np.log(candidate_step[mask]).sum()),
+        default=np.zeros(len(voltage_magnitudes)),
     )
     return coarsest_step / np.sqrt(12)
 
 
-def _are_multiples(values: np.ndarray, step: np.ndarray) -> bool:
+def _are_multiples(voltage_magnitudes: np.ndarray, rounding_step: np.ndarray) -> bool:
     """Whether each value is a multiple of its step, with a quotient of at most `_MAX_SIGNIFICANT_DIGITS` digits."""
-    quotients = values / step
-    remainders = np.abs(quotients - np.round(quotients))
+    step_quotients = voltage_magnitudes / rounding_step
+    step_remainders = np.abs(step_quotients - np.round(step_quotients))
     return bool(
-        (quotients < 10**_MAX_SIGNIFICANT_DIGITS).all()
-        and (remainders <= _RELATIVE_STEP_ACCURACY * np.maximum(quotients, 1)).all()
+        (step_quotients < 10**_MAX_SIGNIFICANT_DIGITS).all()
+        and (step_remainders <= _RELATIVE_STEP_ACCURACY * np.maximum(step_quotients, 1)).all()
     )
 
 
-def _asymmetry(
-    measurement: Measurement, deviation: np.ndarray | None = None
+def _transfer_asymmetry(
+    measurement: Measurement, voltage_deviation: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Asymmetry of the matrix T of transfer between drives (`reciprocity_error`). Returns the entries of T - Tᵀ
-    (watts), their standard deviation for noise of the given `deviation` (default: one volt per channel), and the
-    entries of T with its diagonal, to which the asymmetry is compared. The entries of T are divided by their noise if
-    `deviation` is specified.
+    (watts), their standard deviation for noise of the given `voltage_deviation` (default: one volt per channel), and
+    the entries of T with its diagonal, to which the asymmetry is compared. The entries of T are divided by their noise
+    if `voltage_deviation` is specified.
 
     The diagonal is included because for the optimal currents of `jeit.protocol.optimal` a change of the body alters
     only the diagonal.
@@ -307,37 +321,45 @@ def _asymmetry(
     protocol = measurement.protocol
     frames = np.unique(np.linspace(0, measurement.num_frames - 1, _MAX_ASSESSED_FRAMES).round().astype(int))
     voltages = np.nan_to_num(np.asarray(measurement.voltages)[frames])
-    masks = np.asarray(measurement.mask)[frames]
+    frame_masks = np.asarray(measurement.mask)[frames]
 
     mask_results = []
-    for mask in np.unique(masks, axis=0):
-        transfer, is_known, gain = transfer_between_drives(
+    for frame_mask in np.unique(frame_masks, axis=0):
+        drive_transfer, is_known, noise_gain = transfer_between_drives(
             np.asarray(protocol.drive),
             np.asarray(protocol.measurement),
             np.asarray(protocol.drive_index),
             np.asarray(protocol.measurement_index),
-            voltages[np.all(masks == mask, axis=1)],
-            mask,
-            deviation,
+            voltages[np.all(frame_masks == frame_mask, axis=1)],
+            frame_mask,
+            voltage_deviation,
         )
-        row, column = np.nonzero(np.triu(is_known & is_known.T, k=1))
-        upper_entries, lower_entries = transfer[:, row, column], transfer[:, column, row]
-        noise = np.hypot(gain[row, column], gain[column, row])
-        size = np.sqrt((np.abs(upper_entries) ** 2 + np.abs(lower_entries) ** 2) / 2)
+        first_drives, second_drives = np.nonzero(np.triu(is_known & is_known.T, k=1))
+        upper_entries, lower_entries = (
+            drive_transfer[:, first_drives, second_drives],
+            drive_transfer[:, second_drives, first_drives],
+        )
+        noise = np.hypot(noise_gain[first_drives, second_drives], noise_gain[second_drives, first_drives])
+        entry_sizes = np.sqrt((np.abs(upper_entries) ** 2 + np.abs(lower_entries) ** 2) / 2)
         diagonal_drives = np.flatnonzero(np.diag(is_known))
         # In ‖T‖² a diagonal entry counts once; a pair of off-diagonal entries, which is one entry here, counts twice.
-        diagonal = np.abs(transfer[:, diagonal_drives, diagonal_drives]) / np.sqrt(2)
-        if deviation is not None:
-            size, diagonal = size / noise, diagonal / (np.sqrt(2) * gain[diagonal_drives, diagonal_drives])
+        diagonal_entries = np.abs(drive_transfer[:, diagonal_drives, diagonal_drives]) / np.sqrt(2)
+        if voltage_deviation is not None:
+            entry_sizes, diagonal_entries = (
+                entry_sizes / noise,
+                diagonal_entries / (np.sqrt(2) * noise_gain[diagonal_drives, diagonal_drives]),
+            )
         mask_results.append(
             (
                 upper_entries - lower_entries,
                 np.broadcast_to(noise, upper_entries.shape),
-                np.concatenate([size, diagonal], axis=1),
+                np.concatenate([entry_sizes, diagonal_entries], axis=1),
             )
         )
-    error, noise, signal = (np.concatenate([arrays[k].ravel() for arrays in mask_results]) for k in range(3))
-    return error, noise, signal
+    error, noise, signal_entries = (
+        np.concatenate([result_arrays[k].ravel() for result_arrays in mask_results]) for k in range(3)
+    )
+    return error, noise, signal_entries
 
 
 def _robust_deviation(values: np.ndarray) -> float:
@@ -355,14 +377,18 @@ _MAX_CHANCE_DIFFERENCE = 0.01
 def describe_electrode_order(measurement: Measurement) -> str | None:
     """A sentence that reports that electrodes are not numbered in their order along the edge; None if they are, or if
     they do not lie on an edge."""
-    order = boundary_order(measurement)
-    if order is None or len(order) < 4 or is_cyclic_sequence(order):
+    edge_order = boundary_order(measurement)
+    if edge_order is None or len(edge_order) < 4 or is_cyclic_sequence(edge_order):
         return None
-    electrode_list = ", ".join(str(number + 1) for number in _rotate_to_first(order)[:_MAX_LISTED_ELECTRODES])
-    ellipsis = " …" if len(order) > _MAX_LISTED_ELECTRODES else ""
-    order_text = f"going round the edge, the positions of the electrodes come in the order {electrode_list}{ellipsis}"
+    electrode_list = ", ".join(
+        str(electrode_number + 1) for electrode_number in _rotate_to_first(edge_order)[:_MAX_LISTED_ELECTRODES]
+    )
+    ellipsis_text = " …" if len(edge_order) > _MAX_LISTED_ELECTRODES else ""
+    order_text = (
+        f"going round the edge, the positions of the electrodes come in the order {electrode_list}{ellipsis_text}"
+    )
     position_signs, number_signs = (
-        impossible_signs(measurement, electrode_order) for electrode_order in (order, np.arange(len(order)))
+        impossible_signs(measurement, electrode_order) for electrode_order in (edge_order, np.arange(len(edge_order)))
     )
     if (
         position_signs is None
@@ -382,14 +408,14 @@ def describe_electrode_order(measurement: Measurement) -> str | None:
 def is_cyclic_sequence(electrode_order: Int[np.ndarray, " L"]) -> bool:
     """Whether the electrode numbers in the cyclic `electrode_order` increase by one at every step, or decrease by
     one."""
-    steps = (np.roll(electrode_order, -1) - electrode_order) % len(electrode_order)
-    return bool((steps == 1).all() or (steps == len(electrode_order) - 1).all())
+    number_steps = (np.roll(electrode_order, -1) - electrode_order) % len(electrode_order)
+    return bool((number_steps == 1).all() or (number_steps == len(electrode_order) - 1).all())
 
 
 def _rotate_to_first(electrode_order: Int[np.ndarray, " L"]) -> Int[np.ndarray, " L"]:
     """The cyclic `electrode_order` of electrodes rotated to begin at the first electrode, in the direction in which
     most numbers increase."""
-    steps = (np.roll(electrode_order, -1) - electrode_order) % len(electrode_order)
-    if (steps == len(electrode_order) - 1).sum() > (steps == 1).sum():
+    number_steps = (np.roll(electrode_order, -1) - electrode_order) % len(electrode_order)
+    if (number_steps == len(electrode_order) - 1).sum() > (number_steps == 1).sum():
         electrode_order = electrode_order[::-1]
     return np.roll(electrode_order, -int(np.flatnonzero(electrode_order == 0)[0]))

@@ -39,15 +39,15 @@ class Format:
         """The module or class that reads files of this format; it defines `DESCRIPTION`, `recognises(path)` and
         `read(path)`."""
         module_name, _, class_name = self.reading.partition(".")
-        module = importlib.import_module(f"jeit.data.formats.{module_name}")
-        return getattr(module, class_name) if class_name else module
+        reader_module = importlib.import_module(f"jeit.data.formats.{module_name}")
+        return getattr(reader_module, class_name) if class_name else reader_module
 
     def recognises(self, path: Path) -> bool:
         """Whether a file is of this format, judged by its suffix and its content."""
         return path.suffix.lower() in self.endings and self.reader.recognises(path)
 
 
-_TABLES = (".csv", ".txt", ".dat", ".npy", ".npz")
+_TABLE_SUFFIXES = (".csv", ".txt", ".dat", ".npy", ".npz")
 # A file is read by the first format that recognises it. To add a format, write a class like Kit4 in kuopio.py, or a
 # module like table.py, and list it here.
 FORMATS: dict[str, Format] = {
@@ -70,7 +70,7 @@ FORMATS: dict[str, Format] = {
         own_protocol=True,
     ),
     "openeit": Format("boards.OpenEit", (".txt", ".csv", ".dat", ".log", ".bin"), described=True, borrows=True),
-    "table": Format("table", _TABLES, described=True, borrows=True),
+    "table": Format("table", _TABLE_SUFFIXES, described=True, borrows=True),
     # A table with 208 rows of pairs of real and imaginary parts and a bundled description; used only if named
     # explicitly.
     "tank6cm": Format("table", (), bundled="tank6cm"),
@@ -83,7 +83,12 @@ def format_with_protocol(path: Path) -> str | None:
     if not path.is_file():
         return None
     return next(
-        (name for name, candidate in FORMATS.items() if candidate.own_protocol and candidate.recognises(path)), None
+        (
+            name
+            for name, candidate_format in FORMATS.items()
+            if candidate_format.own_protocol and candidate_format.recognises(path)
+        ),
+        None,
     )
 
 
@@ -120,38 +125,48 @@ def read(
     """
     file = Path(path)
     if file.is_dir():
-        sciospec = FORMATS["sciospec"]
-        members = sorted(member for member in file.iterdir() if member.is_file() and sciospec.recognises(member))
-        if not members or format not in (None, "sciospec"):
+        sciospec_format = FORMATS["sciospec"]
+        sciospec_files = sorted(
+            folder_member
+            for folder_member in file.iterdir()
+            if folder_member.is_file() and sciospec_format.recognises(folder_member)
+        )
+        if not sciospec_files or format not in (None, "sciospec"):
             raise ValueError(f"{file} is a folder. Give one data file in it.")
-        check_memory(file.name, _MEMORY_PER_FILE_BYTE * sum(member.stat().st_size for member in members))
-        return replace(sciospec.reader.read_recordings(members, description), name=file.name, source=str(file))
+        check_memory(
+            file.name, _MEMORY_PER_FILE_BYTE * sum(folder_member.stat().st_size for folder_member in sciospec_files)
+        )
+        return replace(
+            sciospec_format.reader.read_recordings(sciospec_files, description), name=file.name, source=str(file)
+        )
     if not file.is_file():
         raise ValueError(f"path: there is no file {file}. Check the name and the working directory.")
     if file.stat().st_size == 0:
         raise ValueError(f"{file.name} is empty.")
-    name = _recognise(file, description, like) if format is None else format
+    name = _recognise_format(file, description, like) if format is None else format
     check_name("format", name, FORMATS)
     file_format = FORMATS[name]
-    reader = file_format.reader
+    format_reader = file_format.reader
     if file_format.borrows:
-        return reader.read(file, description=description, like=like, key=key)
+        return format_reader.read(file, description=description, like=like, key=key)
     if key is not None:
         raise ValueError(f"key: files of format '{name}' have no choice of arrays; leave it out.")
     if file_format.described:
-        return reader.read(file, description=description)
+        return format_reader.read(file, description=description)
     if description is not None:
         raise ValueError(f"Format '{name}' describes itself; tables and files of instruments take a description.")
-    return reader.read(file, description=file_format.bundled) if file_format.bundled else reader.read(file)
+    return (
+        format_reader.read(file, description=file_format.bundled) if file_format.bundled else format_reader.read(file)
+    )
 
 
-def _recognise(file: Path, description: str | Path | None, like: Measurement | None) -> str:
+def _recognise_format(file: Path, description: str | Path | None, similar_measurement: Measurement | None) -> str:
     """Return the name of the format of a file. If the file has no known format, raises `ValueError` that states what
     the file probably is."""
-    has_description = description is not None or like is not None
-    for name, candidate in FORMATS.items():
-        if candidate.recognises(file):
-            if name == "table" and not has_description and candidate.reader.find_description(file) is None:
+    has_description = description is not None or similar_measurement is not None
+    for name, candidate_format in FORMATS.items():
+        if candidate_format.recognises(file):
+            if name == "table" and not has_description and candidate_format.reader.find_description(file) is None:
                 _check_signature(file)
             return name
     _check_signature(file)
@@ -162,35 +177,41 @@ def _recognise(file: Path, description: str | Path | None, like: Measurement | N
 
         if has_description or eidors.find_description(file) is not None:
             return "eidors"
-        names = matlab.variable_names(file)
-        for reader in (Kit4, Ktc2023):
+        variable_names = matlab.variable_names(file)
+        for kuopio_reader in (Kit4, Ktc2023):
             missing_variables = [
-                min(kind - names, key=len) for kind in reader.VARIABLES if len(kind & names) == len(kind) - 1
+                min(variable_set - variable_names, key=len)
+                for variable_set in kuopio_reader.VARIABLES
+                if len(variable_set & variable_names) == len(variable_set) - 1
             ]
             if missing_variables:
                 raise ValueError(
-                    f"{file.name} looks like {reader.DESCRIPTION}, but lacks the variable {missing_variables[0]}: add "
-                    "it, or put a description beside the file."
+                    f"{file.name} looks like {kuopio_reader.DESCRIPTION}, but lacks the variable "
+                    f"{missing_variables[0]}: add it, or put a description beside the file."
                 )
-        listed_names = names_text(sorted(names))
+        listed_names = names_text(sorted(variable_names))
         raise ValueError(
             f"{file.name} is a .mat file of no known kind; it holds {listed_names}. `jeit describe {file.name}` finds "
             f"out what it can, and writes a description. Known: {Kit4.DESCRIPTION}; {Ktc2023.DESCRIPTION}; "
             f"{eidors.DESCRIPTION}."
         )
     file_suffix = file.suffix.lower()
-    if known_formats := [name for name, candidate in FORMATS.items() if file_suffix in candidate.endings]:
+    if known_formats := [name for name, candidate_format in FORMATS.items() if file_suffix in candidate_format.endings]:
         raise ValueError(
             f"{file.name}: its content is that of no known kind of file ending in '{file_suffix}' "
             f"({', '.join(known_formats)}). Is its start damaged, or is it of another program?"
         )
     with file.open("rb") as file_object:
-        head = file_object.read(_HEAD_BYTES)
+        head_bytes = file_object.read(_NUM_HEAD_BYTES)
     program_hint = next(
-        (f" It is {explanation}." for signature, explanation in _OTHER_PROGRAMS.items() if head.startswith(signature)),
+        (
+            f" It is {program_explanation}."
+            for program_signature, program_explanation in _OTHER_PROGRAMS.items()
+            if head_bytes.startswith(program_signature)
+        ),
         "",
     )
-    if not program_hint and _is_text(head):
+    if not program_hint and _is_text(head_bytes):
         program_hint = f" It is text: if it is a table of numbers, name it {file.stem[:40]}.txt."
     raise ValueError(
         f"{file.name}: files ending in '{file.suffix}' are of no known format.{program_hint} Known: "
@@ -198,7 +219,7 @@ def _recognise(file: Path, description: str | Path | None, like: Measurement | N
     )
 
 
-_HEAD_BYTES = 65536
+_NUM_HEAD_BYTES = 65536
 # For each format, a regular expression that recognises damaged files and files with a wrong suffix.
 _FORMAT_SIGNATURES = {
     "draeger": rb"Draeger EIT-Software|Framerate \[Hz\]:",
@@ -221,22 +242,22 @@ def _check_signature(file: Path) -> None:
     """Raise `ValueError` if a file that no format recognises has the signature (`_FORMAT_SIGNATURES`) of a format; the
     message states what is damaged, or that the suffix is wrong."""
     with file.open("rb") as file_object:
-        head = file_object.read(_HEAD_BYTES)
-    for name, signature in _FORMAT_SIGNATURES.items():
-        if not re.search(signature, head):
+        head_bytes = file_object.read(_NUM_HEAD_BYTES)
+    for name, format_signature in _FORMAT_SIGNATURES.items():
+        if not re.search(format_signature, head_bytes):
             continue
-        reader, known_suffixes = FORMATS[name].reader, FORMATS[name].endings
+        format_reader, known_suffixes = FORMATS[name].reader, FORMATS[name].endings
         try:
-            reader.read(file)
+            format_reader.read(file)
         except ValueError as error:
             raise ValueError(
-                f"{file.name} looks like a file of {name} ({reader.DESCRIPTION}), but is damaged or of a version that "
-                f"is not known: {str(error).removeprefix(file.name).lstrip(':, ')}"
+                f"{file.name} looks like a file of {name} ({format_reader.DESCRIPTION}), but is damaged or of a "
+                f"version that is not known: {str(error).removeprefix(file.name).lstrip(':, ')}"
             ) from None
         if file.suffix.lower() not in known_suffixes:
             raise ValueError(
-                f"{file.name} is a file of {name} ({reader.DESCRIPTION}), which end in {names_text(known_suffixes)}: "
-                f"rename it, or give format='{name}' (--format {name})."
+                f"{file.name} is a file of {name} ({format_reader.DESCRIPTION}), which end in "
+                f"{names_text(known_suffixes)}: rename it, or give format='{name}' (--format {name})."
             )
 
 

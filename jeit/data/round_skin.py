@@ -56,8 +56,8 @@ class RoundSkin(Module):
 
     def electrodes(self) -> BoundaryElectrodes:
         """The electrodes of the skin; electrode 1 is at 12 o'clock, and the other electrodes follow clockwise."""
-        position = ring(self.radius, self.num_electrodes, clockwise=True)
-        return BoundaryElectrodes(position, self.electrode_width, self.contact_impedance)
+        electrode_positions = ring(self.radius, self.num_electrodes, clockwise=True)
+        return BoundaryElectrodes(electrode_positions, self.electrode_width, self.contact_impedance)
 
 
 @numpy_or_compiled
@@ -72,8 +72,8 @@ def pressed_conductivity(
     conductivity is assumed to increase with pressure.
     """
     xp = namespace(points, position)
-    squared = xp.sum((points - xp.asarray(position)) ** 2, axis=-1) / radius**2
-    return background * (1 + strength * xp.sqrt(xp.maximum(1 - squared, 0)))
+    squared_distances = xp.sum((points - xp.asarray(position)) ** 2, axis=-1) / radius**2
+    return background * (1 + strength * xp.sqrt(xp.maximum(1 - squared_distances, 0)))
 
 
 def simulate_press(
@@ -107,15 +107,15 @@ def simulate_press(
     ```
     """
     check_kind("skin", skin, RoundSkin, "a RoundSkin, such as RoundSkin(radius=0.05)")
-    centre = np.asarray(position, float)
-    if centre.shape != (2,) or not np.isfinite(centre).all():
+    press_centre = np.asarray(position, float)
+    if press_centre.shape != (2,) or not np.isfinite(press_centre).all():
         raise ValueError(f"position: give (x, y) in metres, not {position!r}.")
     if not (np.isfinite(radius) and radius > 0):
         raise ValueError(f"radius: the contact must be of positive size, in metres; it is {radius}.")
-    if np.hypot(*centre) + radius > skin.radius:
+    if np.hypot(*press_centre) + radius > skin.radius:
         raise ValueError(
-            f"position: a press at ({centre[0]:g}, {centre[1]:g}) m with a contact of radius {radius:g} m reaches "
-            f"beyond the skin, whose radius is {skin.radius:g} m. Positions are in metres from its centre."
+            f"position: a press at ({press_centre[0]:g}, {press_centre[1]:g}) m with a contact of radius {radius:g} m "
+            f"reaches beyond the skin, whose radius is {skin.radius:g} m. Positions are in metres from its centre."
         )
     if not (np.isfinite(strength) and strength > -1 and strength != 0):
         raise ValueError(f"strength: the relative change must be above -1 and not zero; it is {strength}.")
@@ -124,10 +124,10 @@ def simulate_press(
     check_key(key)
     model = skin.model()
     points = centroids(model.mesh)
-    pressed = pressed_conductivity(points, skin.conductivity, centre, radius, strength)
-    frames = np.stack([model.voltages(pressed), model.voltages(skin.conductivity)])
+    pressed_conductivities = pressed_conductivity(points, skin.conductivity, press_centre, radius, strength)
+    frames = np.stack([model.voltages(pressed_conductivities), model.voltages(skin.conductivity)])
     frames += noise * np.sqrt(np.mean(frames**2)) * np.asarray(jax.random.normal(key, frames.shape))
-    measured = screen(
+    screened_measurement = screen(
         frames,
         model.protocol,
         electrodes=model.electrodes,
@@ -137,4 +137,4 @@ def simulate_press(
         frame_names=("pressed", "reference"),
         notes=(f"simulated on a mesh of {model.mesh.num_points} nodes, with {noise:g} relative noise; not measured.",),
     )
-    return measured.frame("pressed"), measured.frame("reference")
+    return screened_measurement.frame("pressed"), screened_measurement.frame("reference")

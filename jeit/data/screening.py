@@ -85,65 +85,82 @@ def screen(
     ```
     """
     name = name.encode("utf-8", "backslashreplace").decode()  # the name of a file may not be valid text
-    values = _convert_to_frames(voltages, protocol, name)
-    usable = np.ones(values.shape, dtype=bool)
-    note_list = list(notes)
+    frame_values = _convert_to_frames(voltages, protocol, name)
+    usable_mask = np.ones(frame_values.shape, dtype=bool)
+    screening_notes = list(notes)
 
-    def exclude(is_bad: np.ndarray, reason: str) -> None:
-        num_masked = int((usable & is_bad).sum())
+    def exclude_channels(is_bad: np.ndarray, exclusion_reason: str) -> None:
+        num_masked = int((usable_mask & is_bad).sum())
         if num_masked:
-            usable[is_bad] = False
-            note_list.append(f"{num_masked} of {values.size} voltages masked: {reason}")
+            usable_mask[is_bad] = False
+            screening_notes.append(f"{num_masked} of {frame_values.size} voltages masked: {exclusion_reason}")
 
     if mask is not None:
-        mask_array = np.broadcast_to(np.asarray(mask), values.shape)
+        mask_array = np.broadcast_to(np.asarray(mask), frame_values.shape)
         if mask_array.dtype != bool:
             raise ValueError(f"mask is {mask_array.dtype}; give booleans, True where a voltage is usable.")
-        exclude(~mask_array, "excluded by the mask given.")
-    values = measurable_values(values)
-    is_missing = np.isnan(values)
-    exclude(is_missing, f"NaN, infinite or beyond any instrument{_describe_missing_electrodes(is_missing, protocol)}.")
-    is_dead = ~np.any(np.where(usable, values, 0) != 0, axis=1)
+        exclude_channels(~mask_array, "excluded by the mask given.")
+    frame_values = measurable_values(frame_values)
+    is_missing = np.isnan(frame_values)
+    exclude_channels(
+        is_missing, f"NaN, infinite or beyond any instrument{_describe_missing_electrodes(is_missing, protocol)}."
+    )
+    is_dead = ~np.any(np.where(usable_mask, frame_values, 0) != 0, axis=1)
     if is_dead.all():
         raise ValueError(
             f"{name}: every usable voltage is zero, NaN or missing; there is nothing measured in it. Was the "
             "instrument on, and is this the right variable or column?"
         )
-    exclude(
-        np.broadcast_to(is_dead[:, None], values.shape), f"all zero: {int(is_dead.sum())} of {len(is_dead)} frames."
+    exclude_channels(
+        np.broadcast_to(is_dead[:, None], frame_values.shape),
+        f"all zero: {int(is_dead.sum())} of {len(is_dead)} frames.",
     )
-    exclude(_find_saturated(values, usable, saturation), "saturated (stuck at an end of the instrument's range).")
-    is_dead, is_alive = _drives_without_and_with_current(values, usable, protocol)
-    exclude(is_dead[:, np.asarray(protocol.drive_index)], "their drive's current did not flow.")
-    is_driven, is_measured = (np.asarray(patterns) != 0 for patterns in (protocol.drive, protocol.channel_measurement))
-    unconnected = (is_dead @ is_driven) & ~(is_alive @ is_driven)
-    numbers = ", ".join(str(electrode + 1) for electrode in np.flatnonzero(unconnected.any(axis=0)))
-    connection_note = f"they read electrode {numbers}, through which no drive's current flowed: is it connected?"
-    exclude(unconnected @ is_measured.T, connection_note)
-    max_voltage = np.abs(values[usable]).max(initial=0)
+    exclude_channels(
+        _find_saturated(frame_values, usable_mask, saturation), "saturated (stuck at an end of the instrument's range)."
+    )
+    is_dead, is_alive = _drives_without_and_with_current(frame_values, usable_mask, protocol)
+    exclude_channels(is_dead[:, np.asarray(protocol.drive_index)], "their drive's current did not flow.")
+    is_driven, is_measured = (
+        np.asarray(pattern_matrix) != 0 for pattern_matrix in (protocol.drive, protocol.channel_measurement)
+    )
+    is_unconnected = (is_dead @ is_driven) & ~(is_alive @ is_driven)
+    electrode_numbers = ", ".join(str(electrode + 1) for electrode in np.flatnonzero(is_unconnected.any(axis=0)))
+    connection_note = (
+        f"they read electrode {electrode_numbers}, through which no drive's current flowed: is it connected?"
+    )
+    exclude_channels(is_unconnected @ is_measured.T, connection_note)
+    max_voltage = np.abs(frame_values[usable_mask]).max(initial=0)
     if max_voltage > _MAX_VOLTAGE:
-        note_list.append(f"the largest voltage is {max_voltage:.3g} V: are voltages in volts, and currents in amperes?")
-    if not usable.any():
-        raise ValueError(f"{name}: no usable voltage is left. {' '.join(note_list)}")
-    fields = {"electrodes": electrodes, "domain": domain, "name": name, "source": source, "frame_names": frame_names}
-    measurement = Measurement(values, usable, protocol, notes=tuple(note_list), **fields)
+        screening_notes.append(
+            f"the largest voltage is {max_voltage:.3g} V: are voltages in volts, and currents in amperes?"
+        )
+    if not usable_mask.any():
+        raise ValueError(f"{name}: no usable voltage is left. {' '.join(screening_notes)}")
+    measurement_fields = {
+        "electrodes": electrodes,
+        "domain": domain,
+        "name": name,
+        "source": source,
+        "frame_names": frame_names,
+    }
+    measurement = Measurement(frame_values, usable_mask, protocol, notes=tuple(screening_notes), **measurement_fields)
     order_text = describe_electrode_order(measurement)
     return measurement if order_text is None else replace(measurement, notes=(*measurement.notes, order_text))
 
 
-def _explain_number(number: int, channels: int) -> str:
-    """Text on what may be wrong if `number` numbers are not complete frames of `channels` voltages: missing lines, or a
-    different number of electrodes."""
-    if 0 < channels - number <= channels // 4:
-        return f" They are {number} numbers, {channels - number} fewer than a frame has: is a line missing?"
-    counts = {
-        electrodes * (electrodes - 3) // share: (electrodes, pair_text)
+def _explain_number(number: int, num_channels: int) -> str:
+    """Text on what may be wrong if `number` numbers are not complete frames of `num_channels` voltages: missing lines,
+    or a different number of electrodes."""
+    if 0 < num_channels - number <= num_channels // 4:
+        return f" They are {number} numbers, {num_channels - number} fewer than a frame has: is a line missing?"
+    likely_counts = {
+        electrodes * (electrodes - 3) // reciprocal_share: (electrodes, pair_text)
         for electrodes in range(64, 3, -1)
-        for share, pair_text in ((2, "half of the adjacent pairs"), (1, "adjacent pairs"))
+        for reciprocal_share, pair_text in ((2, "half of the adjacent pairs"), (1, "adjacent pairs"))
     } | {electrodes * (electrodes - 1) // 2: (electrodes, "all pairs") for electrodes in range(4, 65)}
-    if number not in counts:
+    if number not in likely_counts:
         return ""
-    electrodes, pair_text = counts[number]
+    electrodes, pair_text = likely_counts[number]
     return (
         f" {number} numbers are what {electrodes} electrodes give with {pair_text}: is the number of electrodes right?"
     )
@@ -152,84 +169,100 @@ def _explain_number(number: int, channels: int) -> str:
 def _describe_missing_electrodes(is_missing: Bool[np.ndarray, "F M"], protocol: Protocol) -> str:
     """Clause that names the electrodes without any usable channel in some frame, unless they are all; otherwise
     empty."""
-    touching = np.array([protocol.channels_touching(electrode) for electrode in range(protocol.num_electrodes)])
-    is_lost = [bool(channels.any()) and bool(is_missing[:, channels].all(axis=1).any()) for channels in touching]
+    touching_channels = np.array(
+        [protocol.channels_touching(electrode) for electrode in range(protocol.num_electrodes)]
+    )
+    is_lost = [
+        bool(electrode_channels.any()) and bool(is_missing[:, electrode_channels].all(axis=1).any())
+        for electrode_channels in touching_channels
+    ]
     if not any(is_lost) or all(is_lost):
         return ""
-    numbers = ", ".join(str(electrode + 1) for electrode in np.flatnonzero(is_lost))
-    return f", among them all of electrode{'s' * (sum(is_lost) > 1)} {numbers}: check the connection"
+    electrode_numbers = ", ".join(str(electrode + 1) for electrode in np.flatnonzero(is_lost))
+    return f", among them all of electrode{'s' * (sum(is_lost) > 1)} {electrode_numbers}: check the connection"
 
 
 def _convert_to_frames(voltages, protocol: Protocol, name: str) -> np.ndarray:
-    values = np.asarray(voltages)
-    if values.dtype.kind not in "fiuc":
-        raise ValueError(f"{name}: voltages are {values.dtype}; they must be numbers, in volts.")
-    values = np.atleast_2d(values.astype(complex if values.dtype.kind == "c" else float))
+    frame_values = np.asarray(voltages)
+    if frame_values.dtype.kind not in "fiuc":
+        raise ValueError(f"{name}: voltages are {frame_values.dtype}; they must be numbers, in volts.")
+    frame_values = np.atleast_2d(frame_values.astype(complex if frame_values.dtype.kind == "c" else float))
     num_channels = protocol.num_measurements
-    if values.ndim != 2 or values.shape[0] == 0 or values.shape[1] != num_channels:
-        shape_hint = " It looks transposed: give one row per frame." if values.shape[0] == num_channels else ""
-        if values.ndim == 2 and 0 < (num_extra_columns := values.shape[1] - num_channels) <= _MAX_EXTRA_COLUMNS:
+    if frame_values.ndim != 2 or frame_values.shape[0] == 0 or frame_values.shape[1] != num_channels:
+        shape_hint = " It looks transposed: give one row per frame." if frame_values.shape[0] == num_channels else ""
+        if (
+            frame_values.ndim == 2
+            and 0 < (num_extra_columns := frame_values.shape[1] - num_channels) <= _MAX_EXTRA_COLUMNS
+        ):
             shape_hint = (
                 f" There are {num_extra_columns} too many: are there times, counters or states among them? Leave them "
                 "out."
             )
-        shape_hint = shape_hint or _explain_number(values.size, num_channels)
+        shape_hint = shape_hint or _explain_number(frame_values.size, num_channels)
         raise ValueError(
-            f"{name}: the data have shape {values.shape}, but the protocol '{protocol.name}' has {num_channels} "
+            f"{name}: the data have shape {frame_values.shape}, but the protocol '{protocol.name}' has {num_channels} "
             f"channels, so (frames, {num_channels}) is needed.{shape_hint} Or describe the protocol that the data "
             "were measured with."
         )
-    return values
+    return frame_values
 
 
-def _find_saturated(values: np.ndarray, usable: np.ndarray, saturation: float | None) -> Bool[np.ndarray, "F M"]:
-    if saturation is not None:
-        if not np.isfinite(saturation) or saturation <= 0:
-            raise ValueError(f"saturation must be a positive voltage in volts; got {saturation!r}.")
+def _find_saturated(
+    frame_values: np.ndarray, usable_mask: np.ndarray, saturation_level: float | None
+) -> Bool[np.ndarray, "F M"]:
+    if saturation_level is not None:
+        if not np.isfinite(saturation_level) or saturation_level <= 0:
+            raise ValueError(f"saturation must be a positive voltage in volts; got {saturation_level!r}.")
         with np.errstate(invalid="ignore"):
-            return np.abs(values) >= saturation * (1 - 1e-9)
-    result = np.zeros(values.shape, dtype=bool)
-    real_components = [np.real(values), np.imag(values)] if np.iscomplexobj(values) else [values]
-    for component in real_components:
-        usable_values = np.where(usable, component, np.nan)
-        repeated = _is_minimum_repeated(usable_values) | _is_minimum_repeated(-usable_values)
-        for frame in np.flatnonzero(repeated & (usable.sum(axis=1) >= 8)):
-            row, row_usable = component[frame], usable[frame]
-            levels, level_index, counts = np.unique(row[row_usable], return_inverse=True, return_counts=True)
-            for extreme_index in (0, len(levels) - 1):
+            return np.abs(frame_values) >= saturation_level * (1 - 1e-9)
+    is_saturated = np.zeros(frame_values.shape, dtype=bool)
+    real_components = (
+        [np.real(frame_values), np.imag(frame_values)] if np.iscomplexobj(frame_values) else [frame_values]
+    )
+    for real_component in real_components:
+        usable_values = np.where(usable_mask, real_component, np.nan)
+        is_repeated = _is_minimum_repeated(usable_values) | _is_minimum_repeated(-usable_values)
+        for frame in np.flatnonzero(is_repeated & (usable_mask.sum(axis=1) >= 8)):
+            frame_row, is_usable_in_row = real_component[frame], usable_mask[frame]
+            distinct_levels, level_of_value, level_counts = np.unique(
+                frame_row[is_usable_in_row], return_inverse=True, return_counts=True
+            )
+            for extreme_index in (0, len(distinct_levels) - 1):
                 # A coarse converter or a simulated symmetric body also produces exactly equal extremes, but then values
                 # between them repeat as often; in saturated data only the extreme value repeats.
-                other_counts = np.delete(counts, [0, len(levels) - 1]) if len(levels) > 2 else np.zeros(1)
+                counts_of_other_levels = (
+                    np.delete(level_counts, [0, len(distinct_levels) - 1]) if len(distinct_levels) > 2 else np.zeros(1)
+                )
                 if (
-                    levels[extreme_index] != 0
-                    and counts[extreme_index] >= _MIN_EQUAL_SATURATED_VALUES
-                    and counts[extreme_index] >= 4 * other_counts.max(initial=0)
+                    distinct_levels[extreme_index] != 0
+                    and level_counts[extreme_index] >= _MIN_EQUAL_SATURATED_VALUES
+                    and level_counts[extreme_index] >= 4 * counts_of_other_levels.max(initial=0)
                 ):
-                    result[frame, np.flatnonzero(row_usable)[level_index == extreme_index]] = True
-    return result
+                    is_saturated[frame, np.flatnonzero(is_usable_in_row)[level_of_value == extreme_index]] = True
+    return is_saturated
 
 
-def _is_minimum_repeated(rows: np.ndarray) -> Bool[np.ndarray, " F"]:
+def _is_minimum_repeated(value_rows: np.ndarray) -> Bool[np.ndarray, " F"]:
     """Whether at least `_MIN_EQUAL_SATURATED_VALUES` values of a row equal its minimum. NaN is left out."""
-    if rows.shape[1] < _MIN_EQUAL_SATURATED_VALUES:
-        return np.zeros(len(rows), bool)
-    smallest_values = np.partition(rows, _MIN_EQUAL_SATURATED_VALUES - 1, axis=1)[:, :_MIN_EQUAL_SATURATED_VALUES]
+    if value_rows.shape[1] < _MIN_EQUAL_SATURATED_VALUES:
+        return np.zeros(len(value_rows), bool)
+    smallest_values = np.partition(value_rows, _MIN_EQUAL_SATURATED_VALUES - 1, axis=1)[:, :_MIN_EQUAL_SATURATED_VALUES]
     return smallest_values.min(axis=1) == smallest_values.max(axis=1)
 
 
 def _drives_without_and_with_current(
-    values: np.ndarray, usable: np.ndarray, protocol: Protocol
+    frame_values: np.ndarray, usable_mask: np.ndarray, protocol: Protocol
 ) -> tuple[Bool[np.ndarray, "F S"], Bool[np.ndarray, "F S"]]:
     """Masks (frames, drives) of the drives without current, whose voltages are a thousand times smaller than the
     voltages of the median drive, and of the drives with current. Both masks are False for drives without a usable
     voltage."""
     drive_indices = np.asarray(protocol.drive_index)
-    max_magnitudes = np.full((values.shape[0], protocol.num_drives), -1.0)
-    np.maximum.at(max_magnitudes.T, drive_indices, np.where(usable, np.abs(values), -1.0).T)
+    max_magnitudes = np.full((frame_values.shape[0], protocol.num_drives), -1.0)
+    np.maximum.at(max_magnitudes.T, drive_indices, np.where(usable_mask, np.abs(frame_values), -1.0).T)
     if protocol.num_drives < 3:
         return np.zeros(max_magnitudes.shape, dtype=bool), max_magnitudes >= 0
-    threshold = 1e-3 * np.median(np.maximum(max_magnitudes, 0), axis=1, keepdims=True)
-    return (max_magnitudes >= 0) & (max_magnitudes < threshold), max_magnitudes >= threshold
+    dead_threshold = 1e-3 * np.median(np.maximum(max_magnitudes, 0), axis=1, keepdims=True)
+    return (max_magnitudes >= 0) & (max_magnitudes < dead_threshold), max_magnitudes >= dead_threshold
 
 
 def mask_spikes(measurement: Measurement, reference: Measurement, *, fill: bool = False) -> Measurement:
@@ -255,125 +288,149 @@ def mask_spikes(measurement: Measurement, reference: Measurement, *, fill: bool 
     clean = mask_spikes(pressed, rest)
     ```
     """
-    mean = reference.mean_frame()
-    base_voltages, known_channels = np.asarray(mean.voltages)[0], np.asarray(mean.mask)[0]
-    weight = np.asarray(
+    mean_reference = reference.mean_frame()
+    base_voltages, known_channels = np.asarray(mean_reference.voltages)[0], np.asarray(mean_reference.mask)[0]
+    channel_deviations = np.asarray(
         relative_noise(as_array(np.abs(np.where(known_channels, base_voltages, 0))), as_array(known_channels))
     )
-    voltages, masks = np.array(measurement.voltages), np.asarray(measurement.mask)
-    spikes, is_filled_frame_channel = np.zeros(masks.shape, bool), np.zeros(masks.shape, bool)
+    voltages, frame_masks = np.array(measurement.voltages), np.asarray(measurement.mask)
+    is_spike_channel, is_filled_frame_channel = np.zeros(frame_masks.shape, bool), np.zeros(frame_masks.shape, bool)
     distinct_masks, mask_index, num_frames = np.unique(
-        masks & known_channels, axis=0, return_inverse=True, return_counts=True
+        frame_masks & known_channels, axis=0, return_inverse=True, return_counts=True
     )
     for pattern_index in np.argsort(-num_frames)[:_MAX_DISTINCT_MASKS]:
-        mask = distinct_masks[pattern_index]
-        basis = _possible_changes(measurement, weight, mask)
-        if basis is None:
+        frame_mask = distinct_masks[pattern_index]
+        change_basis = _possible_changes(measurement, channel_deviations, frame_mask)
+        if change_basis is None:
             continue
         for frame in np.flatnonzero(mask_index.ravel() == pattern_index):
-            change = ((voltages[frame] - base_voltages) / weight)[mask]
-            rounding_errors = rounding_of_difference(measurement.frame(int(frame)), mean) / weight
-            is_spike = np.isin(np.arange(len(change)), _find_spikes(change, basis, rounding_errors[mask]))
-            spikes[frame, mask] = is_spike
+            weighted_change = ((voltages[frame] - base_voltages) / channel_deviations)[frame_mask]
+            rounding_errors = rounding_of_difference(measurement.frame(int(frame)), mean_reference) / channel_deviations
+            is_spike = np.isin(
+                np.arange(len(weighted_change)),
+                _find_spikes(weighted_change, change_basis, rounding_errors[frame_mask]),
+            )
+            is_spike_channel[frame, frame_mask] = is_spike
             if fill and is_spike.any():
                 # A channel is determined by the other channels if their rows of the basis span its row.
-                weights = basis[is_spike] @ np.linalg.pinv(basis[~is_spike])
+                spike_predictors = change_basis[is_spike] @ np.linalg.pinv(change_basis[~is_spike])
                 is_determined = (
-                    np.linalg.norm(weights @ basis[~is_spike] - basis[is_spike], axis=1) < _MIN_UNDETERMINED_SHARE
+                    np.linalg.norm(spike_predictors @ change_basis[~is_spike] - change_basis[is_spike], axis=1)
+                    < _MIN_UNDETERMINED_SHARE
                 )
-                determined_channels = np.flatnonzero(mask)[is_spike][is_determined]
+                determined_channels = np.flatnonzero(frame_mask)[is_spike][is_determined]
                 voltages[frame, determined_channels] = (
                     base_voltages[determined_channels]
-                    + weight[determined_channels] * (weights @ change[~is_spike])[is_determined]
+                    + channel_deviations[determined_channels]
+                    * (spike_predictors @ weighted_change[~is_spike])[is_determined]
                 )
                 is_filled_frame_channel[frame, determined_channels] = True
-    reason = f"spikes, which contradict the other channels ({_listed_spikes(spikes)})."
+    spike_reason = f"spikes, which contradict the other channels ({_listed_spikes(is_spike_channel)})."
     if is_filled_frame_channel.any():
         spike_note = (
-            f"{counted(int(is_filled_frame_channel.sum()), 'voltage')} replaced by what others determine: {reason}"
+            f"{counted(int(is_filled_frame_channel.sum()), 'voltage')} replaced by what others determine: "
+            f"{spike_reason}"
         )
         measurement = replace(measurement, voltages=voltages, notes=(*measurement.notes, spike_note))
     return (
-        measurement.masked(~spikes | is_filled_frame_channel, reason)
-        if (spikes & ~is_filled_frame_channel).any()
+        measurement.masked(~is_spike_channel | is_filled_frame_channel, spike_reason)
+        if (is_spike_channel & ~is_filled_frame_channel).any()
         else measurement
     )
 
 
-def _listed_spikes(spikes: Bool[np.ndarray, "F M"]) -> str:
+def _listed_spikes(is_spike_channel: Bool[np.ndarray, "F M"]) -> str:
     """Text that lists the channels with spikes, and their frames if there are several frames."""
-    frames, channels = np.nonzero(spikes)
-    labels = [
-        f"channel {k + 1}" + (f" of frame {f}" if len(spikes) > 1 else "")
-        for f, k in zip(frames, channels, strict=True)
+    frames, spike_channels = np.nonzero(is_spike_channel)
+    spike_labels = [
+        f"channel {k + 1}" + (f" of frame {f}" if len(is_spike_channel) > 1 else "")
+        for f, k in zip(frames, spike_channels, strict=True)
     ]
-    return ", ".join(labels[:_MAX_SPIKES]) + (" …" if len(labels) > _MAX_SPIKES else "")
+    return ", ".join(spike_labels[:_MAX_SPIKES]) + (" …" if len(spike_labels) > _MAX_SPIKES else "")
 
 
 def _possible_changes(
-    measurement: Measurement, weight: Float[np.ndarray, " M"], mask: Bool[np.ndarray, " M"]
+    measurement: Measurement, channel_deviations: Float[np.ndarray, " M"], frame_mask: Bool[np.ndarray, " M"]
 ) -> Float[np.ndarray, "n r"] | None:
-    """Orthonormal basis (n, r) of the r-dimensional space of changes of the n usable channels, divided by `weight`,
-    that a change of a symmetric transfer impedance can cause. None if every change is possible, or if the computation
-    would take too long."""
-    drive = np.asarray(measurement.protocol.channel_drive)[mask]
-    measurements = np.asarray(measurement.protocol.channel_measurement)[mask]
-    row, column = np.triu_indices(drive.shape[1])
-    if len(drive) * len(row) * min(len(drive), len(row)) > _MAX_OPERATIONS or not len(drive):
+    """Orthonormal basis (n, r) of the r-dimensional space of changes of the n usable channels, divided by
+    `channel_deviations`, that a change of a symmetric transfer impedance can cause. None if every change is possible,
+    or if the computation would take too long."""
+    channel_drives = np.asarray(measurement.protocol.channel_drive)[frame_mask]
+    measurements = np.asarray(measurement.protocol.channel_measurement)[frame_mask]
+    row_indices, column_indices = np.triu_indices(channel_drives.shape[1])
+    if len(channel_drives) * len(row_indices) * min(len(channel_drives), len(row_indices)) > _MAX_OPERATIONS or not len(
+        channel_drives
+    ):
         return None
-    drive = drive / np.abs(drive).max()
-    drive_measurement_products = drive[:, row] * measurements[:, column] + drive[:, column] * measurements[:, row]
-    basis, size, _ = np.linalg.svd(drive_measurement_products / weight[mask, None], full_matrices=False)
-    basis = basis[:, size > 1e-9 * size[0]]
-    return basis if basis.shape[1] < len(drive) else None
+    channel_drives = channel_drives / np.abs(channel_drives).max()
+    drive_measurement_products = (
+        channel_drives[:, row_indices] * measurements[:, column_indices]
+        + channel_drives[:, column_indices] * measurements[:, row_indices]
+    )
+    change_basis, singular_values, _ = np.linalg.svd(
+        drive_measurement_products / channel_deviations[frame_mask, None], full_matrices=False
+    )
+    change_basis = change_basis[:, singular_values > 1e-9 * singular_values[0]]
+    return change_basis if change_basis.shape[1] < len(channel_drives) else None
 
 
 def _find_spikes(
-    change: Inexact[np.ndarray, " n"], basis: Float[np.ndarray, "n r"], rounding_errors: Float[np.ndarray, " n"]
+    weighted_change: Inexact[np.ndarray, " n"],
+    change_basis: Float[np.ndarray, "n r"],
+    rounding_errors: Float[np.ndarray, " n"],
 ) -> list[int]:
-    """Indices of the channels with spikes in a weighted `change` (n,) of n channels; `rounding_errors` (n,): standard
-    deviation of the change due to rounding.
+    """Indices of the channels with spikes in a `weighted_change` (n,) of n channels; `rounding_errors` (n,):
+    standard deviation of the change due to rounding.
 
     If a suspected channel may have any value, its unit vector is added to the basis. The power that this vector
     explains, `gain`, is compared with the power that the basis alone leaves unexplained.
     """
-    residual, undetermined_share = change - basis @ (basis.T @ change), 1 - np.sum(basis**2, axis=1)
-    is_remaining_channel, faulty_channels, spikes = np.ones(len(change), bool), [], []
+    change_residual, undetermined_share = (
+        weighted_change - change_basis @ (change_basis.T @ weighted_change),
+        1 - np.sum(change_basis**2, axis=1),
+    )
+    is_remaining_channel, faulty_channels, spike_channels = np.ones(len(weighted_change), bool), [], []
     for _ in range(_MAX_SPIKES):
         is_predicted_by_others = is_remaining_channel & (undetermined_share > _MIN_UNDETERMINED_SHARE)
-        size = np.where(
+        spike_sizes = np.where(
             is_predicted_by_others,
-            np.abs(residual) / np.sqrt(np.maximum(undetermined_share, _MIN_UNDETERMINED_SHARE)),
+            np.abs(change_residual) / np.sqrt(np.maximum(undetermined_share, _MIN_UNDETERMINED_SHARE)),
             0,
         )
-        worst_channels = np.flatnonzero(size > (1 - _MIN_UNDETERMINED_SHARE) * size.max())
+        worst_channels = np.flatnonzero(spike_sizes > (1 - _MIN_UNDETERMINED_SHARE) * spike_sizes.max())
         if not 0 < len(worst_channels) <= 2:
             break
-        deviation = max(
-            1.4826 * float(np.median(size[is_predicted_by_others])), float(rounding_errors[worst_channels].max())
+        residual_deviation = max(
+            1.4826 * float(np.median(spike_sizes[is_predicted_by_others])), float(rounding_errors[worst_channels].max())
         )
-        if not size.max() > _MIN_SPIKE_DEVIATIONS * deviation:
+        if not spike_sizes.max() > _MIN_SPIKE_DEVIATIONS * residual_deviation:
             break
-        direction = np.zeros(len(change))
-        direction[worst_channels[0]] = 1
+        fault_direction = np.zeros(len(weighted_change))
+        fault_direction[worst_channels[0]] = 1
         for _ in range(2):  # projected twice, so that rounding errors do not destroy orthogonality
-            direction = direction - basis @ (basis.T @ direction)
-        direction = direction / np.linalg.norm(direction)
-        unexplained_power, gain = float(np.sum(np.abs(residual) ** 2)), float(np.abs(direction @ residual) ** 2)
-        spike_size = float((size[worst_channels] / np.sqrt(undetermined_share[worst_channels])).max())
-        basis = np.column_stack([basis, direction])
-        residual, undetermined_share = residual - direction * (direction @ residual), undetermined_share - direction**2
-        faulty_channels += _faulty_channels(change, worst_channels)
+            fault_direction = fault_direction - change_basis @ (change_basis.T @ fault_direction)
+        fault_direction = fault_direction / np.linalg.norm(fault_direction)
+        unexplained_power, explained_power = (
+            float(np.sum(np.abs(change_residual) ** 2)),
+            float(np.abs(fault_direction @ change_residual) ** 2),
+        )
+        spike_size = float((spike_sizes[worst_channels] / np.sqrt(undetermined_share[worst_channels])).max())
+        change_basis = np.column_stack([change_basis, fault_direction])
+        change_residual, undetermined_share = (
+            change_residual - fault_direction * (fault_direction @ change_residual),
+            undetermined_share - fault_direction**2,
+        )
+        faulty_channels += _faulty_channels(weighted_change, worst_channels)
         is_remaining_channel[worst_channels] = False
-        root_mean_square_change = float(np.sqrt(np.mean(np.abs(change[is_remaining_channel]) ** 2)))
-        if spike_size > root_mean_square_change and gain > _MIN_SPIKE_POWER_SHARE * unexplained_power:
-            spikes = [*faulty_channels]
-    return spikes
+        root_mean_square_change = float(np.sqrt(np.mean(np.abs(weighted_change[is_remaining_channel]) ** 2)))
+        if spike_size > root_mean_square_change and explained_power > _MIN_SPIKE_POWER_SHARE * unexplained_power:
+            spike_channels = [*faulty_channels]
+    return spike_channels
 
 
-def _faulty_channels(change: Inexact[np.ndarray, " n"], channels: np.ndarray) -> list[int]:
+def _faulty_channels(weighted_change: Inexact[np.ndarray, " n"], candidate_channels: np.ndarray) -> list[int]:
     """Return the faulty channels among one or two channels that contradict the other channels or each other: the
     channel with the far larger change, or both channels if their changes are similar."""
-    size = np.abs(change[channels])
-    is_largest_only = size.max() > _MIN_FAULTY_CHANGE_RATIO * size.min()
-    return [int(channels[size.argmax()])] if is_largest_only else channels.tolist()
+    change_sizes = np.abs(weighted_change[candidate_channels])
+    is_largest_only = change_sizes.max() > _MIN_FAULTY_CHANGE_RATIO * change_sizes.min()
+    return [int(candidate_channels[change_sizes.argmax()])] if is_largest_only else candidate_channels.tolist()

@@ -42,33 +42,42 @@ def transfer_impedance(measurement: Measurement) -> Inexact[np.ndarray, "F L L"]
     ```
     """
     protocol, num_electrodes = measurement.protocol, measurement.protocol.num_electrodes
-    basis = scipy.linalg.null_space(np.ones((1, num_electrodes)))
-    rows, columns = np.triu_indices(num_electrodes - 1)
+    current_basis = scipy.linalg.null_space(np.ones((1, num_electrodes)))
+    row_indices, column_indices = np.triu_indices(num_electrodes - 1)
     check_memory(
-        f"the transfer impedance of '{measurement.name}'", 8 * _NUM_MEMORY_COPIES * len(rows) * measurement.num_channels
+        f"the transfer impedance of '{measurement.name}'",
+        8 * _NUM_MEMORY_COPIES * len(row_indices) * measurement.num_channels,
     )
-    drive, measurement_patterns = (
-        np.asarray(protocol.channel_drive) @ basis,
-        np.asarray(protocol.channel_measurement) @ basis,
+    channel_drives, measurement_patterns = (
+        np.asarray(protocol.channel_drive) @ current_basis,
+        np.asarray(protocol.channel_measurement) @ current_basis,
     )
-    drive_measurement_products = drive[:, rows] * measurement_patterns[:, columns] + np.where(
-        rows == columns, 0, drive[:, columns] * measurement_patterns[:, rows]
+    drive_measurement_products = channel_drives[:, row_indices] * measurement_patterns[:, column_indices] + np.where(
+        row_indices == column_indices, 0, channel_drives[:, column_indices] * measurement_patterns[:, row_indices]
     )
-    size = np.abs(drive).max()
-    voltages, masks = np.asarray(measurement.filled()), np.asarray(measurement.mask)
-    impedances = np.empty((measurement.num_frames, num_electrodes, num_electrodes), voltages.dtype)
-    for mask in np.unique(masks, axis=0):
-        inverse = np.linalg.pinv(drive_measurement_products[mask] / size, rcond=_MIN_SINGULAR_VALUE) / size
-        if np.linalg.norm(inverse @ drive_measurement_products[mask] - np.eye(len(rows))) > 1e-6 * len(rows):
+    largest_current = np.abs(channel_drives).max()
+    voltages, frame_masks = np.asarray(measurement.filled()), np.asarray(measurement.mask)
+    transfer_impedances = np.empty((measurement.num_frames, num_electrodes, num_electrodes), voltages.dtype)
+    for frame_mask in np.unique(frame_masks, axis=0):
+        inverse_products = (
+            np.linalg.pinv(drive_measurement_products[frame_mask] / largest_current, rcond=_MIN_SINGULAR_VALUE)
+            / largest_current
+        )
+        if np.linalg.norm(
+            inverse_products @ drive_measurement_products[frame_mask] - np.eye(len(row_indices))
+        ) > 1e-6 * len(row_indices):
             raise ValueError(
-                f"'{measurement.name}': its {int(mask.sum())} usable channels leave the transfer impedance open, "
-                f"{len(rows)} numbers. It takes {num_electrodes - 1} independent currents, read on all electrodes."
+                f"'{measurement.name}': its {int(frame_mask.sum())} usable channels leave the transfer impedance open, "
+                f"{len(row_indices)} numbers. It takes {num_electrodes - 1} independent currents, read on all "
+                "electrodes."
             )
-        for frame in np.flatnonzero((masks == mask).all(axis=1)):
-            upper_triangle = np.zeros((num_electrodes - 1, num_electrodes - 1), voltages.dtype)
-            upper_triangle[rows, columns] = inverse @ voltages[frame, mask]
-            impedances[frame] = basis @ (upper_triangle + np.triu(upper_triangle, 1).T) @ basis.T
-    return impedances
+        for frame in np.flatnonzero((frame_masks == frame_mask).all(axis=1)):
+            upper_triangle_entries = np.zeros((num_electrodes - 1, num_electrodes - 1), voltages.dtype)
+            upper_triangle_entries[row_indices, column_indices] = inverse_products @ voltages[frame, frame_mask]
+            transfer_impedances[frame] = (
+                current_basis @ (upper_triangle_entries + np.triu(upper_triangle_entries, 1).T) @ current_basis.T
+            )
+    return transfer_impedances
 
 
 def converted_to_protocol(reference: Measurement, measurement: Measurement) -> Measurement:
@@ -93,9 +102,9 @@ def _are_proportional(first_protocol: Protocol, second_protocol: Protocol) -> bo
     if first_protocol.num_measurements != second_protocol.num_measurements:
         return False
     first_drives, second_drives = np.asarray(first_protocol.channel_drive), np.asarray(second_protocol.channel_drive)
-    ratio = np.linalg.norm(first_drives) / np.linalg.norm(second_drives)
+    drive_ratio = np.linalg.norm(first_drives) / np.linalg.norm(second_drives)
     return np.allclose(
-        first_drives, ratio * second_drives, rtol=1e-6, atol=1e-6 * np.abs(first_drives).max()
+        first_drives, drive_ratio * second_drives, rtol=1e-6, atol=1e-6 * np.abs(first_drives).max()
     ) and np.allclose(first_protocol.channel_measurement, second_protocol.channel_measurement, rtol=1e-6)
 
 
@@ -123,9 +132,12 @@ def driven_by(measurement: Measurement, protocol: Protocol) -> Measurement:
             f"{measurement.protocol.num_electrodes}; both must be of the same body."
         )
     drive_patterns, measurement_patterns = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
-    impedance = transfer_impedance(measurement)
+    frame_impedances = transfer_impedance(measurement)
     voltages = np.stack(
-        [np.einsum("km,km->k", measurement_patterns @ transfer, drive_patterns) for transfer in impedance]
+        [
+            np.einsum("km,km->k", measurement_patterns @ frame_transfer, drive_patterns)
+            for frame_transfer in frame_impedances
+        ]
     )
     has_same_name = protocol.name == measurement.protocol.name
     difference_text = "other currents of that name read" if has_same_name else f"'{protocol.name}' reads"

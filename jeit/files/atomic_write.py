@@ -83,8 +83,8 @@ def remove_unfinished_files(folder: Path) -> None:
     """Remove unfinished temporary files that killed processes of this machine have left in a folder."""
     with suppress(OSError):
         for path in folder.iterdir():
-            match = _UNFINISHED_NAME_PATTERN.fullmatch(path.name)
-            if match and match[1] == _machine_hash() and not is_alive(int(match[2])):
+            name_match = _UNFINISHED_NAME_PATTERN.fullmatch(path.name)
+            if name_match and name_match[1] == _machine_hash() and not is_alive(int(name_match[2])):
                 shutil.rmtree(path, ignore_errors=True) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 

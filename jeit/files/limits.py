@@ -83,7 +83,7 @@ def faults_message(origin: str, sentences: list[str], keys: Sequence[str] = ()) 
     """Combine several faults in the file `origin` into one error message. It contains the first of the `sentences`, as
     many of the following sentences as fit, and the `keys` of up to ten of the remaining faults."""
     first_sentence = shorten(f"{shorten(origin, 2 * MAX_KEY_LENGTH)}: {sentences[0]}", _MAX_MESSAGE_LENGTH - 20)
-    num_listed = 1
+    num_listed_keys = 1
     for num_sentences in range(min(len(sentences), _MAX_LISTED_FAULTS), 0, -1):
         # If a message proposes a valid word, its list of all valid words is omitted first to save room.
         short_sentences = [
@@ -101,18 +101,18 @@ def faults_message(origin: str, sentences: list[str], keys: Sequence[str] = ()) 
             if len(message) <= _MAX_MESSAGE_LENGTH:
                 return message
     while (
-        len(" ".join([first_sentence, *_text_of_further_faults(keys[1:], len(sentences) - 1, num_listed)]))
+        len(" ".join([first_sentence, *_text_of_further_faults(keys[1:], len(sentences) - 1, num_listed_keys)]))
         <= _MAX_MESSAGE_LENGTH
-        and num_listed < _MAX_LISTED_KEYS
+        and num_listed_keys < _MAX_LISTED_KEYS
     ):
-        num_listed += 1
-    return " ".join([first_sentence, *_text_of_further_faults(keys[1:], len(sentences) - 1, num_listed - 1)])
+        num_listed_keys += 1
+    return " ".join([first_sentence, *_text_of_further_faults(keys[1:], len(sentences) - 1, num_listed_keys - 1)])
 
 
-def _text_of_further_faults(keys: Sequence[str], num_faults: int, max_keys: int) -> list[str]:
+def _text_of_further_faults(faulty_keys: Sequence[str], num_faults: int, max_keys: int) -> list[str]:
     """Sentences about `num_faults` further faults in a file; at most `max_keys` faults are named by their keys in the
     file."""
-    named_keys = keys[:max_keys]
+    named_keys = faulty_keys[:max_keys]
     sentences = [f"Wrong too: {', '.join(named_keys)}."] if named_keys else []
     return [*sentences, f"And {num_faults - len(named_keys)} more."] if num_faults > len(named_keys) else sentences
 
@@ -122,7 +122,7 @@ def shorten(text: str, max_length: int) -> str:
     return text if len(text) <= max_length else f"{text[: max_length - 1]}…"
 
 
-_MAX_REASON_LENGTH = 120
+_MAX_ERROR_TEXT_LENGTH = 120
 
 
 @contextmanager
@@ -146,7 +146,7 @@ def read_as(message: str) -> Iterator[None]:
 def error_text(error: Exception) -> str:
     """Message of an error in one short line; the type of the error if it has no message."""
     text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-    return text if len(text) <= _MAX_REASON_LENGTH else f"{text[: _MAX_REASON_LENGTH - 1]}…"
+    return text if len(text) <= _MAX_ERROR_TEXT_LENGTH else f"{text[: _MAX_ERROR_TEXT_LENGTH - 1]}…"
 
 
 # Maximum size in bytes of a hand-written TOML file.
@@ -166,9 +166,9 @@ def read_text(path: str | Path, *, encoding: str = "utf-8", max_bytes: int | Non
     """
     path = Path(path)
     check_size(path, max_bytes)
-    data = path.read_bytes()
+    file_bytes = path.read_bytes()
     try:
-        return data.decode(encoding)
+        return file_bytes.decode(encoding)
     except UnicodeDecodeError:
         raise UnicodeError(f"{path.name} is no text in UTF-8.") from None
 
@@ -176,12 +176,12 @@ def read_text(path: str | Path, *, encoding: str = "utf-8", max_bytes: int | Non
 def check_size(path: Path, max_bytes: int | None = None) -> None:
     """Raise `ValueError` if a file has more than `max_bytes` bytes, or if its content exceeds the memory limit
     (`check_memory`)."""
-    size = path.stat().st_size
-    if max_bytes is not None and size > max_bytes:
+    num_bytes = path.stat().st_size
+    if max_bytes is not None and num_bytes > max_bytes:
         raise ValueError(
-            f"{path.name} has {size} bytes, and a file of its kind {max_bytes} at most: is it the right one?"
+            f"{path.name} has {num_bytes} bytes, and a file of its kind {max_bytes} at most: is it the right one?"
         )
-    check_memory(path.name, _BYTES_PER_CHARACTER * size)
+    check_memory(path.name, _BYTES_PER_CHARACTER * num_bytes)
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
@@ -192,7 +192,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
 def parsed_toml(text: str, name: str) -> dict[str, Any]:
     """Parse `text` from the TOML file `name`. Raises `ValueError` for invalid TOML."""
-    if any(_max_dots(line) > _MAX_KEY_PARTS for line in text.splitlines()):
+    if any(_max_dots_per_key(line) > _MAX_KEY_PARTS for line in text.splitlines()):
         raise ValueError(f"{name} has a key of more than {_MAX_KEY_PARTS} parts; none is of so many.")
     try:
         return tomllib.loads(text)
@@ -202,12 +202,12 @@ def parsed_toml(text: str, name: str) -> dict[str, Any]:
         raise ValueError(f"{name} is no TOML file: {error_text(error)}.") from None
 
 
-def _max_dots(line: str) -> int:
+def _max_dots_per_key(line: str) -> int:
     """Maximum number of dots in a key on a line of TOML: the parser's time grows with the square of that number."""
     if "=" not in line:
         return line.count(".") if line.lstrip().startswith("[") and "," not in line else 0
-    prefixes = [key_part.rpartition("{")[2].rpartition(",")[2] for key_part in line.split("=")[:-1]]
-    return max(key_part.count(".") for key_part in prefixes)
+    key_prefixes = [key_part.rpartition("{")[2].rpartition(",")[2] for key_part in line.split("=")[:-1]]
+    return max(key_part.count(".") for key_part in key_prefixes)
 
 
 def read_json(path: str | Path, *, max_bytes: int = 2**26) -> Any:

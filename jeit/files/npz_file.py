@@ -18,10 +18,10 @@ import numpy as np
 
 from jeit.files.limits import FileTooLargeError, check_memory, error_text
 
-_NUM_COPIES = 2
+_NUM_COPIES_IN_MEMORY = 2
 # Maximum size in bytes of a file in an NPZ archive that is not an array, such as a JSON header.
 _MAX_TEXT_BYTES = 2**24
-_NPY_MARK, _ZIP_MARK = b"\x93NUM", b"PK\x03\x04"
+_NPY_SIGNATURE, _ZIP_SIGNATURE = b"\x93NUM", b"PK\x03\x04"
 # Errors that NumPy and zipfile raise for files that are damaged, encrypted, or compressed by an unknown method.
 ARCHIVE_READ_ERRORS = (
     ValueError,
@@ -49,41 +49,45 @@ def npz_arrays(
     and arrays that exceed the memory limit (`check_memory`). Raises `OSError` if the file does not exist.
     """
     with _open_archive(path, otherwise) as archive:
-        members = _members(archive)
-        requested = {name: info for name, info in members.items() if read_all or name in keys}
-        headers = {name: _member_header(archive, name, info) for name, info in requested.items()}
-        check_memory(path.name, sum(header.memory for header in headers.values()))
+        archive_members = _archive_members(archive)
+        requested_members = {
+            name: member_info for name, member_info in archive_members.items() if read_all or name in keys
+        }
+        array_headers = {
+            name: _read_member_header(archive, name, member_info) for name, member_info in requested_members.items()
+        }
+        check_memory(path.name, sum(header.required_memory for header in array_headers.values()))
         arrays = {}
-        for name, info in requested.items():
-            with archive.open(info) as member:
-                arrays[name] = _read_array(member)
-    return {"": np.array([*members], dtype=str), **arrays}
+        for name, member_info in requested_members.items():
+            with archive.open(member_info) as member_file:
+                arrays[name] = _read_array(member_file)
+    return {"": np.array([*archive_members], dtype=str), **arrays}
 
 
 def npz_shapes(path: Path) -> dict[str, tuple[int, ...]]:
     """Shapes of the arrays of numbers in an NPZ file, read from their headers; arrays of text or objects are omitted.
     Raises the errors of `npz_arrays`."""
-    shapes = {}
+    array_shapes = {}
     with _open_archive(path) as archive:
-        for name, info in _members(archive).items():
+        for name, member_info in _archive_members(archive).items():
             with contextlib.suppress(ValueError):  # of an array of objects, or of a file of another kind
-                header = _member_header(archive, name, info)
-                if header.dtype.kind in "biufc":
-                    shapes[name] = header.shape
-    return shapes
+                array_header = _read_member_header(archive, name, member_info)
+                if array_header.dtype.kind in "biufc":
+                    array_shapes[name] = array_header.shape
+    return array_shapes
 
 
 @contextlib.contextmanager
-def _open_archive(path: Path, otherwise: str = "not an NPZ file") -> Iterator[zipfile.ZipFile]:
+def _open_archive(path: Path, other_format_text: str = "not an NPZ file") -> Iterator[zipfile.ZipFile]:
     """Open an NPZ file, and convert the errors of reading it. Arguments and errors as in `npz_arrays`."""
     with path.open("rb") as file:
-        signature = file.read(4)
-        if signature == _NPY_MARK:
+        file_signature = file.read(4)
+        if file_signature == _NPY_SIGNATURE:
             raise ValueError(
                 "it holds a single array without names; save it with numpy.savez and the names of its arrays."
             )
-        if signature != _ZIP_MARK:
-            raise ValueError(f"{otherwise}; save the arrays with numpy.savez.")
+        if file_signature != _ZIP_SIGNATURE:
+            raise ValueError(f"{other_format_text}; save the arrays with numpy.savez.")
         file.seek(0)
         try:
             with zipfile.ZipFile(file) as archive:
@@ -94,8 +98,8 @@ def _open_archive(path: Path, otherwise: str = "not an NPZ file") -> Iterator[zi
             raise _unreadable_error("NPZ file of plain arrays", error) from None
 
 
-def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    return {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+def _archive_members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    return {member_info.filename.removesuffix(".npy"): member_info for member_info in archive.infolist()}
 
 
 def npy_array(path: Path) -> np.ndarray:
@@ -103,11 +107,13 @@ def npy_array(path: Path) -> np.ndarray:
     does not exist."""
     with path.open("rb") as file:
         try:
-            header = _header(file)
-            check_memory(path.name, header.memory)
+            array_header = _read_array_header(file)
+            check_memory(path.name, array_header.required_memory)
             num_bytes_left = path.stat().st_size - file.tell()
-            if header.size > num_bytes_left:
-                raise ValueError(f"it says {header.size} bytes of numbers, and has {num_bytes_left}; is it cut off?")
+            if array_header.num_data_bytes > num_bytes_left:
+                raise ValueError(
+                    f"it says {array_header.num_data_bytes} bytes of numbers, and has {num_bytes_left}; is it cut off?"
+                )
             file.seek(0)
             return _read_array(file)
         except FileTooLargeError:
@@ -121,11 +127,11 @@ def check_archive(path: Path) -> None:
     content exceeds the memory limit (`check_memory`), and if an array is smaller than its header declares."""
     try:
         with zipfile.ZipFile(path) as archive:
-            members = archive.infolist()
-            check_memory(path.name, sum(member.file_size for member in members))
-            for member in members:
+            archive_members = archive.infolist()
+            check_memory(path.name, sum(member.file_size for member in archive_members))
+            for member in archive_members:
                 if member.filename.endswith(".npy"):
-                    _member_header(archive, member.filename, member)
+                    _read_member_header(archive, member.filename, member)
                 elif member.file_size > _MAX_TEXT_BYTES:
                     raise ValueError(f"'{member.filename[:40]}' in it has {member.file_size} bytes of text")
     except (FileTooLargeError, FileNotFoundError):
@@ -143,48 +149,52 @@ def require_arrays(arrays: dict[str, np.ndarray], *keys: str) -> None:
         raise ValueError(f"there is no array '{missing_keys[0]}'; the file holds {array_names}.")
 
 
-class _Header(NamedTuple):
+class _ArrayHeader(NamedTuple):
     shape: tuple[int, ...]
     dtype: np.dtype
 
     @property
-    def size(self) -> int:
+    def num_data_bytes(self) -> int:
         """Size of the array's data in bytes."""
         return math.prod(self.shape) * self.dtype.itemsize
 
     @property
-    def memory(self) -> int:
+    def required_memory(self) -> int:
         """Memory in bytes for two copies of the array in double precision."""
-        return _NUM_COPIES * math.prod(self.shape) * max(self.dtype.itemsize, 8)
+        return _NUM_COPIES_IN_MEMORY * math.prod(self.shape) * max(self.dtype.itemsize, 8)
 
 
-def _header(file: IO[bytes]) -> _Header:
+def _read_array_header(file: IO[bytes]) -> _ArrayHeader:
     """Read the header of an array (shape and type) from an NPY file."""
-    version = np.lib.format.read_magic(file)
-    if version not in ((1, 0), (2, 0), (3, 0)):
-        raise ValueError(f"an array of it is in format {version}")
-    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    format_version = np.lib.format.read_magic(file)
+    if format_version not in ((1, 0), (2, 0), (3, 0)):
+        raise ValueError(f"an array of it is in format {format_version}")
+    read_header = (
+        np.lib.format.read_array_header_1_0 if format_version == (1, 0) else np.lib.format.read_array_header_2_0
+    )
     shape, _, dtype = read_header(file)
     if dtype.hasobject:
         raise ValueError("it holds objects, which would be executed")
-    if any(length < 0 for length in shape) or math.prod(shape) > 2**62:
+    if any(axis_length < 0 for axis_length in shape) or math.prod(shape) > 2**62:
         raise ValueError(f"an array of it has shape {str(shape)[:60]}")
-    return _Header(shape, dtype)
+    return _ArrayHeader(shape, dtype)
 
 
-def _member_header(archive: zipfile.ZipFile, name: str, member: zipfile.ZipInfo) -> _Header:
+def _read_member_header(archive: zipfile.ZipFile, name: str, member: zipfile.ZipInfo) -> _ArrayHeader:
     """Read the header of an array in an NPZ archive, and check that the stored array is as large as the header
     declares."""
     if not member.filename.endswith(".npy"):
         raise ValueError(f"'{name[:40]}' in it is a file of another kind")
     with archive.open(member) as file:
         try:
-            header = _header(file)
+            array_header = _read_array_header(file)
         except ARCHIVE_READ_ERRORS as error:
             raise ValueError(f"'{name[:40]}': {error}") from None
-    if header.size > member.file_size:
-        raise ValueError(f"'{name[:40]}' says {header.size} bytes of numbers, and has {member.file_size}")
-    return header
+    if array_header.num_data_bytes > member.file_size:
+        raise ValueError(
+            f"'{name[:40]}' says {array_header.num_data_bytes} bytes of numbers, and has {member.file_size}"
+        )
+    return array_header
 
 
 def _read_array(file: IO[bytes]) -> np.ndarray:
@@ -196,6 +206,6 @@ def _read_array(file: IO[bytes]) -> np.ndarray:
     return array
 
 
-def _unreadable_error(kind: str, error: Exception) -> ValueError:
+def _unreadable_error(file_kind: str, error: Exception) -> ValueError:
     object_hint = "" if "object" not in str(error).lower() else " as numbers and text, not objects"
-    return ValueError(f"not a readable {kind} ({error_text(error)}); write it again{object_hint}.")
+    return ValueError(f"not a readable {file_kind} ({error_text(error)}); write it again{object_hint}.")

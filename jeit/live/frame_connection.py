@@ -107,20 +107,24 @@ class SerialPort(AbstractConnection):
 
     def read(self, timeout: float) -> bytes | None:
         """Wait for bytes; see `AbstractConnection.read`."""
-        device = self.device
+        serial_device = self.device
         try:
-            device.timeout = timeout
-            first_byte = device.read(1)
-            return first_byte + device.read(min(device.in_waiting, _MAX_READ_BYTES)) if first_byte else b""
+            serial_device.timeout = timeout
+            first_received_byte = serial_device.read(1)
+            return (
+                first_received_byte + serial_device.read(min(serial_device.in_waiting, _MAX_READ_BYTES))
+                if first_received_byte
+                else b""
+            )
         except TypeError:  # the port was closed by another thread
             raise OSError("the port was closed") from None
 
     def close(self) -> None:
         """Disconnect; see `AbstractConnection.close`."""
-        device, self.device = self.device, None
-        if device is not None:
+        serial_device, self.device = self.device, None
+        if serial_device is not None:
             with suppress(OSError):
-                device.close()
+                serial_device.close()
 
     def _list_ports(self) -> list[str]:
         with suppress(Exception):  # on some systems, devices cannot be listed
@@ -165,21 +169,27 @@ def open_connection(text: str) -> AbstractConnection:
 
     Raises `ValueError` for other texts, and `ImportError` for a serial device without pyserial.
     """
-    connection_kind, _, address = text.partition(":")
+    connection_kind, _, connection_address = text.partition(":")
     if text == "-":
         return StandardInput()
     if connection_kind == "serial":
-        port, _, baud = (address if "@" in address else f"{address}@{_DEFAULT_BAUD}").rpartition("@")
-        if not port or not (baud.isascii() and baud.isdigit() and 0 < len(baud) < 9 and 0 < int(baud) <= _MAX_BAUD):
+        port_name, _, baud_text = (
+            connection_address if "@" in connection_address else f"{connection_address}@{_DEFAULT_BAUD}"
+        ).rpartition("@")
+        if not port_name or not (
+            baud_text.isascii() and baud_text.isdigit() and 0 < len(baud_text) < 9 and 0 < int(baud_text) <= _MAX_BAUD
+        ):
             raise ValueError(
                 f"source '{text[:80]}': give serial:PORT@BAUD, such as serial:/dev/ttyACM0@115200 or serial:COM3@9600."
             )
-        return SerialPort(port, int(baud))
-    host, _, port = address.rpartition(":")
-    host = host.removeprefix("[").removesuffix("]")
-    if not host or not (port.isascii() and port.isdigit() and len(port) < 6 and 0 < int(port) < 65536):
+        return SerialPort(port_name, int(baud_text))
+    host_name, _, port_name = connection_address.rpartition(":")
+    host_name = host_name.removeprefix("[").removesuffix("]")
+    if not host_name or not (
+        port_name.isascii() and port_name.isdigit() and len(port_name) < 6 and 0 < int(port_name) < 65536
+    ):
         raise ValueError(f"source '{text[:80]}': give tcp:HOST:PORT, such as tcp:192.168.4.1:5000.")
-    return TcpServer(host, int(port))
+    return TcpServer(host_name, int(port_name))
 
 
 class LineSource(AbstractSource):
@@ -193,7 +203,7 @@ class LineSource(AbstractSource):
     def __init__(self, name: str, connection: AbstractConnection, reading: LineParser, rate: float | None = None):
         super().__init__(name)
         self.device, self.reading, self.rate = connection, reading, rate
-        self._last_note, self._note_time = "", -float("inf")
+        self._last_note, self._last_note_time = "", -float("inf")
 
     def end_when_lost(self) -> None:
         """End when the connection is lost; see `AbstractSource.end_when_lost`."""
@@ -202,7 +212,7 @@ class LineSource(AbstractSource):
     def __iter__(self) -> Iterator[LiveFrame]:
         self.begun = time.monotonic()
         try:
-            while self._connect():
+            while self._connect_repeatedly():
                 yield from self._read_until_lost()
                 if not self.device.reconnects:
                     break
@@ -210,21 +220,21 @@ class LineSource(AbstractSource):
             self.device.close()
             self.connection = ENDED
 
-    def _connect(self) -> bool:
+    def _connect_repeatedly(self) -> bool:
         """Try to connect until a connection is made. Returns False if the source is closed before that."""
-        delay, last_error = _INITIAL_DELAY, ""
+        retry_delay, last_error_text = _INITIAL_DELAY, ""
         while not self.closing.is_set():
             try:
                 self.device.open()
             except OSError as error:
                 self.connection = f"waiting: {error}"[:300]
-                if str(error) != last_error:
-                    last_error = str(error)
+                if str(error) != last_error_text:
+                    last_error_text = str(error)
                     self.say(f"Not connected: {error}. Trying again until it is.")
-                self.closing.wait(delay)
-                delay = min(2 * delay, _MAX_DELAY)
+                self.closing.wait(retry_delay)
+                retry_delay = min(2 * retry_delay, _MAX_DELAY)
                 continue
-            if last_error or self._num_frames or self.connection != CONNECTED:
+            if last_error_text or self._num_frames or self.connection != CONNECTED:
                 self.say("Connected.")
             self.connection = CONNECTED
             return True
@@ -232,7 +242,7 @@ class LineSource(AbstractSource):
 
     def _read_until_lost(self) -> Iterator[LiveFrame]:
         """Yield frames until the connection is lost, the source has ended, or the source is closed."""
-        buffer, time_of_last_bytes, is_first_line = LineBuffer(), time.monotonic(), self.device.reconnects
+        line_buffer, time_of_last_bytes, is_first_line = LineBuffer(), time.monotonic(), self.device.reconnects
         while not self.closing.is_set():
             try:
                 received_bytes = self.device.read(_READ_TIMEOUT)
@@ -245,7 +255,7 @@ class LineSource(AbstractSource):
                 break
             if received_bytes:
                 time_of_last_bytes, self.connection = arrival_time, CONNECTED
-                for line in buffer.add_bytes(received_bytes):
+                for line in line_buffer.add_bytes(received_bytes):
                     yield from self._parse_line(line, arrival_time, is_first_line=is_first_line)
                     is_first_line = False
             elif arrival_time - time_of_last_bytes > _SILENCE_TIMEOUT and self.connection == CONNECTED:
@@ -254,7 +264,7 @@ class LineSource(AbstractSource):
         else:
             return
         self.device.close()
-        last_line = buffer.take_incomplete_line()
+        last_line = line_buffer.take_incomplete_line()
         if self.device.reconnects:
             self.connection = f"waiting: {disconnection_reason}"[:300]
             self.say(f"Connection lost: {disconnection_reason}.")
@@ -266,25 +276,29 @@ class LineSource(AbstractSource):
     def _parse_line(self, line: bytes, arrival_time: float, *, is_first_line: bool = False) -> Iterator[LiveFrame]:
         """Yield the frame in a line, if the line is not a comment. `is_first_line`: whether the connection may have
         begun within the line."""
-        values = self.reading(line)
+        frame_values = self.reading(line)
         parser_note = self.reading.note
         if (
             parser_note
             and parser_note != self._last_note
-            and (values is not None or arrival_time - self._note_time > _MIN_NOTE_INTERVAL)
+            and (frame_values is not None or arrival_time - self._last_note_time > _MIN_NOTE_INTERVAL)
         ):
-            self._last_note, self._note_time = parser_note, arrival_time
-            self.say(parser_note if values is not None else f"The device sends: {parser_note}")
-        if values is None:
+            self._last_note, self._last_note_time = parser_note, arrival_time
+            self.say(parser_note if frame_values is not None else f"The device sends: {parser_note}")
+        if frame_values is None:
             return
-        if is_first_line and not isinstance(values, str) and not self.reading.starts_with_complete_number(values):
-            values = f"begun before connecting: {line[:200].decode('utf-8', 'replace')}"
+        if (
+            is_first_line
+            and not isinstance(frame_values, str)
+            and not self.reading.starts_with_complete_number(frame_values)
+        ):
+            frame_values = f"begun before connecting: {line[:200].decode('utf-8', 'replace')}"
         if self.rate is not None:
-            scheduled_time = self.begun + self._num_frames / self.rate
-            if self.closing.wait(max(0.0, scheduled_time - time.monotonic())):
+            scheduled_frame_time = self.begun + self._num_frames / self.rate
+            if self.closing.wait(max(0.0, scheduled_frame_time - time.monotonic())):
                 return
             arrival_time = time.monotonic()
-        yield self.frame(values, arrival_time)
+        yield self.frame(frame_values, arrival_time)
 
 
 class ReadAhead(AbstractSource):
@@ -295,14 +309,14 @@ class ReadAhead(AbstractSource):
 
     def __init__(self, source: AbstractSource):
         self._source = source
-        self._queue: queue.Queue[LiveFrame | BaseException | None] = queue.Queue()
+        self._frame_queue: queue.Queue[LiveFrame | BaseException | None] = queue.Queue()
         threading.Thread(target=self._read_source, name="jeit live ahead", daemon=True).start()
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._source, name)
 
     def __iter__(self) -> Iterator[LiveFrame]:
-        while (frame := self._queue.get()) is not None:
+        while (frame := self._frame_queue.get()) is not None:
             if isinstance(frame, BaseException):
                 raise frame
             if self._source.closing.is_set():
@@ -312,7 +326,7 @@ class ReadAhead(AbstractSource):
     def close(self) -> None:
         """End the iteration soon, and discard the waiting frames."""
         self._source.close()
-        self._queue.put(None)
+        self._frame_queue.put(None)
 
     def end_when_lost(self) -> None:
         """End when the connection is lost; see `AbstractSource.end_when_lost`."""
@@ -327,13 +341,13 @@ class ReadAhead(AbstractSource):
 
         try:
             for frame in self._source:
-                if self._queue.qsize() >= _MAX_WAITING_FRAMES:
+                if self._frame_queue.qsize() >= _MAX_WAITING_FRAMES:
                     num_lost += 1
                     continue
                 report_loss()
                 num_lost = 0
-                self._queue.put(frame)
+                self._frame_queue.put(frame)
         except Exception as error:  # raised again in the thread that iterates over the frames
-            self._queue.put(error)
+            self._frame_queue.put(error)
         report_loss()
-        self._queue.put(None)
+        self._frame_queue.put(None)

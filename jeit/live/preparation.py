@@ -97,7 +97,7 @@ def prepare(
     print(next(frames(source, view)).picture.markers)
     ```
     """
-    report_step = progress or (lambda step: None)
+    report_step = progress or (lambda task_name: None)
     if calibration is not None:
         if model is not None:
             raise ValueError("calibration= and model= are of different sensors; give one of them.")
@@ -107,26 +107,30 @@ def prepare(
         return _prepare_model(
             source, reference, description, loaded_description, Path(model), rate, untouched, report_step
         )
-    measured = reference if isinstance(reference, Measurement | None) else read(reference, None, description)
-    opened_source = open_source(source, rate=rate, description=description, reference=measured)
+    reference_measurement = (
+        reference if isinstance(reference, Measurement | None) else read(reference, None, description)
+    )
+    opened_source = open_source(source, rate=rate, description=description, reference=reference_measurement)
     with _closed_on_failure(opened_source):
-        measured = getattr(opened_source, "reference", None) if measured is None else measured
-        if measured is None:
+        reference_measurement = (
+            getattr(opened_source, "reference", None) if reference_measurement is None else reference_measurement
+        )
+        if reference_measurement is None:
             if loaded_description is None:
                 raise ValueError(
                     "reference is missing: give a measured file of the undisturbed sensor, or a description, and the "
                     "first frames are the reference."
                 )
             reference_frames, opened_source = first_frames(opened_source, untouched, report_step, rate=rate)
-            measured = described_reference(loaded_description, reference_frames)
+            reference_measurement = described_reference(loaded_description, reference_frames)
         else:
-            reference_frames = frames_of(measured)
-        conductivity_view = ConductivityView.prepare(measured, settings, progress=progress)
+            reference_frames = frames_of(reference_measurement)
+        conductivity_view = ConductivityView.prepare(reference_measurement, settings, progress=progress)
         if not contacts:
-            return Prepared(opened_source, conductivity_view, measured)
+            return Prepared(opened_source, conductivity_view, reference_measurement)
         from jeit.live.views.contacts import ContactsView
 
-        return Prepared(opened_source, ContactsView(conductivity_view, reference_frames), measured)
+        return Prepared(opened_source, ContactsView(conductivity_view, reference_frames), reference_measurement)
 
 
 @contextmanager
@@ -157,53 +161,53 @@ def first_frames(
     """
     if isinstance(source, PlayedRecording):
         return _frames_of_usual_length(list(source.frames[source.seconds <= seconds]), seconds), source
-    with _report_connection(source, f"undisturbed, {seconds:g} s", report or (lambda step: None)):
+    with _report_connection(source, f"undisturbed, {seconds:g} s", report or (lambda report_step: None)):
         return _read_first_frames(source, seconds, rate)
 
 
 @contextmanager
-def _report_connection(source: AbstractSource, task_name: str, report: Callable[[str], None]) -> Iterator[None]:
+def _report_connection(source: AbstractSource, task_name: str, report_step: Callable[[str], None]) -> Iterator[None]:
     """Context that reports the task `task_name`, and each change of the state of the source's connection."""
     end_event = threading.Event()
 
     def report_changes() -> None:
-        last_state = CONNECTED
+        last_connection_state = CONNECTED
         while not end_event.wait(_POLL_PERIOD):
-            if source.connection != last_state:
-                last_state = source.connection
-                report(task_name if last_state == CONNECTED else last_state)
+            if source.connection != last_connection_state:
+                last_connection_state = source.connection
+                report_step(task_name if last_connection_state == CONNECTED else last_connection_state)
 
-    report(task_name)
-    thread = threading.Thread(target=report_changes, daemon=True)
-    thread.start()
+    report_step(task_name)
+    report_thread = threading.Thread(target=report_changes, daemon=True)
+    report_thread.start()
     try:
         yield
     finally:
         end_event.set()
-        thread.join()
+        report_thread.join()
 
 
 def _read_first_frames(
-    source: AbstractSource, seconds: float, rate: float | None
+    source: AbstractSource, reading_seconds: float, frame_rate: float | None
 ) -> tuple[Float[np.ndarray, "N M"], AbstractSource]:
     frames, initial_frames = iter(source), []
-    num_frames = None if rate is None else max(round(rate * seconds), _MIN_FRAMES)
+    num_frames = None if frame_rate is None else max(round(frame_rate * reading_seconds), _MIN_FRAMES)
     for frame in frames:
-        is_late = num_frames is None and frame.second - (initial_frames or [frame])[0].second >= seconds
+        is_late = num_frames is None and frame.second - (initial_frames or [frame])[0].second >= reading_seconds
         if is_late or len(initial_frames) >= (num_frames or _MAX_FRAMES):
             frames = chain([frame], frames)
             break
         if num_frames is None or not isinstance(frame.values, str):
             initial_frames.append(frame)
     if num_frames is None and (measured_rate := _arrival_rate(initial_frames)) is not None:
-        num_frames = max(round(measured_rate * seconds), _MIN_FRAMES)
+        num_frames = max(round(measured_rate * reading_seconds), _MIN_FRAMES)
     reference_frames = _frames_of_usual_length(
-        [frame.values for frame in initial_frames[:num_frames] if not isinstance(frame.values, str)], seconds
+        [frame.values for frame in initial_frames[:num_frames] if not isinstance(frame.values, str)], reading_seconds
     )
     if (relative_change := change_during(reference_frames)) is not None:
         source.say(
-            f"The sensor changed by {100 * relative_change:.2g} % in the first {seconds:g} s, which are the reference: "
-            "take a new one while nothing touches the sensor."
+            f"The sensor changed by {100 * relative_change:.2g} % in the first {reading_seconds:g} s, which are the "
+            "reference: take a new one while nothing touches the sensor."
         )
     return reference_frames, _ContinuedSource(
         source, chain(initial_frames[len(initial_frames) if num_frames is None else num_frames :], frames)
@@ -222,18 +226,18 @@ def _arrival_rate(frames: list[LiveFrame]) -> float | None:
     )
 
 
-def _frames_of_usual_length(rows: list[np.ndarray], seconds: float) -> Float[np.ndarray, "N M"]:
+def _frames_of_usual_length(frame_rows: list[np.ndarray], reading_seconds: float) -> Float[np.ndarray, "N M"]:
     """Return the frames of the most frequent length as one array. Raises `ValueError` if there are fewer than three
     such frames."""
-    lengths = [len(row) for row in rows]
-    usual_length = max(set(lengths), key=lengths.count, default=0)
-    rows = [row for row in rows if len(row) == usual_length]
-    if len(rows) < _MIN_FRAMES:
+    row_lengths = [len(frame_row) for frame_row in frame_rows]
+    usual_length = max(set(row_lengths), key=row_lengths.count, default=0)
+    frame_rows = [frame_row for frame_row in frame_rows if len(frame_row) == usual_length]
+    if len(frame_rows) < _MIN_FRAMES:
         raise ValueError(
-            f"untouched: the first {seconds:g} s have {counted(len(rows), 'frame')} of numbers; {_MIN_FRAMES} are "
-            "needed. Give a longer time, or a reference."
+            f"untouched: the first {reading_seconds:g} s have {counted(len(frame_rows), 'frame')} of numbers; "
+            f"{_MIN_FRAMES} are needed. Give a longer time, or a reference."
         )
-    return np.array(rows, float)
+    return np.array(frame_rows, float)
 
 
 class _ContinuedSource(AbstractSource):
@@ -257,20 +261,22 @@ class _ContinuedSource(AbstractSource):
         self._source.end_when_lost()
 
 
-def _prepare_sound(source: str, calibration: str | Path, rate: float | None) -> tuple[AbstractSource, AbstractView]:
+def _prepare_sound(
+    source: str, calibration_path: str | Path, frame_rate: float | None
+) -> tuple[AbstractSource, AbstractView]:
     """Create the source of intensities and the view of a calibrated array of microphones. The file `source` may contain
     sound samples or intensities."""
     from jeit.acoustic import Calibration, read_recording
     from jeit.acoustic.calibration.calibration import calibrated_intensities
     from jeit.live.views.sound import SoundView
 
-    loaded_calibration = Calibration.load(calibration)
+    loaded_calibration = Calibration.load(calibration_path)
     if not Path(source).is_file():
-        return open_source(source, rate=rate), SoundView(loaded_calibration)
-    intensities = calibrated_intensities(read_recording(source), loaded_calibration)
-    power = np.where(intensities.usable, intensities.power, np.nan)
-    view = SoundView(loaded_calibration, floor=intensities.floor, freedom=intensities.freedom)
-    return PlayedRecording(source, power, np.asarray(intensities.times), rate), view
+        return open_source(source, rate=frame_rate), SoundView(loaded_calibration)
+    silent_intensities = calibrated_intensities(read_recording(source), loaded_calibration)
+    silent_power = np.where(silent_intensities.usable, silent_intensities.power, np.nan)
+    sound_view = SoundView(loaded_calibration, floor=silent_intensities.floor, freedom=silent_intensities.freedom)
+    return PlayedRecording(source, silent_power, np.asarray(silent_intensities.times), frame_rate), sound_view
 
 
 def _prepare_model(
@@ -279,8 +285,8 @@ def _prepare_model(
     description: str | Path | None,
     loaded_description: Description | None,
     path: Path,
-    rate: float | None,
-    untouched: float,
+    frame_rate: float | None,
+    untouched_seconds: float,
     report_step: Callable[[str], None],
 ) -> Prepared:
     """Create the source of frames, and the view of the learnt model in the file or folder `path`."""
@@ -289,48 +295,60 @@ def _prepare_model(
     model = _read_model(path)
     if isinstance(model, GestureModel) and loaded_description is None:
         raise ValueError("description is missing: gestures are named from images of the skin, which it describes.")
-    measured = reference if isinstance(reference, Measurement) else None
-    reference_frames = None if measured is None else frames_of(measured)
+    reference_measurement = reference if isinstance(reference, Measurement) else None
+    reference_frames = None if reference_measurement is None else frames_of(reference_measurement)
     if reference is not None and not isinstance(reference, Measurement):
         reference_recording = read_frame_recording(reference, loaded_description)
         reference_frames = (
             reference_recording.frames if reference_recording.reference is None else reference_recording.reference
         )
     if Path(source).is_file():
-        recording = read_frame_recording(source, loaded_description)
-        reference_frames = recording.reference if reference_frames is None else reference_frames
-        opened_source: AbstractSource = PlayedRecording(source, recording.frames, recording.seconds, rate)
+        reference_recording_of_source = read_frame_recording(source, loaded_description)
+        reference_frames = reference_recording_of_source.reference if reference_frames is None else reference_frames
+        opened_source: AbstractSource = PlayedRecording(
+            source, reference_recording_of_source.frames, reference_recording_of_source.seconds, frame_rate
+        )
     else:
-        opened_source = open_source(source, rate=rate, description=description, reference=measured)
-        measured = getattr(opened_source, "reference", None) if measured is None else measured
+        opened_source = open_source(source, rate=frame_rate, description=description, reference=reference_measurement)
+        reference_measurement = (
+            getattr(opened_source, "reference", None) if reference_measurement is None else reference_measurement
+        )
         reference_frames = (
-            frames_of(measured) if reference_frames is None and measured is not None else reference_frames
+            frames_of(reference_measurement)
+            if reference_frames is None and reference_measurement is not None
+            else reference_frames
         )
     with _closed_on_failure(opened_source):
         if reference_frames is None and not (isinstance(model, LearntSkin) and model.mean_reference is None):
-            reference_frames, opened_source = first_frames(opened_source, untouched, report_step, rate=rate)
+            reference_frames, opened_source = first_frames(
+                opened_source, untouched_seconds, report_step, rate=frame_rate
+            )
         if isinstance(model, LearntSkin):
             from jeit.live.views.learnt import LearntSkinView
 
             return Prepared(
-                opened_source, LearntSkinView(model, reference_frames, description=loaded_description), measured
+                opened_source,
+                LearntSkinView(model, reference_frames, description=loaded_description),
+                reference_measurement,
             )
         assert reference_frames is not None
         if isinstance(model, GestureModel):
             from jeit.live.views.contacts import GestureView
 
             assert loaded_description is not None
-            view: AbstractView = GestureView(
-                loaded_description, model, reference_frames, rate=rate, progress=report_step
+            model_view: AbstractView = GestureView(
+                loaded_description, model, reference_frames, rate=frame_rate, progress=report_step
             )
             return Prepared(
                 opened_source,
-                view,
-                described_reference(loaded_description, reference_frames) if measured is None else measured,
+                model_view,
+                described_reference(loaded_description, reference_frames)
+                if reference_measurement is None
+                else reference_measurement,
             )
         from jeit.live.views.learnt import DepthView
 
-        return Prepared(opened_source, DepthView(model, reference_frames), measured)
+        return Prepared(opened_source, DepthView(model, reference_frames), reference_measurement)
 
 
 def _read_model(path: Path):
@@ -344,8 +362,8 @@ def _read_model(path: Path):
             raise ValueError(f"model: '{path}' holds {' and '.join(file_names)}; give one of these files.")
         path = path / file_names[0] if file_names else path
     if not path.is_file() or path.suffix not in (".skops", ".jeit"):
-        commands = "'jeit touch fit', 'jeit touch gestures' or 'jeit learn image'"
-        raise ValueError(f"model: '{path}' is neither a folder of {commands}, nor a file of such a folder.")
+        fitting_commands = "'jeit touch fit', 'jeit touch gestures' or 'jeit learn image'"
+        raise ValueError(f"model: '{path}' is neither a folder of {fitting_commands}, nor a file of such a folder.")
     if path.suffix == ".jeit":
         from jeit.touch.networks import read_network
 

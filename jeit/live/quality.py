@@ -27,7 +27,7 @@ _LOST_READING_DIFFERENCE, _DEAD_ELECTRODE_LOST_SHARE, _MIN_DRIFT_DIFFERENCE, _MI
 # The frames of a reference are divided into parts, whose means are compared. Number of parts; minimum number of frames
 # of a part; ratio of the deviation of the means to the deviation expected from noise, above which the sensor is
 # considered disturbed.
-_NUM_PARTS, _MIN_PART_FRAMES, _MIN_DISTURBANCE_RATIO = 4, 2, 4.0
+_NUM_PARTS_OF_REFERENCE, _MIN_PART_FRAMES, _MIN_DISTURBANCE_RATIO = 4, 2, 4.0
 # Factor by which the frame rate must change for a report, and number of successive calls for which the change must
 # last.
 _MIN_RATE_CHANGE_FACTOR, _NUM_CALLS_WITH_CHANGED_RATE = 1.4, 3
@@ -52,15 +52,15 @@ def change_during(frames: Float[np.ndarray, "N M"]) -> float | None:
     fewer than eight frames, for a change that noise explains, and for a change no larger than the noise of a single
     frame. The noise is estimated from successive frames."""
     frames = np.asarray(frames, float)[:, np.isfinite(frames).all(axis=0)]
-    if len(frames) < _NUM_PARTS * _MIN_PART_FRAMES:
+    if len(frames) < _NUM_PARTS_OF_REFERENCE * _MIN_PART_FRAMES:
         return None
-    deviations_of_parts = np.array([part.mean(axis=0) for part in np.array_split(frames, _NUM_PARTS)]) - frames.mean(
-        axis=0
-    )
+    deviations_of_parts = np.array(
+        [frame_part.mean(axis=0) for frame_part in np.array_split(frames, _NUM_PARTS_OF_REFERENCE)]
+    ) - frames.mean(axis=0)
     noise = (np.diff(frames, axis=0) ** 2).mean(axis=0).sum() / 2
     # A change smaller than the noise of a frame, such as a slow drift over thousands of frames, is harmless.
-    if not (deviations_of_parts**2).sum() > (_NUM_PARTS - 1) * noise * max(
-        _MIN_DISTURBANCE_RATIO**2 * _NUM_PARTS / len(frames), 1.0
+    if not (deviations_of_parts**2).sum() > (_NUM_PARTS_OF_REFERENCE - 1) * noise * max(
+        _MIN_DISTURBANCE_RATIO**2 * _NUM_PARTS_OF_REFERENCE / len(frames), 1.0
     ):
         return None
     return float(np.sqrt((deviations_of_parts**2).sum(axis=1).max()) / np.linalg.norm(frames.mean(axis=0)))
@@ -77,7 +77,7 @@ class QualityWatch:
         self.reference_voltages = self.touching = None
         self._lock = threading.Lock()
         self._frames: deque[np.ndarray] = deque(maxlen=_NUM_FRAMES)
-        self._medians: deque[np.ndarray] = deque(maxlen=_NUM_MEDIANS)
+        self._past_medians: deque[np.ndarray] = deque(maxlen=_NUM_MEDIANS)
         if reference is not None:
             self.replace_reference(np.where(reference.mask, np.real(np.asarray(reference.voltages)), np.nan))
             num_electrodes = reference.protocol.num_electrodes
@@ -88,23 +88,23 @@ class QualityWatch:
     def replace_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
         """Replace the reference by the mean of `frames` (frames, channels)."""
         is_finite = np.isfinite(frames)
-        total = np.where(is_finite, frames, 0.0).sum(axis=0)
-        mean = np.where(is_finite.any(axis=0), total / np.maximum(is_finite.sum(axis=0), 1), np.nan)
+        channel_sums = np.where(is_finite, frames, 0.0).sum(axis=0)
+        channel_means = np.where(is_finite.any(axis=0), channel_sums / np.maximum(is_finite.sum(axis=0), 1), np.nan)
         with self._lock:
-            self.reference_voltages = mean
-            self._medians.clear()
+            self.reference_voltages = channel_means
+            self._past_medians.clear()
 
     def add(self, frame: LiveFrame) -> None:
         """Add a frame to the latest frames. Text, and frames with a different number of channels, are left out."""
-        values = frame.values
-        if isinstance(values, str) or values.ndim != 1 or values.dtype.kind not in "iuf":
+        frame_values = frame.values
+        if isinstance(frame_values, str) or frame_values.ndim != 1 or frame_values.dtype.kind not in "iuf":
             return
-        if self.reference_voltages is not None and len(values) != len(self.reference_voltages):
+        if self.reference_voltages is not None and len(frame_values) != len(self.reference_voltages):
             return
         with self._lock:
-            if self._frames and len(self._frames[0]) != len(values):
+            if self._frames and len(self._frames[0]) != len(frame_values):
                 self._frames.clear()
-            self._frames.append(values)
+            self._frames.append(frame_values)
 
     @np.errstate(all="ignore")  # squares of numbers that are no voltages may overflow
     def assess(self) -> Quality:
@@ -119,31 +119,38 @@ class QualityWatch:
         if reference_voltages is None or self.protocol is None or self.touching is None:
             return Quality(noise)
         is_known = np.isfinite(frames).sum(axis=0) > len(frames) // 2
-        medians = np.full(frames.shape[1], np.nan)
-        medians[is_known] = np.nanmedian(frames[:, is_known], axis=0)
-        reciprocity = None
+        channel_medians = np.full(frames.shape[1], np.nan)
+        channel_medians[is_known] = np.nanmedian(frames[:, is_known], axis=0)
+        mean_reciprocity_error = None
         if is_known.any():
-            measured = Measurement(np.where(is_known, medians, 0.0)[None], is_known[None], self.protocol)
-            reciprocity = reciprocity_error(measured)
+            median_measurement = Measurement(
+                np.where(is_known, channel_medians, 0.0)[None], is_known[None], self.protocol
+            )
+            mean_reciprocity_error = reciprocity_error(median_measurement)
         with self._lock:
-            self._medians.append(medians)
-            past_medians = np.array(self._medians)
+            self._past_medians.append(channel_medians)
+            past_medians = np.array(self._past_medians)
         is_readable = np.isfinite(reference_voltages) & (reference_voltages != 0)
-        change = np.abs(medians - reference_voltages) / np.abs(np.where(is_readable, reference_voltages, 1.0))
+        relative_changes = np.abs(channel_medians - reference_voltages) / np.abs(
+            np.where(is_readable, reference_voltages, 1.0)
+        )
         dead_electrodes = _find_dead_electrodes(
-            ~is_known | (change > _LOST_READING_DIFFERENCE), is_readable, self.touching
+            ~is_known | (relative_changes > _LOST_READING_DIFFERENCE), is_readable, self.touching
         )
         if len(past_medians) < _NUM_MEDIANS // 2:
-            return Quality(noise, reciprocity, dead_electrodes)
+            return Quality(noise, mean_reciprocity_error, dead_electrodes)
         has_drift_data = (
             np.isfinite(past_medians).all(axis=0) & is_readable & ~self.touching[dead_electrodes].any(axis=0)
         )
-        drift = np.zeros(len(reference_voltages))
-        drift[has_drift_data] = np.median(
+        drift_per_channel = np.zeros(len(reference_voltages))
+        drift_per_channel[has_drift_data] = np.median(
             np.abs(past_medians[:, has_drift_data] / reference_voltages[has_drift_data] - 1), axis=0
         )
         return Quality(
-            noise, reciprocity, dead_electrodes, _find_drifting_electrodes(drift, has_drift_data, self.touching)
+            noise,
+            mean_reciprocity_error,
+            dead_electrodes,
+            _find_drifting_electrodes(drift_per_channel, has_drift_data, self.touching),
         )
 
 
@@ -152,7 +159,7 @@ class RateWatch:
 
     def __init__(self):
         self.usual_rate: float | None = None
-        self._num_changed = 0
+        self._num_changed_rates = 0
 
     def __call__(self, rate: float) -> str:
         """Return a sentence if the `rate` in frames/s has changed, otherwise an empty string."""
@@ -162,12 +169,12 @@ class RateWatch:
             self.usual_rate is not None
             and max(rate / self.usual_rate, self.usual_rate / rate) < _MIN_RATE_CHANGE_FACTOR
         ):
-            self._num_changed = 0
+            self._num_changed_rates = 0
             return ""
-        self._num_changed += 1
-        if self._num_changed < _NUM_CALLS_WITH_CHANGED_RATE:
+        self._num_changed_rates += 1
+        if self._num_changed_rates < _NUM_CALLS_WITH_CHANGED_RATE:
             return ""
-        previous_rate, self.usual_rate, self._num_changed = self.usual_rate, rate, 0
+        previous_rate, self.usual_rate, self._num_changed_rates = self.usual_rate, rate, 0
         return (
             ""
             if previous_rate is None
@@ -177,51 +184,58 @@ class RateWatch:
 
 def _relative_noise(frames: Float[np.ndarray, "F M"]) -> float | None:
     """Estimate the relative noise of frames from second differences in time, which a linear change does not affect."""
-    rms = np.sqrt(np.nanmean(frames**2)) if np.isfinite(frames).any() else 0.0
+    rms_voltage = np.sqrt(np.nanmean(frames**2)) if np.isfinite(frames).any() else 0.0
     second_differences = frames[:-2] - 2 * frames[1:-1] + frames[2:]
     second_differences = second_differences[np.isfinite(second_differences)]
-    if not rms > 0 or not second_differences.size or not np.isfinite(rms):
+    if not rms_voltage > 0 or not second_differences.size or not np.isfinite(rms_voltage):
         return None
-    return float(1.4826 * np.median(np.abs(second_differences)) / np.sqrt(6) / rms)
+    return float(1.4826 * np.median(np.abs(second_differences)) / np.sqrt(6) / rms_voltage)
 
 
 def _find_dead_electrodes(
-    is_lost: Bool[np.ndarray, " M"], is_readable: Bool[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
+    is_lost: Bool[np.ndarray, " M"], is_readable: Bool[np.ndarray, " M"], is_electrode_channel: Bool[np.ndarray, "L M"]
 ) -> list[int]:
     """Find the electrodes most of whose readings are lost. The electrode with the largest fraction of lost readings is
     detected first; its channels are left out in the search for the next dead electrode."""
     dead_electrodes: list[int] = []
     is_remaining_channel = is_readable.copy()
     while is_remaining_channel.any():
-        own_channels = touching & is_remaining_channel
+        own_channels = is_electrode_channel & is_remaining_channel
         num_channels = own_channels.sum(axis=1)
-        remaining_change_shares = np.where(
+        lost_reading_shares = np.where(
             num_channels > 0, (own_channels & is_lost).sum(axis=1) / np.maximum(num_channels, 1), 0.0
         )
-        worst_electrode = int(remaining_change_shares.argmax())
-        if remaining_change_shares[worst_electrode] < _DEAD_ELECTRODE_LOST_SHARE:
+        worst_electrode = int(lost_reading_shares.argmax())
+        if lost_reading_shares[worst_electrode] < _DEAD_ELECTRODE_LOST_SHARE:
             break
         dead_electrodes.append(worst_electrode)
-        is_remaining_channel &= ~touching[worst_electrode]
+        is_remaining_channel &= ~is_electrode_channel[worst_electrode]
     return sorted(dead_electrodes)
 
 
 def _find_drifting_electrodes(
-    drift: Float[np.ndarray, " M"], has_drift_data: Bool[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
+    channel_drift: Float[np.ndarray, " M"],
+    has_drift_data: Bool[np.ndarray, " M"],
+    is_electrode_channel: Bool[np.ndarray, "L M"],
 ) -> list[int]:
-    """Find the electrodes whose readings have a large `drift`, much larger than that of the readings of other
+    """Find the electrodes whose readings have a large `channel_drift`, much larger than that of the readings of other
     electrodes."""
     drifting_electrodes: list[int] = []
     is_remaining_channel = has_drift_data.copy()
     while True:
-        own_channels = [touching[mask] & is_remaining_channel for mask in range(len(touching))]
-        median_drifts = np.array([np.median(drift[mask]) if mask.any() else 0.0 for mask in own_channels])
+        own_channels = [
+            is_electrode_channel[electrode_index] & is_remaining_channel
+            for electrode_index in range(len(is_electrode_channel))
+        ]
+        median_drifts = np.array(
+            [np.median(channel_drift[channel_mask]) if channel_mask.any() else 0.0 for channel_mask in own_channels]
+        )
         worst_electrode = int(median_drifts.argmax())
-        channels_of_others = is_remaining_channel & ~touching[worst_electrode]
+        channels_of_others = is_remaining_channel & ~is_electrode_channel[worst_electrode]
         if (
             median_drifts[worst_electrode] < _MIN_DRIFT_DIFFERENCE
             or not channels_of_others.any()
-            or median_drifts[worst_electrode] < _MIN_DRIFT_RATIO * np.median(drift[channels_of_others])
+            or median_drifts[worst_electrode] < _MIN_DRIFT_RATIO * np.median(channel_drift[channels_of_others])
         ):
             return sorted(drifting_electrodes)
         drifting_electrodes.append(worst_electrode)

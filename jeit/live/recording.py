@@ -64,12 +64,12 @@ class Recorder:
 
     def __init__(self, folder: str | Path, *, reference: Measurement | None = None):
         self.folder, self.reference = Path(folder), reference
-        self._condition = threading.Condition()
-        self._lines: deque[tuple[str, bytes]] = deque()
-        self._waiting_bytes = self._num_lost = 0
-        self._problem = ""
-        self._files: _RecordingFiles | None = None
-        self._thread: threading.Thread | None = None
+        self._queue_condition = threading.Condition()
+        self._queued_lines: deque[tuple[str, bytes]] = deque()
+        self._waiting_bytes = self._num_lost_lines = 0
+        self._problem_text = ""
+        self._recording_files: _RecordingFiles | None = None
+        self._writer_thread: threading.Thread | None = None
         self._is_stopping = False
         self._last_microsecond = -1
         self._num_channels = self._frame_length = None if reference is None else reference.num_channels
@@ -78,69 +78,75 @@ class Recorder:
     def start(self) -> Path:
         """Begin a recording, unless a recording is in progress, and return the folder of the recording. Raises
         `OSError` if the folder cannot be created."""
-        if self._files is not None:
-            return self._files.folder
-        folder = _new_folder(self.folder)
+        if self._recording_files is not None:
+            return self._recording_files.folder
+        folder = _create_new_folder(self.folder)
         if self.reference is not None:
             _write_reference(self.reference, folder)
-        with self._condition:
-            self._files, self._is_stopping, self._problem = _RecordingFiles(folder), False, ""
-            self._num_lost = 0
+        with self._queue_condition:
+            self._recording_files, self._is_stopping, self._problem_text = _RecordingFiles(folder), False, ""
+            self._num_lost_lines = 0
             self._last_microsecond, self._frame_length = -1, self._num_channels
             self._num_other_lengths, self._file_number, self._file_size = 0, 1, 0
-            self._lines.clear()
+            self._queued_lines.clear()
             self._waiting_bytes = 0
-            self._thread = threading.Thread(
-                target=self._write_lines, args=(self._files,), name="jeit live recorder", daemon=True
+            self._writer_thread = threading.Thread(
+                target=self._write_lines, args=(self._recording_files,), name="jeit live recorder", daemon=True
             )
-            self._thread.start()
+            self._writer_thread.start()
         return folder
 
     def stop(self) -> str:
         """End the recording, and wait until all frames are written, for at most ten seconds. Returns a sentence for the
         user; an empty string if no recording was in progress."""
-        with self._condition:
-            thread, files, self._is_stopping = self._thread, self._files, True
-            self._condition.notify_all()
-        if thread is None or files is None:
+        with self._queue_condition:
+            writer_thread, recording_files, self._is_stopping = self._writer_thread, self._recording_files, True
+            self._queue_condition.notify_all()
+        if writer_thread is None or recording_files is None:
             return ""
-        thread.join(_END_TIMEOUT)
-        with self._condition:
-            self._files = self._thread = None
-            num_lost = self._num_lost + len(self._lines)
-            self._lines.clear()
+        writer_thread.join(_END_TIMEOUT)
+        with self._queue_condition:
+            self._recording_files = self._writer_thread = None
+            num_lost = self._num_lost_lines + len(self._queued_lines)
+            self._queued_lines.clear()
             self._waiting_bytes = 0
-        sentence = f"Recorded: {counted(files.frames, 'frame')} in {files.folder}."
-        return f"{sentence} Not recorded, for there was no room: {counted(num_lost, 'line')}." if num_lost else sentence
+        summary_sentence = f"Recorded: {counted(recording_files.num_frames, 'frame')} in {recording_files.folder}."
+        return (
+            f"{summary_sentence} Not recorded, for there was no room: {counted(num_lost, 'line')}."
+            if num_lost
+            else summary_sentence
+        )
 
     def add(self, frame: LiveFrame) -> None:
         """Record a frame. Does nothing if no recording is in progress."""
-        if self._files is None:
+        if self._recording_files is None:
             return
-        values = frame.values
-        if isinstance(values, str) or values.ndim != 1:
-            self._queue_line(REFUSED, _format_row(frame.second, str(values)))
+        frame_values = frame.values
+        if isinstance(frame_values, str) or frame_values.ndim != 1:
+            self._queue_line(REFUSED, _format_row(frame.second, str(frame_values)))
             return
-        if not self._has_usual_length(values):
-            self._queue_line(REFUSED, _format_row(frame.second, " ".join(map(repr, values.tolist()))))
+        if not self._has_usual_length(frame_values):
+            self._queue_line(REFUSED, _format_row(frame.second, " ".join(map(repr, frame_values.tolist()))))
             return
         # Readers recognise a column of times by its increase, so each time is at least a microsecond later than the
         # previous time.
         self._last_microsecond = max(round(1e6 * frame.second), self._last_microsecond + 1)
-        line = f"{self._last_microsecond / 1e6:.6f},{','.join(map(repr, values.astype(float).tolist()))}\n".encode()
+        line = (
+            f"{self._last_microsecond / 1e6:.6f},{','.join(map(repr, frame_values.astype(float).tolist()))}\n".encode()
+        )
         if self._file_size + len(line) > _MAX_FILE_SIZE:
             self._file_number, self._file_size = self._file_number + 1, 0
         self._file_size += len(line)
         self._queue_line(FRAMES if self._file_number == 1 else f"frames-{self._file_number}.csv", line)
 
-    def _has_usual_length(self, values: np.ndarray) -> bool:
+    def _has_usual_length(self, frame_values: np.ndarray) -> bool:
         """Whether a frame has as many channels as the other recorded frames. If the number of channels of the sensor is
         unknown, a new file is begun after three successive frames with a different number of channels."""
-        if values.dtype.kind not in "iuf":
+        if frame_values.dtype.kind not in "iuf":
             return False
         if self._frame_length is None:
-            self._frame_length = len(values)
-        if len(values) == self._frame_length:
+            self._frame_length = len(frame_values)
+        if len(frame_values) == self._frame_length:
             self._num_other_lengths = 0
             return True
         self._num_other_lengths += 1
@@ -148,89 +154,89 @@ class Recorder:
             return False
         if self._file_size:
             self._file_number, self._file_size = self._file_number + 1, 0
-        self._frame_length, self._num_other_lengths = len(values), 0
+        self._frame_length, self._num_other_lengths = len(frame_values), 0
         return True
 
     def mark(self, second: float, label: str) -> None:
         """Record an event with the text `label` at the time `second`."""
-        if self._files is not None:
+        if self._recording_files is not None:
             self._queue_line(EVENTS, _format_row(second, label))
 
     def renew(self, second: float, frames: np.ndarray) -> None:
         """Write the frames (frames, channels) of a new reference to the folder of the recording, and record the change
         of the reference as an event at the time `second`."""
-        if self._files is None:
+        if self._recording_files is None:
             return
         name = f"reference-{second:.3f}s.npy"
         try:
-            np.save(self._files.folder / name, frames)
+            np.save(self._recording_files.folder / name, frames)
         except OSError as error:
-            self._problem = f"The new reference is not recorded: {error.strerror}."
+            self._problem_text = f"The new reference is not recorded: {error.strerror}."
             return
         self.mark(second, f"new reference, {name}")
 
     def state(self) -> dict[str, Any] | None:
         """Folder of the recording in progress, numbers of frames and bytes written, and problem, if any; None if no
         recording is in progress."""
-        with self._condition:
-            files = self._files
-            if files is None:
+        with self._queue_condition:
+            recording_files = self._recording_files
+            if recording_files is None:
                 return None
             return {
-                "folder": str(files.folder),
-                "frames": files.frames,
-                "bytes": files.bytes,
-                "problem": self._problem or None,
+                "folder": str(recording_files.folder),
+                "frames": recording_files.num_frames,
+                "bytes": recording_files.num_bytes,
+                "problem": self._problem_text or None,
             }
 
     def _queue_line(self, name: str, line: bytes) -> None:
-        with self._condition:
+        with self._queue_condition:
             if self._waiting_bytes + len(line) > _MAX_WAITING_BYTES:
-                self._num_lost += 1
-                self._problem = (
-                    f"The disk is full or too slow: {counted(self._num_lost, 'line')} could not be recorded."
+                self._num_lost_lines += 1
+                self._problem_text = (
+                    f"The disk is full or too slow: {counted(self._num_lost_lines, 'line')} could not be recorded."
                 )
                 return
-            self._lines.append((name, line))
+            self._queued_lines.append((name, line))
             self._waiting_bytes += len(line)
-            self._condition.notify_all()
+            self._queue_condition.notify_all()
 
-    def _write_lines(self, files: _RecordingFiles) -> None:
+    def _write_lines(self, recording_files: _RecordingFiles) -> None:
         sync_time = time.monotonic()
-        while (queued_line := self._next_line(files)) is not None:
+        while (queued_line := self._next_line(recording_files)) is not None:
             try:
-                files.write(*queued_line)
+                recording_files.write(*queued_line)
             except OSError as error:
-                with self._condition:
-                    if self._is_ending(files):
+                with self._queue_condition:
+                    if self._is_ending(recording_files):
                         break
-                    self._problem = _describe_error(error)
-                    self._condition.wait_for(lambda: self._is_ending(files), _RETRY_PERIOD)
+                    self._problem_text = _describe_error(error)
+                    self._queue_condition.wait_for(lambda: self._is_ending(recording_files), _RETRY_PERIOD)
                 continue
-            with self._condition:
-                if self._files is not files:  # the recording was ended before the line was written
+            with self._queue_condition:
+                if self._recording_files is not recording_files:  # the recording was ended before the line was written
                     break
-                self._lines.popleft()
+                self._queued_lines.popleft()
                 self._waiting_bytes -= len(queued_line[1])
-                if not self._num_lost:
-                    self._problem = ""
+                if not self._num_lost_lines:
+                    self._problem_text = ""
             if time.monotonic() - sync_time > _SYNC_PERIOD:
-                files.synchronise()
+                recording_files.synchronise()
                 sync_time = time.monotonic()
-        files.close()
+        recording_files.close()
 
-    def _next_line(self, files: _RecordingFiles) -> tuple[str, bytes] | None:
+    def _next_line(self, recording_files: _RecordingFiles) -> tuple[str, bytes] | None:
         """Wait for a line to write, and return the line without removing it from the queue; None when the recording
         ends."""
-        with self._condition:
-            while not self._lines or self._files is not files:
-                if self._is_ending(files):
+        with self._queue_condition:
+            while not self._queued_lines or self._recording_files is not recording_files:
+                if self._is_ending(recording_files):
                     return None
-                self._condition.wait(_SYNC_PERIOD)
-            return self._lines[0]
+                self._queue_condition.wait(_SYNC_PERIOD)
+            return self._queued_lines[0]
 
-    def _is_ending(self, files: _RecordingFiles) -> bool:
-        return self._is_stopping or self._files is not files
+    def _is_ending(self, recording_files: _RecordingFiles) -> bool:
+        return self._is_stopping or self._recording_files is not recording_files
 
 
 class _RecordingFiles:
@@ -238,72 +244,74 @@ class _RecordingFiles:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        self.frames = self.bytes = 0
-        self._descriptors: dict[str, int] = {}
-        self._sizes: dict[str, int] = {}
+        self.num_frames = self.num_bytes = 0
+        self._file_descriptors: dict[str, int] = {}
+        self._file_sizes: dict[str, int] = {}
 
     def write(self, name: str, line: bytes) -> None:
         """Append a complete line to the file `name`. Raises `OSError` if the line cannot be written; the file is then
         unchanged."""
-        if name not in self._descriptors:
+        if name not in self._file_descriptors:
             self._create_file(name, line)
-        self._append_line(self._descriptors[name], self._sizes[name], line)
-        self._sizes[name] += len(line)
-        self.bytes += len(line)
-        self.frames += name.startswith(_FRAMES_PREFIX)
+        self._append_line(self._file_descriptors[name], self._file_sizes[name], line)
+        self._file_sizes[name] += len(line)
+        self.num_bytes += len(line)
+        self.num_frames += name.startswith(_FRAMES_PREFIX)
 
     def _create_file(self, name: str, line: bytes) -> None:
         """Create the file `name` with its header line, and close the previous file of frames."""
-        heading = b"second,text\n"
+        header_line = b"second,text\n"
         if name.startswith(_FRAMES_PREFIX):
-            heading = (
+            header_line = (
                 "second," + ",".join(f"v{channel_index + 1}" for channel_index in range(line.count(b","))) + "\n"
             ).encode()
-        descriptor = os.open(self.folder / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _BINARY_FILE_FLAG, 0o644)
+        file_descriptor = os.open(self.folder / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _BINARY_FILE_FLAG, 0o644)
         try:
-            self._append_line(descriptor, 0, heading)
+            self._append_line(file_descriptor, 0, header_line)
         except OSError:
-            os.close(descriptor)
+            os.close(file_descriptor)
             raise
         if name.startswith(_FRAMES_PREFIX):
-            for open_name in [open_name for open_name in self._descriptors if open_name.startswith(_FRAMES_PREFIX)]:
-                os.close(self._descriptors.pop(open_name))
-        self._descriptors[name], self._sizes[name] = descriptor, len(heading)
+            for open_file_name in [
+                open_file_name for open_file_name in self._file_descriptors if open_file_name.startswith(_FRAMES_PREFIX)
+            ]:
+                os.close(self._file_descriptors.pop(open_file_name))
+        self._file_descriptors[name], self._file_sizes[name] = file_descriptor, len(header_line)
 
     @staticmethod
-    def _append_line(descriptor: int, size: int, line: bytes) -> None:
-        """Append a line to a file of the given `size`. If the line cannot be written completely, the file is truncated
-        to this size."""
+    def _append_line(file_descriptor: int, file_size: int, line: bytes) -> None:
+        """Append a line to a file of the given `file_size`. If the line cannot be written completely, the file is
+        truncated to this size."""
         try:
-            num_written = os.write(descriptor, line)
+            num_written = os.write(file_descriptor, line)
             while num_written < len(line):
-                num_written += os.write(descriptor, line[num_written:])
+                num_written += os.write(file_descriptor, line[num_written:])
         except OSError:
             with suppress(OSError):
-                os.ftruncate(descriptor, size)
-                os.lseek(descriptor, size, os.SEEK_SET)
+                os.ftruncate(file_descriptor, file_size)
+                os.lseek(file_descriptor, file_size, os.SEEK_SET)
             raise
 
     def synchronise(self) -> None:
         """Flush all files to the disk."""
-        for descriptor in self._descriptors.values():
+        for file_descriptor in self._file_descriptors.values():
             with suppress(OSError):
-                os.fsync(descriptor)
+                os.fsync(file_descriptor)
 
     def close(self) -> None:
         self.synchronise()
-        for descriptor in self._descriptors.values():
+        for file_descriptor in self._file_descriptors.values():
             with suppress(OSError):
-                os.close(descriptor)
-        self._descriptors.clear()
+                os.close(file_descriptor)
+        self._file_descriptors.clear()
 
 
-def _new_folder(folder: Path) -> Path:
+def _create_new_folder(folder: Path) -> Path:
     """Create a new folder below `folder`, named by date and time, and return its path."""
     folder.mkdir(parents=True, exist_ok=True)
     name = datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
-    for number in range(1, 1000):
-        new_folder = folder / (name if number == 1 else f"{name}_{number}")
+    for folder_number in range(1, 1000):
+        new_folder = folder / (name if folder_number == 1 else f"{name}_{folder_number}")
         with suppress(FileExistsError):
             new_folder.mkdir()
             return new_folder
@@ -315,17 +323,19 @@ def _write_reference(reference: Measurement, folder: Path) -> None:
     try:
         _, description = write_table(reference, folder / REFERENCE)
     except ValueError:  # a body that a description cannot express
-        bare_reference = Measurement(reference.voltages, reference.mask, reference.protocol, name=reference.name)
-        _, description = write_table(bare_reference, folder / REFERENCE)
+        reference_without_body = Measurement(
+            reference.voltages, reference.mask, reference.protocol, name=reference.name
+        )
+        _, description = write_table(reference_without_body, folder / REFERENCE)
     text = description.read_text("utf-8")
     (folder / DESCRIPTION).write_text(text, "utf-8")
 
 
 def _format_row(frame_time: float, text: str) -> bytes:
     """Format a line of a CSV table of times in seconds and texts."""
-    buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerow([f"{frame_time:.6f}", " ".join(text.split())])
-    return buffer.getvalue().encode("utf-8", "replace")
+    text_buffer = io.StringIO()
+    csv.writer(text_buffer, lineterminator="\n").writerow([f"{frame_time:.6f}", " ".join(text.split())])
+    return text_buffer.getvalue().encode("utf-8", "replace")
 
 
 def _describe_error(error: OSError) -> str:

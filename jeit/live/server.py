@@ -54,11 +54,11 @@ def serve(
 
     if token is None and not is_loopback(host):
         token = secrets.token_urlsafe(24)
-    hub = PageHub(session)
+    page_hub = PageHub(session)
     server_socket = _open_socket(host, port)
     with server_socket:
-        config = uvicorn.Config(
-            make_application(hub, host=host, token=token),
+        server_config = uvicorn.Config(
+            make_application(page_hub, host=host, token=token),
             log_level="error",
             access_log=False,  # it would contain the token
             ws="websockets-sansio",
@@ -70,9 +70,9 @@ def serve(
             limit_concurrency=200,
             timeout_graceful_shutdown=2,
         )
-        server = uvicorn.Server(config)
+        server = uvicorn.Server(server_config)
         if not stay:
-            threading.Thread(target=_stop_at_end, args=(hub, server), daemon=True).start()
+            threading.Thread(target=_stop_at_session_end, args=(page_hub, server), daemon=True).start()
         if opened is not None:
             opened(_page_address(host, server_socket.getsockname()[1], token))
         with contextlib.suppress(KeyboardInterrupt):
@@ -84,8 +84,8 @@ def check_port(host: str, port: int) -> None:
     _open_socket(host, port).close()
 
 
-def _stop_at_end(hub: PageHub, server: object) -> None:
-    hub.ended.wait()
+def _stop_at_session_end(page_hub: PageHub, server: object) -> None:
+    page_hub.ended.wait()
     server.should_exit = True  # pyright: ignore[reportAttributeAccessIssue]
 
 
@@ -95,18 +95,20 @@ def _open_socket(host: str, port: int) -> socket.socket:
     if not 0 <= port <= 65535:
         raise OSError(f"port: {port} is none; they go from 1 to 65535, and 0 takes a free one")
     try:
-        family, socket_type, protocol_number, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        socket_family, socket_type, protocol_number, _, socket_address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM
+        )[0]
     except (socket.gaierror, UnicodeError) as error:
         raise OSError(f"cannot listen on {host!r}, port {port}: {error}") from error
-    server_socket = socket.socket(family, socket_type, protocol_number)
+    server_socket = socket.socket(socket_family, socket_type, protocol_number)
     try:
         server_socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        server_socket.bind(address)
+        server_socket.bind(socket_address)
         server_socket.listen(128)
     except OSError as error:
         server_socket.close()
-        remedy = f"port {port} is taken or not allowed: choose another, or 0 for any free one"
-        raise OSError(error.errno, f"cannot listen on {host}, port {port} ({error.strerror}); {remedy}") from error
+        remedy_text = f"port {port} is taken or not allowed: choose another, or 0 for any free one"
+        raise OSError(error.errno, f"cannot listen on {host}, port {port} ({error.strerror}); {remedy_text}") from error
     return server_socket
 
 
@@ -116,7 +118,7 @@ def _page_address(host: str, port: int, token: str | None) -> str:
     host_in_address = host
     try:
         if ip_address(host).is_unspecified:
-            host_in_address = _own_address()
+            host_in_address = _own_ip_address()
         if ip_address(host_in_address).version == 6:
             host_in_address = f"[{host_in_address}]"
     except ValueError:
@@ -125,7 +127,7 @@ def _page_address(host: str, port: int, token: str | None) -> str:
     return f"http://{host_in_address}:{port}/{query_string}"
 
 
-def _own_address() -> str:
+def _own_ip_address() -> str:
     """IP address of this machine in its network. The function sends no data."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe_socket:
         try:

@@ -104,17 +104,17 @@ class Session:
         self._num_channels = None if reference is None else reference.num_channels
         self._frame_length = self._num_channels or 0
         self._num_other_lengths = 0
-        self._condition = threading.Condition()
+        self._frames_condition = threading.Condition()
         self._waiting_frames: deque[LiveFrame] = deque()
-        self._results: deque[Result] = deque()
-        self._num_bytes = 0
+        self._stored_results: deque[Result] = deque()
+        self._num_stored_bytes = 0
         self._has_source_ended = self._is_finished = False
         self._closed = threading.Event()
-        self._num_read = self._num_imaged = self._num_dropped = self._num_refused = 0
-        self._reasons: dict[str, list] = {}
-        self._statuses: Counter[FrameStatus] = Counter()
+        self._num_frames_read = self._num_imaged = self._num_dropped = self._num_refused = 0
+        self._refusal_reasons: dict[str, list] = {}
+        self._status_counts: Counter[FrameStatus] = Counter()
         self._latencies: deque[float] = deque(maxlen=_NUM_LATENCIES)
-        self._arrivals: deque[float] = deque(maxlen=4096)
+        self._arrival_times: deque[float] = deque(maxlen=4096)
         self._messages: deque[tuple[float, str]] = deque(maxlen=MAX_MESSAGES)
         self._num_requested, self._collected_frames = 0, []
         self._reference: np.ndarray | None = None
@@ -137,58 +137,58 @@ class Session:
         if self._threads:
             raise RuntimeError("A session starts once; make another for the same source.")
         self._threads = [
-            threading.Thread(target=target, name=f"jeit live {name}", daemon=True)
-            for name, target in (
+            threading.Thread(target=thread_target, name=f"jeit live {name}", daemon=True)
+            for name, thread_target in (
                 ("reader", self._read_source),
                 ("imaging", self._image_frames),
                 ("quality", self._assess_quality),
             )
         ]
-        for thread in self._threads:
-            thread.start()
+        for session_thread in self._threads:
+            session_thread.start()
 
     def stop(self) -> None:
         """Close the source, and end the recording and the threads."""
         self.source.close()
-        with self._condition:
+        with self._frames_condition:
             self._has_source_ended = True
-            self._condition.notify_all()
-        for thread in self._threads:
-            thread.join(5.0)
+            self._frames_condition.notify_all()
+        for session_thread in self._threads:
+            session_thread.join(5.0)
         self.record(False)
 
     def wait(self) -> None:
         """Wait until the source has ended and its last frame is imaged."""
-        with self._condition:
+        with self._frames_condition:
             while not self._is_finished:
-                self._condition.wait(0.5)
+                self._frames_condition.wait(0.5)
 
     def newest(self, after: int, timeout: float) -> Result | None:
         """Return the newest result if its frame number is above `after`; otherwise wait for a newer result, at most
         `timeout` seconds. Returns None if no newer result arrives, or if the session has ended."""
-        end = time.monotonic() + timeout
-        with self._condition:
-            while not (self._results and self._results[-1].frame.number > after):
-                remaining_time = end - time.monotonic()
+        end_time = time.monotonic() + timeout
+        with self._frames_condition:
+            while not (self._stored_results and self._stored_results[-1].frame.number > after):
+                remaining_time = end_time - time.monotonic()
                 if self._is_finished or remaining_time <= 0:
                     return None
-                self._condition.wait(min(remaining_time, 0.5))
-            return self._results[-1]
+                self._frames_condition.wait(min(remaining_time, 0.5))
+            return self._stored_results[-1]
 
     def result(self, number: int) -> Result | None:
         """Return the last stored result whose frame number is at most `number`; None if there is no such result."""
-        with self._condition:
-            for result in reversed(self._results):
-                if result.frame.number <= number:
-                    return result
+        with self._frames_condition:
+            for stored_result in reversed(self._stored_results):
+                if stored_result.frame.number <= number:
+                    return stored_result
         return None
 
     def with_events(self, result: Result, after: int) -> Result:
         """Add to `result` the events of earlier stored results whose frame number is above `after`."""
-        with self._condition:
+        with self._frames_condition:
             skipped_results = [
                 skipped_result
-                for skipped_result in self._results
+                for skipped_result in self._stored_results
                 if after < skipped_result.frame.number < result.frame.number
             ]
         earlier_events = tuple(event for skipped_result in skipped_results for event in skipped_result.picture.events)
@@ -201,7 +201,7 @@ class Session:
             raise ValueError(
                 f"count must be a number of frames between 1 and {_MAX_REFERENCE_FRAMES:,}; it is {count}."
             )
-        with self._condition:
+        with self._frames_condition:
             self._num_requested, self._collected_frames = count, []
 
     def mark(self, label: str) -> None:
@@ -219,9 +219,9 @@ class Session:
                 self.say("There is nowhere to record to.")
             return
         if not on:
-            sentence = self.recorder.stop()
-            if sentence:
-                self.say(sentence)
+            summary_sentence = self.recorder.stop()
+            if summary_sentence:
+                self.say(summary_sentence)
             return
         try:
             folder = self.recorder.start()
@@ -236,28 +236,30 @@ class Session:
 
     def state(self) -> dict[str, Any]:
         """Counters, frame rate, latency, quality, connection, recording and messages, in types of JSON."""
-        with self._condition:
+        with self._frames_condition:
             latencies = np.array(self._latencies)
-            counters = {
-                "read": self._num_read,
+            frame_counters = {
+                "read": self._num_frames_read,
                 "imaged": self._num_imaged,
                 "dropped": self._num_dropped,
                 "refused": self._num_refused,
-                "reasons": dict(self._reasons.values()),
-                "statuses": {str(status): count for status, count in self._statuses.items()},
+                "reasons": dict(self._refusal_reasons.values()),
+                "statuses": {
+                    str(image_status): status_count for image_status, status_count in self._status_counts.items()
+                },
             }
-            quality, has_ended = self._quality, self._has_source_ended
-        median, latency_99 = np.quantile(latencies, (0.5, 0.99)).tolist() if latencies.size else (None, None)
+            signal_quality, has_ended = self._quality, self._has_source_ended
+        median_latency, latency_99 = np.quantile(latencies, (0.5, 0.99)).tolist() if latencies.size else (None, None)
         messages = sorted([*self.source.messages.copy(), *self._messages.copy()])[-MAX_MESSAGES:]
         return {
-            **counters,
+            **frame_counters,
             "rate": self._frame_rate(),
-            "latency_median": median,
+            "latency_median": median_latency,
             "latency_99": latency_99,
-            "noise": quality.noise,
-            "reciprocity": quality.reciprocity,
-            "dead": self._electrode_names(quality.dead),
-            "drifting": self._electrode_names(quality.drifting),
+            "noise": signal_quality.noise,
+            "reciprocity": signal_quality.reciprocity,
+            "dead": self._electrode_names(signal_quality.dead),
+            "drifting": self._electrode_names(signal_quality.drifting),
             "connection": ENDED if has_ended else self.source.connection,
             "recording": None if self.recorder is None else self.recorder.state(),
             "messages": [{"second": elapsed_seconds, "text": text} for elapsed_seconds, text in messages],
@@ -271,8 +273,8 @@ class Session:
     def _frame_rate(self) -> float:
         """Frames/s in the last two seconds."""
         current_time = time.monotonic()
-        with self._condition:
-            recent_arrivals = [arrival for arrival in self._arrivals if arrival > current_time - _RATE_TIME_SPAN]
+        with self._frames_condition:
+            recent_arrivals = [arrival for arrival in self._arrival_times if arrival > current_time - _RATE_TIME_SPAN]
         time_span = recent_arrivals[-1] - recent_arrivals[0] if len(recent_arrivals) > 1 else 0.0
         return (len(recent_arrivals) - 1) / time_span if time_span > 0 else 0.0
 
@@ -285,46 +287,46 @@ class Session:
             for frame in self.source:
                 if self.recorder is not None:
                     self.recorder.add(frame)
-                with self._condition:
-                    self._num_read += 1
-                    self._arrivals.append(frame.arrived)
+                with self._frames_condition:
+                    self._num_frames_read += 1
+                    self._arrival_times.append(frame.arrived)
                     self._waiting_frames.append(frame)
                     if len(self._waiting_frames) > _MAX_WAITING_IN_QUEUE:
                         self._waiting_frames.popleft()
                         self._num_dropped += 1
                     self._quality_watch.add(frame)
                     self._collect_reference_frame(frame)
-                    self._condition.notify_all()
+                    self._frames_condition.notify_all()
                 self._compare_length(frame)
         except Exception as error:  # devices and files raise errors of many types; the page reports the errors
             self.say(f"The source failed: {error}")
         finally:
-            with self._condition:
+            with self._frames_condition:
                 self._has_source_ended = True
-                self._condition.notify_all()
+                self._frames_condition.notify_all()
 
     def _compare_length(self, frame: LiveFrame) -> None:
         """Report a lasting change of the number of channels of the frames."""
         if isinstance(frame.values, str):
             return
-        length = frame.values.size
-        self._num_other_lengths = self._num_other_lengths + 1 if length != self._frame_length else 0
+        num_channels = frame.values.size
+        self._num_other_lengths = self._num_other_lengths + 1 if num_channels != self._frame_length else 0
         if self._num_other_lengths == _NUM_OTHER_LENGTHS:
             if self._frame_length:
-                self.say(f"Frames now have {counted(length, 'channel')}; they had {self._frame_length}.")
-            self._frame_length, self._num_other_lengths = length, 0
+                self.say(f"Frames now have {counted(num_channels, 'channel')}; they had {self._frame_length}.")
+            self._frame_length, self._num_other_lengths = num_channels, 0
 
     def _assess_quality(self) -> None:
         while not self._closed.wait(_QUALITY_PERIOD):
             try:
-                quality = self._quality_watch.assess()
+                signal_quality = self._quality_watch.assess()
             except Exception as error:  # an error here must not end the session
                 self.say(f"Noise and electrodes are no longer judged: {type(error).__name__}: {error}")
                 return
-            with self._condition:
-                self._quality = quality
-            if sentence := self._rate_watch(self._frame_rate()):
-                self.say(sentence)
+            with self._frames_condition:
+                self._quality = signal_quality
+            if rate_sentence := self._rate_watch(self._frame_rate()):
+                self.say(rate_sentence)
 
     def _collect_reference_frame(self, frame: LiveFrame) -> None:
         """Store a frame for the new reference if a new reference was requested."""
@@ -338,13 +340,13 @@ class Session:
         if len(self._collected_frames) == self._num_requested:
             self._reference, self._num_requested, self._collected_frames = np.array(self._collected_frames), 0, []
 
-    def _next_frame(self) -> LiveFrame | None:
+    def _wait_for_frame(self) -> LiveFrame | None:
         """Wait for the next frame to image, and return it; None at the end."""
-        with self._condition:
+        with self._frames_condition:
             while not self._waiting_frames:
                 if self._has_source_ended:
                     return None
-                self._condition.wait(0.5)
+                self._frames_condition.wait(0.5)
             oldest_arrival = time.monotonic() - _MAX_WAIT
             while len(self._waiting_frames) > 1 and self._waiting_frames[0].arrived < oldest_arrival:
                 self._waiting_frames.popleft()
@@ -352,7 +354,7 @@ class Session:
             return self._waiting_frames.popleft()
 
     def _image_frames(self) -> None:
-        while (frame := self._next_frame()) is not None:
+        while (frame := self._wait_for_frame()) is not None:
             self._set_reference()
             try:
                 picture = self.view.picture(frame)
@@ -360,16 +362,16 @@ class Session:
                 picture = Picture(None, status=FrameStatus.REFUSED, reason=f"{type(error).__name__}: {error}"[:300])
             self._publish_result(Result(frame, picture, time.monotonic() - frame.arrived))
         self._closed.set()
-        with self._condition:
+        with self._frames_condition:
             if self._num_requested:
                 self._messages.append(
                     (time.monotonic() - self.source.begun, "The source ended before a new reference.")
                 )
             self._is_finished = True
-            self._condition.notify_all()
+            self._frames_condition.notify_all()
 
     def _set_reference(self) -> None:
-        with self._condition:
+        with self._frames_condition:
             frames, self._reference = self._reference, None
         if frames is None:
             return
@@ -389,34 +391,34 @@ class Session:
             self.recorder.renew(time.monotonic() - self.source.begun, frames)
         self.say(f"New reference: mean of {counted(len(frames), 'frame')}.")
 
-    def _publish_result(self, result: Result) -> None:
-        with self._condition:
-            self._results.append(result)
-            self._num_bytes += _result_size(result)
-            oldest_arrival = result.frame.arrived - self.history
-            while len(self._results) > 1 and (
-                self._num_bytes > _MAX_BYTES or self._results[0].frame.arrived < oldest_arrival
+    def _publish_result(self, frame_result: Result) -> None:
+        with self._frames_condition:
+            self._stored_results.append(frame_result)
+            self._num_stored_bytes += _result_bytes(frame_result)
+            oldest_arrival = frame_result.frame.arrived - self.history
+            while len(self._stored_results) > 1 and (
+                self._num_stored_bytes > _MAX_BYTES or self._stored_results[0].frame.arrived < oldest_arrival
             ):
-                self._num_bytes -= _result_size(self._results.popleft())
-            if result.picture.status == FrameStatus.REFUSED:
+                self._num_stored_bytes -= _result_bytes(self._stored_results.popleft())
+            if frame_result.picture.status == FrameStatus.REFUSED:
                 self._num_refused += 1
             else:
                 self._num_imaged += 1
-                self._latencies.append(result.latency)
-            if result.picture.status == FrameStatus.REFUSED:
-                self._count_reason(result.picture.reason)
+                self._latencies.append(frame_result.latency)
+            if frame_result.picture.status == FrameStatus.REFUSED:
+                self._count_reason(frame_result.picture.reason)
             else:
-                self._statuses[result.picture.status] += 1
-            self._condition.notify_all()
-        for event in result.picture.events:
-            self.say(event)
+                self._status_counts[frame_result.picture.status] += 1
+            self._frames_condition.notify_all()
+        for picture_event in frame_result.picture.events:
+            self.say(picture_event)
 
-    def _count_reason(self, reason: str) -> None:
+    def _count_reason(self, refusal_reason: str) -> None:
         """Count a reason why a frame was refused. Reasons that differ only in numbers are counted together."""
-        pattern = _NUMBER_PATTERN.sub("#", reason)
-        if pattern not in self._reasons and len(self._reasons) >= _MAX_REASONS:
-            pattern, reason = "", "other reasons"
-        self._reasons.setdefault(pattern, [reason, 0])[1] += 1
+        reason_pattern = _NUMBER_PATTERN.sub("#", refusal_reason)
+        if reason_pattern not in self._refusal_reasons and len(self._refusal_reasons) >= _MAX_REASONS:
+            reason_pattern, refusal_reason = "", "other reasons"
+        self._refusal_reasons.setdefault(reason_pattern, [refusal_reason, 0])[1] += 1
 
 
 def frames(source: AbstractSource, view: AbstractView, *, recorder: Recorder | None = None) -> Iterator[Result]:
@@ -437,20 +439,20 @@ def frames(source: AbstractSource, view: AbstractView, *, recorder: Recorder | N
         print(result.frame.second, result.picture.markers)
     ```
     """
-    session, last_number = Session(source, view, recorder=recorder, history=_EVENT_STORAGE_TIME), -1
+    live_session, last_frame_number = Session(source, view, recorder=recorder, history=_EVENT_STORAGE_TIME), -1
     if recorder is not None:
-        session.record(True)
-    with session:
+        live_session.record(True)
+    with live_session:
         while True:
-            result = session.newest(last_number, 0.5)
-            if result is not None:
-                yield session.with_events(result, last_number)
-                last_number = result.frame.number
-            elif session.ended:
+            newest_result = live_session.newest(last_frame_number, 0.5)
+            if newest_result is not None:
+                yield live_session.with_events(newest_result, last_frame_number)
+                last_frame_number = newest_result.frame.number
+            elif live_session.ended:
                 return
 
 
-def _result_size(result: Result) -> int:
+def _result_bytes(result: Result) -> int:
     """Memory of a result in bytes."""
     pixels, values = result.picture.pixels, result.frame.values
     return 500 + (0 if pixels is None else pixels.nbytes) + (len(values) if isinstance(values, str) else values.nbytes)

@@ -90,7 +90,7 @@ class SimulatedSensor(AbstractSource):
         self.reference, self.rate, self.limit, self.period = reference, float(rate), limit, period
         self.states, self._positions = rest + changes, places
         self._noise = _noise_deviation(rest)
-        self._random = np.random.default_rng(seed)
+        self._random_generator = np.random.default_rng(seed)
 
     def truth(self, second: float) -> tuple[float, float] | None:
         """True position (x, y) of the rod or finger at the time `second`, in metres; None if nothing touches the
@@ -98,19 +98,22 @@ class SimulatedSensor(AbstractSource):
         x, y = self._positions[self._state_index(second)].tolist()
         return None if np.isnan(x) else (x, y)
 
-    def _state_index(self, time: float) -> int:
-        return int(time / self.period * len(self.states)) % len(self.states)
+    def _state_index(self, elapsed_time: float) -> int:
+        return int(elapsed_time / self.period * len(self.states)) % len(self.states)
 
     def __iter__(self) -> Iterator[LiveFrame]:
         self.begun = time.monotonic()
-        number = 0
-        while self.limit is None or number < self.limit:
-            if self.closing.wait(max(0.0, self.begun + number / self.rate - time.monotonic())):
+        frame_number = 0
+        while self.limit is None or frame_number < self.limit:
+            if self.closing.wait(max(0.0, self.begun + frame_number / self.rate - time.monotonic())):
                 break
             arrival_time = time.monotonic()
-            values = self.states[self._state_index(arrival_time - self.begun)]
-            yield self.frame(values + self._noise * self._random.standard_normal(values.shape), arrival_time)
-            number += 1
+            clean_voltages = self.states[self._state_index(arrival_time - self.begun)]
+            yield self.frame(
+                clean_voltages + self._noise * self._random_generator.standard_normal(clean_voltages.shape),
+                arrival_time,
+            )
+            frame_number += 1
         self.connection = ENDED
 
 
@@ -132,27 +135,29 @@ def simulated_tank(rate: float = 60.0, *, limit: int | None = None, seed: int = 
     print(len(list(source)), source.truth(0.5))
     ```
     """
-    tank = RoundSkin(radius=0.1, electrode_width=0.02, contact_impedance=1e-3, conductivity=0.01, num_points=_NUM_NODES)
-    model = tank.model()
+    round_tank = RoundSkin(
+        radius=0.1, electrode_width=0.02, contact_impedance=1e-3, conductivity=0.01, num_points=_NUM_NODES
+    )
+    model = round_tank.model()
     cells = np.asarray(centroids(model.mesh))
-    reference_voltages = np.asarray(model.voltages(np.full(len(cells), tank.conductivity)))
-    pitch = 2 * np.pi / tank.num_electrodes
-    angles = pitch * np.arange(_STEPS_PER_ELECTRODE * tank.num_electrodes) / _STEPS_PER_ELECTRODE
-    positions = _ROD_PATH_RADIUS * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    inside_masks = np.sum((cells - positions[:_STEPS_PER_ELECTRODE, None]) ** 2, axis=2) < _ROD_RADIUS**2
+    reference_voltages = np.asarray(model.voltages(np.full(len(cells), round_tank.conductivity)))
+    electrode_pitch = 2 * np.pi / round_tank.num_electrodes
+    rod_angles = electrode_pitch * np.arange(_STEPS_PER_ELECTRODE * round_tank.num_electrodes) / _STEPS_PER_ELECTRODE
+    rod_positions = _ROD_PATH_RADIUS * np.stack([np.cos(rod_angles), np.sin(rod_angles)], axis=1)
+    inside_masks = np.sum((cells - rod_positions[:_STEPS_PER_ELECTRODE, None]) ** 2, axis=2) < _ROD_RADIUS**2
     first_changes = [
-        np.asarray(model.voltages(tank.conductivity * np.where(is_inside, _ROD_CONDUCTIVITY, 1.0)))
+        np.asarray(model.voltages(round_tank.conductivity * np.where(is_inside, _ROD_CONDUCTIVITY, 1.0)))
         for is_inside in inside_masks
     ] - reference_voltages
-    changes = np.concatenate([_rotate_changes(first_changes, k) for k in range(tank.num_electrodes)])
-    reference = _simulate_reference(tank, model, reference_voltages, seed, "simulated tank")
+    voltage_changes = np.concatenate([_rotate_changes(first_changes, k) for k in range(round_tank.num_electrodes)])
+    reference_recording = _simulate_reference(round_tank, model, reference_voltages, seed, "simulated tank")
     name = "demo: a tank in which a rod goes round"
     return SimulatedSensor(
         name,
-        reference,
+        reference_recording,
         reference_voltages,
-        changes,
-        positions,
+        voltage_changes,
+        rod_positions,
         period=_ROD_REVOLUTION_TIME,
         rate=rate,
         limit=limit,
@@ -177,10 +182,10 @@ def simulated_skin(rate: float = 60.0, *, limit: int | None = None, seed: int = 
     print(len(list(source)), source.truth(0.5))
     ```
     """
-    skin = RoundSkin(num_points=_NUM_NODES)
-    model = skin.model()
+    round_skin = RoundSkin(num_points=_NUM_NODES)
+    model = round_skin.model()
     cells = centroids(model.mesh)
-    reference_voltages = np.asarray(model.voltages(np.full(model.mesh.num_cells, skin.conductivity)))
+    reference_voltages = np.asarray(model.voltages(np.full(model.mesh.num_cells, round_skin.conductivity)))
     path = np.stack(
         [
             np.linspace(-_HALF_STROKE_LENGTH, _HALF_STROKE_LENGTH, _NUM_STROKE_STATES),
@@ -189,36 +194,52 @@ def simulated_skin(rate: float = 60.0, *, limit: int | None = None, seed: int = 
         axis=1,
     )
     # The finger is lowered and lifted at the ends of a stroke.
-    strengths = _RELATIVE_CHANGE * np.minimum(
+    stroke_strengths = _RELATIVE_CHANGE * np.minimum(
         1, 4 * np.sin(np.pi * (np.arange(_NUM_STROKE_STATES) + 0.5) / _NUM_STROKE_STATES)
     )
-    conductivities = [
-        pressed_conductivity(cells, skin.conductivity, position, _FINGER_RADIUS, strength)
-        for position, strength in zip(path, strengths, strict=True)
+    stroke_conductivities = [
+        pressed_conductivity(cells, round_skin.conductivity, touch_position, _FINGER_RADIUS, touch_strength)
+        for touch_position, touch_strength in zip(path, stroke_strengths, strict=True)
     ]
     stroke_positions = (
-        np.stack([np.asarray(model.voltages(np.asarray(conductivity))) for conductivity in conductivities])
+        np.stack([np.asarray(model.voltages(np.asarray(conductivity))) for conductivity in stroke_conductivities])
         - reference_voltages
     )
-    pitches = [_STROKE_PITCHES * k for k in range(skin.num_electrodes)]
+    rotation_pitches = [_STROKE_PITCHES * k for k in range(round_skin.num_electrodes)]
     states_during_pause = (
         np.zeros((_NUM_PAUSE_STATES, len(reference_voltages))),
         np.full((_NUM_PAUSE_STATES, 2), np.nan),
     )
-    changes = np.concatenate(
-        [block for k in pitches for block in (_rotate_changes(stroke_positions, k), states_during_pause[0])]
+    voltage_changes = np.concatenate(
+        [
+            state_block
+            for k in rotation_pitches
+            for state_block in (_rotate_changes(stroke_positions, k), states_during_pause[0])
+        ]
     )
-    angles = 2 * np.pi / skin.num_electrodes * np.array(pitches)
-    rotation_matrices = np.stack([np.cos(angles), np.sin(angles), -np.sin(angles), np.cos(angles)], axis=1).reshape(
-        -1, 2, 2
+    rotation_angles = 2 * np.pi / round_skin.num_electrodes * np.array(rotation_pitches)
+    rotation_matrices = np.stack(
+        [np.cos(rotation_angles), np.sin(rotation_angles), -np.sin(rotation_angles), np.cos(rotation_angles)], axis=1
+    ).reshape(-1, 2, 2)
+    touch_positions = np.concatenate(
+        [
+            state_block
+            for rotation_matrix in rotation_matrices
+            for state_block in (path @ rotation_matrix, states_during_pause[1])
+        ]
     )
-    positions = np.concatenate(
-        [block for rotation in rotation_matrices for block in (path @ rotation, states_during_pause[1])]
-    )
-    reference = _simulate_reference(skin, model, reference_voltages, seed, "simulated skin")
-    name, period = "demo: a skin that is stroked", _STROKE_TIME * skin.num_electrodes
+    reference_recording = _simulate_reference(round_skin, model, reference_voltages, seed, "simulated skin")
+    name, stroke_period = "demo: a skin that is stroked", _STROKE_TIME * round_skin.num_electrodes
     return SimulatedSensor(
-        name, reference, reference_voltages, changes, positions, period=period, rate=rate, limit=limit, seed=seed
+        name,
+        reference_recording,
+        reference_voltages,
+        voltage_changes,
+        touch_positions,
+        period=stroke_period,
+        rate=rate,
+        limit=limit,
+        seed=seed,
     )
 
 
@@ -233,11 +254,13 @@ def open_simulated(text: str, rate: float | None = None) -> SimulatedSensor:
     return _SIMULATED_SENSORS[sensor_kind](60.0 if rate is None else rate)
 
 
-def _rotate_changes(changes: Float[np.ndarray, "n M"], pitches: int) -> Float[np.ndarray, "n M"]:
-    """Return the voltage changes (states, channels) after an anticlockwise rotation of the touching bodies by `pitches`
-    electrode spacings. The rotation permutes the channels, because the 16 electrodes are numbered clockwise, and each
-    drive has equally many channels."""
-    return np.roll(changes.reshape(len(changes), 16, -1), -pitches, axis=1).reshape(changes.shape)
+def _rotate_changes(voltage_changes: Float[np.ndarray, "n M"], num_pitches: int) -> Float[np.ndarray, "n M"]:
+    """Return the voltage changes (states, channels) after an anticlockwise rotation of the touching bodies by
+    `num_pitches` electrode spacings. The rotation permutes the channels, because the 16 electrodes are numbered
+    clockwise, and each drive has equally many channels."""
+    return np.roll(voltage_changes.reshape(len(voltage_changes), 16, -1), -num_pitches, axis=1).reshape(
+        voltage_changes.shape
+    )
 
 
 def _noise_deviation(reference_voltages: Float[np.ndarray, " M"]) -> float:
@@ -245,7 +268,7 @@ def _noise_deviation(reference_voltages: Float[np.ndarray, " M"]) -> float:
 
 
 def _simulate_reference(
-    skin: RoundSkin, model: ForwardModel, reference_voltages: Float[np.ndarray, " M"], seed: int, name: str
+    round_skin: RoundSkin, model: ForwardModel, reference_voltages: Float[np.ndarray, " M"], seed: int, name: str
 ) -> Measurement:
     noise = _noise_deviation(reference_voltages) * np.random.default_rng((seed, 1)).standard_normal(
         (_NUM_REFERENCE_FRAMES, len(reference_voltages))
@@ -254,7 +277,7 @@ def _simulate_reference(
         reference_voltages + noise,
         model.protocol,
         electrodes=model.electrodes,
-        domain=Disk(skin.radius),
+        domain=Disk(round_skin.radius),
         name=name,
         source="simulated",
         notes=("simulated, not measured.",),

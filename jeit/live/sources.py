@@ -107,10 +107,10 @@ class PlayedRecording(AbstractSource):
 
     def __iter__(self) -> Iterator[LiveFrame]:
         self.begun = time.monotonic()
-        for second, values in zip(self.seconds.tolist(), self.frames, strict=True):
-            if self.closing.wait(max(0.0, self.begun + second - time.monotonic())):
+        for frame_second, frame_values in zip(self.seconds.tolist(), self.frames, strict=True):
+            if self.closing.wait(max(0.0, self.begun + frame_second - time.monotonic())):
                 break
-            yield self.frame(values)
+            yield self.frame(frame_values)
         self.connection = ENDED
 
 
@@ -144,53 +144,53 @@ class WatchedFolder(AbstractSource):
         self.begun = time.monotonic()
         pause_duration = _MIN_PAUSE
         while not self.closing.wait(pause_duration):
-            start = time.monotonic()
+            start_time = time.monotonic()
             try:
-                sizes = self._list_sizes()
+                file_sizes = self._list_sizes()
             except OSError as error:
                 if self.connection == CONNECTED:
                     self.connection = f"waiting: {error}"[:300]
                     self.say(f"The folder cannot be read: {error}.")
                 continue
-            pause_duration = max(_MIN_PAUSE, _PAUSE_FACTOR * (time.monotonic() - start))
+            pause_duration = max(_MIN_PAUSE, _PAUSE_FACTOR * (time.monotonic() - start_time))
             if self.connection != CONNECTED:
                 self.connection = CONNECTED
                 self.say("The folder can be read again.")
-            self._known_names &= sizes.keys()
-            for name in [name for name in self._pending_files if name not in sizes]:
+            self._known_names &= file_sizes.keys()
+            for name in [name for name in self._pending_files if name not in file_sizes]:
                 del self._pending_files[name]
-            for name in sorted(sizes.keys() - self._known_names):
-                yield from self._read_file(name, sizes[name])
+            for name in sorted(file_sizes.keys() - self._known_names):
+                yield from self._read_file(name, file_sizes[name])
         self.connection = ENDED
 
     def _list_sizes(self) -> dict[str, int]:
         """Sizes of the files in the folder by name. Hidden and temporary files are left out, because programs write
         such files first and then rename them."""
-        with os.scandir(self.folder) as entries:
-            sizes = {}
-            for entry in entries:
+        with os.scandir(self.folder) as folder_entries:
+            file_sizes = {}
+            for folder_entry in folder_entries:
                 try:
                     if (
-                        not entry.name.startswith(".")
-                        and not entry.name.endswith((".toml", ".part", ".tmp"))
-                        and entry.is_file()
+                        not folder_entry.name.startswith(".")
+                        and not folder_entry.name.endswith((".toml", ".part", ".tmp"))
+                        and folder_entry.is_file()
                     ):
-                        sizes[entry.name] = entry.stat().st_size
+                        file_sizes[folder_entry.name] = folder_entry.stat().st_size
                 except OSError:  # the file was removed after the listing
                     continue
-            return sizes
+            return file_sizes
 
-    def _read_file(self, name: str, size: int) -> Iterator[LiveFrame]:
+    def _read_file(self, name: str, file_size: int) -> Iterator[LiveFrame]:
         """Yield the frames of a file if the file is complete."""
-        previous_size, time_of_size = self._pending_files.get(name, (-1, time.monotonic()))
-        if size != previous_size:
+        previous_file_size, time_of_size = self._pending_files.get(name, (-1, time.monotonic()))
+        if file_size != previous_file_size:
             time_of_size = time.monotonic()
-        self._pending_files[name] = size, time_of_size
-        if size != previous_size or not size:
+        self._pending_files[name] = file_size, time_of_size
+        if file_size != previous_file_size or not file_size:
             return
         try:
-            measured = read(self.folder / name, description=self.description, like=self.reference)
-            frames = frames_of(measured)
+            file_measurement = read(self.folder / name, description=self.description, like=self.reference)
+            frames = frames_of(file_measurement)
             if frames.dtype.kind == "c":
                 raise ValueError(f"{name}: the voltages are complex; choose a part with [data] component.")
         except (ValueError, OSError) as error:
@@ -200,12 +200,12 @@ class WatchedFolder(AbstractSource):
             yield self.frame(f"{error}"[:400])
             return
         self._mark_as_read(name)
-        for values in frames:
+        for frame_values in frames:
             if self.rate is not None:
-                scheduled_time = self.begun + self._num_frames / self.rate
-                if self.closing.wait(max(0.0, scheduled_time - time.monotonic())):
+                scheduled_frame_time = self.begun + self._num_frames / self.rate
+                if self.closing.wait(max(0.0, scheduled_frame_time - time.monotonic())):
                     return
-            yield self.frame(values)
+            yield self.frame(frame_values)
 
     def _mark_as_read(self, name: str) -> None:
         self._pending_files.pop(name, None)
@@ -259,9 +259,9 @@ def open_source(
     if text and path.is_dir():
         return WatchedFolder(path, description, reference, rate)
     if path.is_file():
-        measured = read(path, description=description, like=reference)
-        times = None if measured.times is None else np.asarray(measured.times)
-        return PlayedRecording(text, frames_of(measured), times, rate)
+        recorded_measurement = read(path, description=description, like=reference)
+        frame_times = None if recorded_measurement.times is None else np.asarray(recorded_measurement.times)
+        return PlayedRecording(text, frames_of(recorded_measurement), frame_times, rate)
     raise ValueError(
         f"source: there is no file or folder '{text[:80]}'. Give one, - for standard input, serial:PORT@BAUD, "
         "tcp:HOST:PORT, or demo."

@@ -23,143 +23,172 @@ _NEXT_CORNER = np.array([1, 2, 0])
 def first_crossing(points: np.ndarray, cells: np.ndarray) -> tuple[int, int] | None:
     """Indices of two triangles of `cells` (m, 3) that cross, touch or overlap outside the nodes and edges that they
     share; None if there are no such triangles."""
-    tolerance = _TOUCH_TOLERANCE * float(np.ptp(points, axis=0).max())
-    for pairs in _near_pairs(points[cells], tolerance):
-        num_shared = (cells[pairs[:, 0], :, None] == cells[pairs[:, 1], None, :]).sum(axis=(1, 2))
-        is_crossing = np.zeros(len(pairs), bool)
-        shares_no_node, shares_node, shares_edge = num_shared == 0, num_shared == 1, num_shared == 2
-        is_crossing[shares_no_node] = _intersect(points, cells, pairs[shares_no_node], tolerance)
-        is_crossing[shares_node] = _cross_opposite(points, cells, pairs[shares_node], tolerance)
-        is_crossing[shares_edge] = _overlap_at_edge(points, cells, pairs[shares_edge])
+    touch_tolerance = _TOUCH_TOLERANCE * float(np.ptp(points, axis=0).max())
+    for triangle_pairs in _near_triangle_pairs(points[cells], touch_tolerance):
+        num_shared = (cells[triangle_pairs[:, 0], :, None] == cells[triangle_pairs[:, 1], None, :]).sum(axis=(1, 2))
+        is_crossing = np.zeros(len(triangle_pairs), bool)
+        has_no_shared_node, has_shared_node, has_shared_edge = num_shared == 0, num_shared == 1, num_shared == 2
+        is_crossing[has_no_shared_node] = _triangles_intersect(
+            points, cells, triangle_pairs[has_no_shared_node], touch_tolerance
+        )
+        is_crossing[has_shared_node] = _triangles_cross_opposite_node(
+            points, cells, triangle_pairs[has_shared_node], touch_tolerance
+        )
+        is_crossing[has_shared_edge] = _overlap_at_edge(points, cells, triangle_pairs[has_shared_edge])
         if is_crossing.any():
-            first_cell, second_cell = np.sort(pairs[is_crossing][0]).tolist()
+            first_cell, second_cell = np.sort(triangle_pairs[is_crossing][0]).tolist()
             return first_cell, second_cell
     return None
 
 
-def _near_pairs(corners: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
+def _near_triangle_pairs(triangle_corners: np.ndarray, touch_tolerance: float) -> Iterator[np.ndarray]:
     """Yield pairs (p, 2) of triangles whose bounding boxes overlap, in batches.
 
     Triangles are grouped by size, and each group has its own search tree. A few large triangles then do not enlarge the
     search radius of all other triangles.
     """
-    centroids = corners.mean(axis=1)
-    radii = np.linalg.norm(corners - centroids[:, None], axis=2).max(axis=1)
-    lower_corners, upper_corners = corners.min(axis=1) - tolerance, corners.max(axis=1) + tolerance
-    size_class = np.floor(np.log2(radii)).astype(int)
-    size_classes = [np.flatnonzero(size_class == value) for value in np.unique(size_class)]
-    for k, members in enumerate(size_classes):
-        tree = KDTree(centroids[members])
+    triangle_centroids = triangle_corners.mean(axis=1)
+    triangle_radii = np.linalg.norm(triangle_corners - triangle_centroids[:, None], axis=2).max(axis=1)
+    lower_corners, upper_corners = (
+        triangle_corners.min(axis=1) - touch_tolerance,
+        triangle_corners.max(axis=1) + touch_tolerance,
+    )
+    size_class = np.floor(np.log2(triangle_radii)).astype(int)
+    size_classes = [np.flatnonzero(size_class == class_number) for class_number in np.unique(size_class)]
+    for k, triangles_of_class in enumerate(size_classes):
+        centroid_tree = KDTree(triangle_centroids[triangles_of_class])
         same_size_or_larger_triangles = np.concatenate(size_classes[k:])
         batch_size = max(1, _PAIRS_PER_BATCH // 64)
-        for start in range(0, len(same_size_or_larger_triangles), batch_size):
-            queried_triangles = same_size_or_larger_triangles[start : start + batch_size]
-            neighbours = tree.query_ball_point(
-                centroids[queried_triangles], radii[queried_triangles] + radii[members].max() + tolerance
+        for batch_start in range(0, len(same_size_or_larger_triangles), batch_size):
+            queried_triangles = same_size_or_larger_triangles[batch_start : batch_start + batch_size]
+            neighbour_lists = centroid_tree.query_ball_point(
+                triangle_centroids[queried_triangles],
+                triangle_radii[queried_triangles] + triangle_radii[triangles_of_class].max() + touch_tolerance,
             )
-            num_neighbours = np.fromiter(map(len, neighbours), int, len(neighbours))
+            num_neighbours = np.fromiter(map(len, neighbour_lists), int, len(neighbour_lists))
             first_cells = np.repeat(queried_triangles, num_neighbours)
-            second_cells = members[np.concatenate([np.asarray(indices, int) for indices in neighbours])]
+            second_cells = triangles_of_class[
+                np.concatenate([np.asarray(neighbour_indices, int) for neighbour_indices in neighbour_lists])
+            ]
             # A pair of triangles of the same size class occurs twice; return it once.
             is_first_occurrence = np.where(
                 size_class[first_cells] == size_class[second_cells], first_cells < second_cells, True
             )
-            boxes_overlap = (lower_corners[first_cells] <= upper_corners[second_cells]).all(axis=1) & (
+            are_boxes_overlapping = (lower_corners[first_cells] <= upper_corners[second_cells]).all(axis=1) & (
                 lower_corners[second_cells] <= upper_corners[first_cells]
             ).all(axis=1)
-            yield np.column_stack([first_cells, second_cells])[is_first_occurrence & boxes_overlap]
+            yield np.column_stack([first_cells, second_cells])[is_first_occurrence & are_boxes_overlapping]
 
 
-def _intersect(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray, tolerance: float) -> np.ndarray:
+def _triangles_intersect(
+    points: np.ndarray, cells: np.ndarray, triangle_pairs: np.ndarray, touch_tolerance: float
+) -> np.ndarray:
     """Whether the two triangles of each pair intersect (p,); the triangles have no node in common."""
-    first_corners, second_corners = points[cells[pairs[:, 0]]], points[cells[pairs[:, 1]]]
-    is_crossing = _overlap_in_plane(first_corners, second_corners, tolerance)
+    first_corners, second_corners = points[cells[triangle_pairs[:, 0]]], points[cells[triangle_pairs[:, 1]]]
+    is_crossing = _overlap_in_plane(first_corners, second_corners, touch_tolerance)
     for segment_triangles, face_triangles in ((first_corners, second_corners), (second_corners, first_corners)):
         for k in range(3):
             is_crossing |= _segments_intersect_triangles(
-                segment_triangles[:, k], segment_triangles[:, _NEXT_CORNER[k]], face_triangles, tolerance
+                segment_triangles[:, k], segment_triangles[:, _NEXT_CORNER[k]], face_triangles, touch_tolerance
             )
     return is_crossing
 
 
-def _cross_opposite(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray, tolerance: float) -> np.ndarray:
+def _triangles_cross_opposite_node(
+    points: np.ndarray, cells: np.ndarray, triangle_pairs: np.ndarray, touch_tolerance: float
+) -> np.ndarray:
     """Whether the two triangles of each pair (p, 2), which have one common node, intersect elsewhere: the edge of one
     triangle that is opposite to the common node pierces the other triangle."""
-    is_crossing = np.zeros(len(pairs), bool)
-    for segment_triangles, face_triangles in (pairs.T, pairs.T[::-1]):
+    is_crossing = np.zeros(len(triangle_pairs), bool)
+    for segment_triangles, face_triangles in (triangle_pairs.T, triangle_pairs.T[::-1]):
         segment_cells = cells[segment_triangles]
         common_corner = (segment_cells[:, :, None] == cells[face_triangles][:, None, :]).any(axis=2).argmax(axis=1)
-        start, end = (
-            points[segment_cells[np.arange(len(segment_cells)), (common_corner + step) % 3]] for step in (1, 2)
+        segment_starts, segment_ends = (
+            points[segment_cells[np.arange(len(segment_cells)), (common_corner + corner_step) % 3]]
+            for corner_step in (1, 2)
         )
-        is_crossing |= _segments_intersect_triangles(start, end, points[cells[face_triangles]], tolerance)
+        is_crossing |= _segments_intersect_triangles(
+            segment_starts, segment_ends, points[cells[face_triangles]], touch_tolerance
+        )
     return is_crossing
 
 
-def _overlap_at_edge(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+def _overlap_at_edge(points: np.ndarray, cells: np.ndarray, triangle_pairs: np.ndarray) -> np.ndarray:
     """Whether the two triangles of each pair overlap (p,); the triangles share an edge."""
-    first_cells, second_cells = cells[pairs[:, 0]], cells[pairs[:, 1]]
+    first_cells, second_cells = cells[triangle_pairs[:, 0]], cells[triangle_pairs[:, 1]]
     is_opposite_corner = ~(first_cells[:, :, None] == second_cells[:, None, :]).any(axis=2)
     is_other_tip = ~(second_cells[:, :, None] == first_cells[:, None, :]).any(axis=2)
     tip_points = points[first_cells[is_opposite_corner]], points[second_cells[is_other_tip]]
-    edge = first_cells[~is_opposite_corner].reshape(-1, 2)
-    start, direction = points[edge[:, 0]], points[edge[:, 1]] - points[edge[:, 0]]
-    direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    perpendiculars = [
-        opposite_corner - start - ((opposite_corner - start) * direction).sum(axis=1, keepdims=True) * direction
+    shared_edges = first_cells[~is_opposite_corner].reshape(-1, 2)
+    edge_starts, edge_directions = points[shared_edges[:, 0]], points[shared_edges[:, 1]] - points[shared_edges[:, 0]]
+    edge_directions = edge_directions / np.linalg.norm(edge_directions, axis=1, keepdims=True)
+    tip_perpendiculars = [
+        opposite_corner
+        - edge_starts
+        - ((opposite_corner - edge_starts) * edge_directions).sum(axis=1, keepdims=True) * edge_directions
         for opposite_corner in tip_points
     ]
-    lengths = [np.linalg.norm(perpendicular, axis=1) for perpendicular in perpendiculars]
-    return (perpendiculars[0] * perpendiculars[1]).sum(axis=1) > (1 - 1e-12) * lengths[0] * lengths[1]
+    perpendicular_lengths = [np.linalg.norm(tip_perpendicular, axis=1) for tip_perpendicular in tip_perpendiculars]
+    return (tip_perpendiculars[0] * tip_perpendiculars[1]).sum(axis=1) > (1 - 1e-12) * perpendicular_lengths[
+        0
+    ] * perpendicular_lengths[1]
 
 
 def _segments_intersect_triangles(
-    start: np.ndarray, end: np.ndarray, corners: np.ndarray, tolerance: float
+    segment_starts: np.ndarray, segment_ends: np.ndarray, triangle_corners: np.ndarray, touch_tolerance: float
 ) -> np.ndarray:
-    """Whether the segments from `start` to `end` (p, 3) intersect the triangles (p, 3, 3), as booleans (p,). A segment
-    that lies in the plane of its triangle does not count."""
-    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    normal = np.cross(a, b)
-    doubled_areas = np.linalg.norm(normal, axis=1)
-    unit = normal / doubled_areas[:, None]
-    start_height, end_height = (((point - corners[:, 0]) * unit).sum(axis=1) for point in (start, end))
-    is_crossing = (np.minimum(start_height, end_height) <= tolerance) & (
-        np.maximum(start_height, end_height) >= -tolerance
+    """Whether the segments from `segment_starts` to `segment_ends` (p, 3) intersect the triangles (p, 3, 3), as
+    booleans (p,). A segment that lies in the plane of its triangle does not count."""
+    a, b = triangle_corners[:, 1] - triangle_corners[:, 0], triangle_corners[:, 2] - triangle_corners[:, 0]
+    triangle_normals = np.cross(a, b)
+    doubled_areas = np.linalg.norm(triangle_normals, axis=1)
+    unit_normals = triangle_normals / doubled_areas[:, None]
+    start_height, end_height = (
+        ((segment_point - triangle_corners[:, 0]) * unit_normals).sum(axis=1)
+        for segment_point in (segment_starts, segment_ends)
     )
-    is_crossing &= np.maximum(np.abs(start_height), np.abs(end_height)) > tolerance
-    fraction = np.clip(start_height / np.where(is_crossing, start_height - end_height, 1.0), 0, 1)
-    intersection_points = start + fraction[:, None] * (end - start) - corners[:, 0]
-    u = (np.cross(intersection_points, b) * unit).sum(axis=1) / doubled_areas
-    v = (np.cross(a, intersection_points) * unit).sum(axis=1) / doubled_areas
+    is_crossing = (np.minimum(start_height, end_height) <= touch_tolerance) & (
+        np.maximum(start_height, end_height) >= -touch_tolerance
+    )
+    is_crossing &= np.maximum(np.abs(start_height), np.abs(end_height)) > touch_tolerance
+    crossing_fraction = np.clip(start_height / np.where(is_crossing, start_height - end_height, 1.0), 0, 1)
+    intersection_points = (
+        segment_starts + crossing_fraction[:, None] * (segment_ends - segment_starts) - triangle_corners[:, 0]
+    )
+    u = (np.cross(intersection_points, b) * unit_normals).sum(axis=1) / doubled_areas
+    v = (np.cross(a, intersection_points) * unit_normals).sum(axis=1) / doubled_areas
     return is_crossing & (np.minimum(np.minimum(u, v), 1 - u - v) >= -_TOUCH_TOLERANCE)
 
 
-def _overlap_in_plane(first_triangles: np.ndarray, second_triangles: np.ndarray, tolerance: float) -> np.ndarray:
+def _overlap_in_plane(first_triangles: np.ndarray, second_triangles: np.ndarray, touch_tolerance: float) -> np.ndarray:
     """Whether the two triangles with corners `first_triangles` and `second_triangles` (p, 3, 3) are coplanar and
     overlap, as booleans (p,). Coplanar triangles do not overlap if the line through an edge of either triangle
     separates them."""
-    normal = np.cross(first_triangles[:, 1] - first_triangles[:, 0], first_triangles[:, 2] - first_triangles[:, 0])
-    unit = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-    height = np.einsum("pki,pi->pk", second_triangles - first_triangles[:, :1], unit)
-    is_overlapping = np.abs(height).max(axis=1) <= tolerance
-    first_triangles, second_triangles, unit = (
+    plane_normals = np.cross(
+        first_triangles[:, 1] - first_triangles[:, 0], first_triangles[:, 2] - first_triangles[:, 0]
+    )
+    unit_normals = plane_normals / np.linalg.norm(plane_normals, axis=1, keepdims=True)
+    heights_above_plane = np.einsum("pki,pi->pk", second_triangles - first_triangles[:, :1], unit_normals)
+    is_overlapping = np.abs(heights_above_plane).max(axis=1) <= touch_tolerance
+    first_triangles, second_triangles, unit_normals = (
         first_triangles[is_overlapping],
         second_triangles[is_overlapping],
-        unit[is_overlapping],
+        unit_normals[is_overlapping],
     )
     is_separated = np.zeros(len(first_triangles), bool)
     for edge_triangles in (first_triangles, second_triangles):
         for k in range(3):
-            edge_normals = np.cross(edge_triangles[:, _NEXT_CORNER[k]] - edge_triangles[:, k], unit)
+            edge_normals = np.cross(edge_triangles[:, _NEXT_CORNER[k]] - edge_triangles[:, k], unit_normals)
             edge_normals = edge_normals / np.linalg.norm(edge_normals, axis=1, keepdims=True)
-            projections = [
-                np.einsum("pki,pi->pk", corners, edge_normals) for corners in (first_triangles, second_triangles)
+            normal_projections = [
+                np.einsum("pki,pi->pk", triangle_corners, edge_normals)
+                for triangle_corners in (first_triangles, second_triangles)
             ]
-            gap = np.maximum(
-                projections[0].min(axis=1) - projections[1].max(axis=1),
-                projections[1].min(axis=1) - projections[0].max(axis=1),
+            projection_gap = np.maximum(
+                normal_projections[0].min(axis=1) - normal_projections[1].max(axis=1),
+                normal_projections[1].min(axis=1) - normal_projections[0].max(axis=1),
             )
-            is_separated |= gap > tolerance
+            is_separated |= projection_gap > touch_tolerance
     is_overlapping[is_overlapping] = ~is_separated
     return is_overlapping
 
@@ -177,8 +206,8 @@ def orient_surface(cells: np.ndarray, points: np.ndarray | None) -> np.ndarray:
     is_odd_permutation = topology.odd_permutation(topology.cell_facets(cells))
     # Two triangles have the same orientation if they traverse their common edge in opposite directions; otherwise one
     # of the two must be turned.
-    needs_flip = is_odd_permutation[first_edges] == is_odd_permutation[second_edges]
-    is_flipped = _find_triangles_to_flip(first_triangle, second_triangle, needs_flip, cells)
+    is_to_flip = is_odd_permutation[first_edges] == is_odd_permutation[second_edges]
+    is_flipped = _find_triangles_to_flip(first_triangle, second_triangle, is_to_flip, cells)
     _check_node_contacts(cells, first_edges, second_edges)
     if np.count_nonzero(is_flipped) * 2 > len(cells):
         is_flipped = ~is_flipped
@@ -186,11 +215,11 @@ def orient_surface(cells: np.ndarray, points: np.ndarray | None) -> np.ndarray:
     oriented_cells = np.where(is_flipped[:, None], cells[:, [0, 2, 1]], cells)
     if points is None:
         return oriented_cells
-    if (pair := first_crossing(points, cells)) is not None:
-        crossing_centre = points[cells[pair[0]]].mean(axis=0).round(6).tolist()
+    if (crossing_pair := first_crossing(points, cells)) is not None:
+        crossing_centre = points[cells[crossing_pair[0]]].mean(axis=0).round(6).tolist()
         raise ValueError(
-            f"cells: the surface crosses or touches itself: triangles {pair[0]} and {pair[1]} meet, at "
-            f"{crossing_centre} m. Move the nodes apart, or unite what overlaps where the surface was made."
+            f"cells: the surface crosses or touches itself: triangles {crossing_pair[0]} and {crossing_pair[1]} meet, "
+            f"at {crossing_centre} m. Move the nodes apart, or unite what overlaps where the surface was made."
         )
     if is_closed and enclosed_volume(points, oriented_cells) < 0:
         if not is_flipped.any():
@@ -206,17 +235,17 @@ def orient_surface(cells: np.ndarray, points: np.ndarray | None) -> np.ndarray:
 
 def enclosed_volume(points: np.ndarray, cells: np.ndarray) -> float:
     """Volume in m³ enclosed by a closed surface (Gauss's theorem); negative if its triangles face inwards."""
-    corners = points[cells] - points.mean(axis=0)
-    return float(np.linalg.det(corners).sum() / 6)
+    centred_corners = points[cells] - points.mean(axis=0)
+    return float(np.linalg.det(centred_corners).sum() / 6)
 
 
 def _pair_edges(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of rows of `topology.cell_facets(cells)` that contain the same edge. Raises `ValueError` for an edge of
     more than two triangles."""
-    edges = topology.cell_facets(cells)
-    first_edges, second_edges, overcrowded_edges = topology.match_facets(edges, int(cells.max()) + 1)
+    cell_edges = topology.cell_facets(cells)
+    first_edges, second_edges, overcrowded_edges = topology.match_facets(cell_edges, int(cells.max()) + 1)
     if overcrowded_edges.size:
-        nodes = np.sort(edges[overcrowded_edges[0]]).tolist()
+        nodes = np.sort(cell_edges[overcrowded_edges[0]]).tolist()
         raise ValueError(
             f"cells: the edge of nodes {nodes} belongs to more than two triangles (among them "
             f"{sorted((overcrowded_edges // 3).tolist())}), so the surface is not manifold there, as where walls "
@@ -235,18 +264,20 @@ def _find_triangles_to_flip(
     edge. The graph falls into two components if the surface has two sides.
     """
     num_triangles = len(cells)
-    rows = np.concatenate([first_edges, first_edges + num_triangles])
-    columns = np.concatenate(
+    graph_rows = np.concatenate([first_edges, first_edges + num_triangles])
+    graph_columns = np.concatenate(
         [second_edges + num_triangles * has_opposite_direction, second_edges + num_triangles * ~has_opposite_direction]
     )
-    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * num_triangles, 2 * num_triangles))
-    _, label = connected_components(graph, directed=False)
-    if label[0] == label[num_triangles]:
+    orientation_graph = coo_array(
+        (np.ones(len(graph_rows)), (graph_rows, graph_columns)), shape=(2 * num_triangles, 2 * num_triangles)
+    )
+    _, component_labels = connected_components(orientation_graph, directed=False)
+    if component_labels[0] == component_labels[num_triangles]:
         raise ValueError(
             "cells: the surface has one side only, as a Möbius strip: going round on it, its triangles face the other "
             "way. A skin has an inner and an outer side; cut the surface open, or look for a seam joined with a twist."
         )
-    return label[:num_triangles] != label[0]
+    return component_labels[:num_triangles] != component_labels[0]
 
 
 def _check_node_contacts(cells: np.ndarray, first_edges: np.ndarray, second_edges: np.ndarray) -> None:
@@ -254,7 +285,7 @@ def _check_node_contacts(cells: np.ndarray, first_edges: np.ndarray, second_edge
     fans."""
     corner_index = np.arange(cells.size).reshape(cells.shape)
     edge_ends = topology.LOCAL_FACETS[2]
-    pairs = []
+    connected_corners = []
     for a in range(2):
         for b in range(2):
             first_corner, second_corner = (
@@ -262,14 +293,14 @@ def _check_node_contacts(cells: np.ndarray, first_edges: np.ndarray, second_edge
                 corner_index[second_edges // 3, edge_ends[second_edges % 3, b]],
             )
             is_same_node = cells.ravel()[first_corner] == cells.ravel()[second_corner]
-            pairs.append(np.stack([first_corner[is_same_node], second_corner[is_same_node]]))
-    rows, columns = np.concatenate(pairs, axis=1)
-    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(cells.size, cells.size))
-    _, label = connected_components(graph, directed=False)
-    fan_nodes = np.unique(np.stack([cells.ravel(), label]), axis=1)[0]
-    node, num_fans = np.unique(fan_nodes, return_counts=True)
+            connected_corners.append(np.stack([first_corner[is_same_node], second_corner[is_same_node]]))
+    graph_rows, graph_columns = np.concatenate(connected_corners, axis=1)
+    corner_graph = coo_array((np.ones(len(graph_rows)), (graph_rows, graph_columns)), shape=(cells.size, cells.size))
+    _, component_labels = connected_components(corner_graph, directed=False)
+    nodes_of_fans = np.unique(np.stack([cells.ravel(), component_labels]), axis=1)[0]
+    touched_nodes, num_fans = np.unique(nodes_of_fans, return_counts=True)
     if (num_fans > 1).any():
         raise ValueError(
-            f"cells: the surface touches itself at node {node[num_fans > 1][0]}: parts of it hang together there by "
-            "the node alone. Give each part a node of its own, or join them along edges."
+            f"cells: the surface touches itself at node {touched_nodes[num_fans > 1][0]}: parts of it hang together "
+            "there by the node alone. Give each part a node of its own, or join them along edges."
         )

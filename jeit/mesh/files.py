@@ -48,18 +48,18 @@ FORMATS = {
 }
 # Memory needed to read a mesh, divided by the size of its file.
 _MEMORY_PER_FILE_BYTE = 4
-_INCLUDE = re.compile(rb"^[ \t]*\*[ \t]*include", re.IGNORECASE | re.MULTILINE)
+_INCLUDE_PATTERN = re.compile(rb"^[ \t]*\*[ \t]*include", re.IGNORECASE | re.MULTILINE)
 # First pattern: sets in an Abaqus file that are specified by their first and last number. Second pattern: counts in a
 # VTK file, including the numbers of grid points along each axis.
-_GENERATED_SET = re.compile(rb"^[ \t]*\*.*generate", re.IGNORECASE | re.MULTILINE)
-_VTK_COUNTS = re.compile(
+_GENERATED_SET_PATTERN = re.compile(rb"^[ \t]*\*.*generate", re.IGNORECASE | re.MULTILINE)
+_VTK_COUNTS_PATTERN = re.compile(
     rb"^[ \t]*(DIMENSIONS|POINTS|CELLS|CELL_TYPES|\w+_COORDINATES)((?:[ \t]+\d+)+)", re.IGNORECASE | re.MULTILINE
 )
 # For .msh files: patterns of sections that start with a count and of integers of at least eight digits, and the layout
 # of a binary node.
-_MSH_COUNTS = re.compile(rb"^\$(Nodes|Elements|PhysicalNames)\s*?\n\s*(\d+)\r?\n", re.MULTILINE)
-_LONG_INTEGER = re.compile(rb"(?<![\w.+-])\d{8,}(?![\d.eE])")
-_MSH_NODE = np.dtype([("number", "<i4"), ("place", "<f8", 3)])
+_MSH_COUNTS_PATTERN = re.compile(rb"^\$(Nodes|Elements|PhysicalNames)\s*?\n\s*(\d+)\r?\n", re.MULTILINE)
+_LONG_INTEGER_PATTERN = re.compile(rb"(?<![\w.+-])\d{8,}(?![\d.eE])")
+_MSH_NODE_DTYPE = np.dtype([("number", "<i4"), ("place", "<f8", 3)])
 # Maximum accepted node number: meshio allocates an array as long as the largest node number.
 _MAX_NODE_NUMBER = 10**7
 _reading_lock = threading.Lock()
@@ -68,68 +68,70 @@ _reading_lock = threading.Lock()
 def check_meshio_format(path: Path) -> str:
     """Name that meshio uses for the format of a file. Raises `ValueError` if the format is not in `FORMATS`, or if the
     file refers to other files, declares XML entities, or is too large for memory."""
-    kind = FORMATS.get(path.suffix.lower())
-    if kind is None:
+    format_name = FORMATS.get(path.suffix.lower())
+    if format_name is None:
         raise ValueError(
             f"path: {path.name[:80]} does not work as a mesh file: the ending of the name gives the format, "
             f"{', '.join(FORMATS)}. Others that meshio knows are read with trusted=True, where a file comes from you."
         )
     check_memory(path.name[:80], _MEMORY_PER_FILE_BYTE * path.stat().st_size)
-    if kind in ("vtu", "xdmf"):
+    if format_name in ("vtu", "xdmf"):
         _check_prologue(path)
-    if kind == "xdmf":
-        _check_inline(path)
-    if kind == "gmsh":
-        _check_numbers(path)
-    if kind == "abaqus" and _INCLUDE.search(path.read_bytes()):
+    if format_name == "xdmf":
+        _check_xdmf_inline(path)
+    if format_name == "gmsh":
+        _check_msh_numbers(path)
+    if format_name == "abaqus" and _INCLUDE_PATTERN.search(path.read_bytes()):
         raise ValueError(f"path: {path.name[:80]} includes another file; put all into one.")
-    if kind == "abaqus" and _GENERATED_SET.search(path.read_bytes()):
+    if format_name == "abaqus" and _GENERATED_SET_PATTERN.search(path.read_bytes()):
         raise ValueError(f"path: {path.name[:80]} has a set by its ends (GENERATE); write its members out.")
-    if kind == "vtk":
-        _check_counts(path)
-    return kind
+    if format_name == "vtk":
+        _check_vtk_counts(path)
+    return format_name
 
 
-def _check_numbers(path: Path) -> None:
+def _check_msh_numbers(path: Path) -> None:
     """Raise `ValueError` for a .msh file whose counts or node numbers are larger than a file of its size can
     contain."""
-    data = path.read_bytes()
-    version, binary = [*data[:64].split(), b"", b"", b""][1:3]
-    if data.startswith(b"$MeshFormat") and binary == b"1" and not version.startswith(b"2"):
+    file_bytes = path.read_bytes()
+    format_version, is_binary_text = [*file_bytes[:64].split(), b"", b"", b""][1:3]
+    if file_bytes.startswith(b"$MeshFormat") and is_binary_text == b"1" and not format_version.startswith(b"2"):
         raise ValueError(
-            f"path: {path.name[:80]} is a binary file of Gmsh's format {version[:8].decode('ascii', 'replace')}; save "
-            "it as text, or in version 2.2."
+            f"path: {path.name[:80]} is a binary file of Gmsh's format "
+            f"{format_version[:8].decode('ascii', 'replace')}; save it as text, or in version 2.2."
         )
-    numbers = [int(match[2][:20]) for match in _MSH_COUNTS.finditer(data)]
-    if binary == b"1":
-        for match in _MSH_COUNTS.finditer(data):
-            num_nodes = min(int(match[2][:20]), (len(data) - match.end()) // _MSH_NODE.itemsize)
+    declared_counts = [int(match[2][:20]) for match in _MSH_COUNTS_PATTERN.finditer(file_bytes)]
+    if is_binary_text == b"1":
+        for match in _MSH_COUNTS_PATTERN.finditer(file_bytes):
+            num_nodes = min(int(match[2][:20]), (len(file_bytes) - match.end()) // _MSH_NODE_DTYPE.itemsize)
             if match[1] == b"Nodes" and num_nodes:
-                numbers.append(int(np.frombuffer(data, _MSH_NODE, num_nodes, match.end())["number"].max()))
+                declared_counts.append(
+                    int(np.frombuffer(file_bytes, _MSH_NODE_DTYPE, num_nodes, match.end())["number"].max())
+                )
     else:
-        numbers += [int(match[0][:20]) for match in _LONG_INTEGER.finditer(data)]
-    max_number = max(_MAX_NODE_NUMBER, len(data))
-    if max(numbers, default=0) > max_number:
+        declared_counts += [int(match[0][:20]) for match in _LONG_INTEGER_PATTERN.finditer(file_bytes)]
+    max_number = max(_MAX_NODE_NUMBER, len(file_bytes))
+    if max(declared_counts, default=0) > max_number:
         raise ValueError(
-            f"path: {path.name[:80]} does not work as a mesh file: it counts to {max(numbers)}, and a file of its size "
-            f"has {max_number} nodes and cells at most."
+            f"path: {path.name[:80]} does not work as a mesh file: it counts to {max(declared_counts)}, and a file of "
+            f"its size has {max_number} nodes and cells at most."
         )
 
 
-def _check_counts(path: Path) -> None:
+def _check_vtk_counts(path: Path) -> None:
     """Raise `ValueError` for a VTK file that declares more points or cells than a file of its size can contain."""
-    data = path.read_bytes()
-    for match in _VTK_COUNTS.finditer(data):
-        counts = [int(digits[:20]) for digits in match[2].split()]
-        num_items = math.prod(counts) if match[1].upper() == b"DIMENSIONS" else max(counts)
-        if num_items > max(len(data), 1000):
+    file_bytes = path.read_bytes()
+    for match in _VTK_COUNTS_PATTERN.finditer(file_bytes):
+        declared_counts = [int(count_digits[:20]) for count_digits in match[2].split()]
+        num_items = math.prod(declared_counts) if match[1].upper() == b"DIMENSIONS" else max(declared_counts)
+        if num_items > max(len(file_bytes), 1000):
             raise ValueError(
                 f"path: {path.name[:80]} does not work as a mesh file: it counts to {num_items} in "
-                f"{match[1].decode()}, and has {len(data)} bytes; grids with implicit ends are not read."
+                f"{match[1].decode()}, and has {len(file_bytes)} bytes; grids with implicit ends are not read."
             )
 
 
-class _ElementReachedError(Exception):
+class _FirstElementReachedError(Exception):
     """Raised at the first XML element, to stop parsing there."""
 
 
@@ -141,25 +143,25 @@ def _check_prologue(path: Path) -> None:
         raise ValueError(f"path: {path.name[:80]} has a document type (<!DOCTYPE), which mesh files have no use for.")
 
     def stop_parsing(*_: Any) -> None:
-        raise _ElementReachedError
+        raise _FirstElementReachedError
 
     xml_parser.StartDoctypeDeclHandler, xml_parser.StartElementHandler = reject_doctype, stop_parsing
     try:
         with path.open("rb") as file:
             xml_parser.ParseFile(file)
-    except _ElementReachedError:
+    except _FirstElementReachedError:
         return
     except expat.ExpatError:
         return  # meshio reports the error
 
 
-def _check_inline(path: Path) -> None:
+def _check_xdmf_inline(path: Path) -> None:
     """Raise `ValueError` for an XDMF file that stores its arrays in other files or declares entities."""
     try:
-        root = ElementTree.parse(path).getroot()
+        root_element = ElementTree.parse(path).getroot()
     except (ElementTree.ParseError, ValueError, LookupError):
         return
-    for item in root.iter():
+    for item in root_element.iter():
         if item.tag == "DataItem" and item.get("Format") not in (None, "XML"):
             raise ValueError(
                 f"path: {path.name[:80]} has its numbers in another file ({item.get('Format', '')[:20]}), which is not "
@@ -175,29 +177,29 @@ def bounded_inflation(path: Path) -> Iterator[None]:
     from meshio.vtu import _vtu  # takes a tenth of a second
 
     vtu_names, num_bytes_left = _vtu.__dict__, max_file_memory()
-    decompressors: dict[str, Callable[[], Any]] = {"zlib": zlib.decompressobj, "lzma": lzma.LZMADecompressor}
-    modules = {name: vtu_names[name] for name in decompressors if name in vtu_names}
+    decompressor_types: dict[str, Callable[[], Any]] = {"zlib": zlib.decompressobj, "lzma": lzma.LZMADecompressor}
+    vtu_modules = {name: vtu_names[name] for name in decompressor_types if name in vtu_names}
 
     def bounded_decompress(create_decompressor: Callable[[], Any]) -> Callable[[bytes], bytes]:
-        def decompress(data: bytes) -> bytes:
+        def decompress_within_limit(compressed_bytes: bytes) -> bytes:
             nonlocal num_bytes_left
-            decompressed = create_decompressor().decompress(data, int(num_bytes_left) + 1)
-            num_bytes_left -= len(decompressed)
+            decompressed_bytes = create_decompressor().decompress(compressed_bytes, int(num_bytes_left) + 1)
+            num_bytes_left -= len(decompressed_bytes)
             if num_bytes_left < 0:
                 check_memory(f"{path.name[:80]}, unpacked,", max_file_memory() + 1)
-            return decompressed
+            return decompressed_bytes
 
-        return decompress
+        return decompress_within_limit
 
     with _reading_lock:
         try:
-            for name, module in modules.items():
+            for name, vtu_module in vtu_modules.items():
                 vtu_names[name] = types.SimpleNamespace(
-                    **{**vars(module), "decompress": bounded_decompress(decompressors[name])}
+                    **{**vars(vtu_module), "decompress": bounded_decompress(decompressor_types[name])}
                 )
             yield
         finally:
-            vtu_names.update(modules)
+            vtu_names.update(vtu_modules)
 
 
 _CELL_TYPES = {2: "triangle", 3: "tetra"}
@@ -242,12 +244,12 @@ def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh
         raise ValueError(f"scale: expected the file's unit in metres, such as 1e-3 for millimetres, got {scale!r}.")
     if not path.stat().st_size:
         raise ValueError(f"path: {path.name[:80]} does not work as a mesh file: it is empty.")
-    kind = None if trusted else check_meshio_format(path)
+    format_name = None if trusted else check_meshio_format(path)
     if path.suffix.lower() in _FORMATS_WITHOUT_CONNECTIVITY:
         points, cells = read_leniently(path, path.name[:80])
         return _create_mesh(points * float(scale), cells, {})
-    with bounded_inflation(path) if kind == "vtu" else nullcontext():
-        meshio_mesh = _call_meshio(path, lambda meshio: meshio.read(path, file_format=kind))
+    with bounded_inflation(path) if format_name == "vtu" else nullcontext():
+        meshio_mesh = _call_meshio(path, lambda meshio: meshio.read(path, file_format=format_name))
     try:
         return _convert_from_meshio(meshio_mesh, float(scale), path.name[:80])
     except _READ_ERRORS as error:
@@ -286,46 +288,57 @@ def write(
     points = np.asarray(mesh.points, dtype=float)
     if mesh.space_dimension == 2:
         points = np.column_stack([points, np.zeros(len(points))])
-    cells = {name: _check_data("cell_data", name, value, mesh.num_cells) for name, value in (cell_data or {}).items()}
-    nodes: dict[str, ArrayLike] = {
-        name: _check_data("point_data", name, value, mesh.num_points) for name, value in (point_data or {}).items()
+    cell_values = {
+        name: _check_values_to_write("cell_data", name, values, mesh.num_cells)
+        for name, values in (cell_data or {}).items()
     }
-    blocks: list[Any] = [(_CELL_TYPES[mesh.dimension], np.asarray(mesh.cells))]
-    data: dict[str, Any] = {name: [value] for name, value in cells.items()}
-    field_data = {}
-    options: dict[str, Any] = {}
+    node_values: dict[str, ArrayLike] = {
+        name: _check_values_to_write("point_data", name, values, mesh.num_points)
+        for name, values in (point_data or {}).items()
+    }
+    cell_blocks: list[Any] = [(_CELL_TYPES[mesh.dimension], np.asarray(mesh.cells))]
+    block_data: dict[str, Any] = {name: [values] for name, values in cell_values.items()}
+    group_data = {}
+    format_options: dict[str, Any] = {}
     if path.suffix.lower() == ".msh":
-        if cells:
+        if cell_values:
             # meshio 5.3 writes values per cell into these files but cannot read them back.
             raise ValueError(
                 "cell_data: .msh files keep the mesh, its tags and point_data; write values per cell to a .vtu file."
             )
-        options = {"file_format": "gmsh22"}
+        format_options = {"file_format": "gmsh22"}
         physical_groups = [np.full(mesh.num_cells, 1)]
-        field_data["domain"] = np.array([1, mesh.dimension])
+        group_data["domain"] = np.array([1, mesh.dimension])
         for group_number, (tag, facet_indices) in enumerate(sorted(mesh.tags.items()), start=2):
-            facets = np.asarray(mesh.facets)[np.asarray(facet_indices)]
-            blocks.append((_FACET_TYPES[mesh.dimension], facets))
-            physical_groups.append(np.full(len(facets), group_number))
-            field_data[tag] = np.array([group_number, mesh.dimension - 1])
-        data["gmsh:physical"] = physical_groups
-        data["gmsh:geometrical"] = physical_groups
+            tagged_facets = np.asarray(mesh.facets)[np.asarray(facet_indices)]
+            cell_blocks.append((_FACET_TYPES[mesh.dimension], tagged_facets))
+            physical_groups.append(np.full(len(tagged_facets), group_number))
+            group_data[tag] = np.array([group_number, mesh.dimension - 1])
+        block_data["gmsh:physical"] = physical_groups
+        block_data["gmsh:geometrical"] = physical_groups
     try:
-        content = {"point_data": dict(nodes), "cell_data": data, "field_data": field_data}
-        _call_meshio(path, lambda meshio: meshio.Mesh(points, blocks, **content).write(path, **options), writing=True)
+        mesh_data = {"point_data": dict(node_values), "cell_data": block_data, "field_data": group_data}
+        _call_meshio(
+            path,
+            lambda meshio: meshio.Mesh(points, cell_blocks, **mesh_data).write(path, **format_options),
+            writing=True,
+        )
     except OSError as error:
         raise ValueError(f"path: {path} cannot be written: {error.strerror}. Is there such a folder?") from None
 
 
-def _check_data(argument: str, name: str, value: ArrayLike, length: int) -> np.ndarray:
-    array = np.asarray(value)
-    if array.ndim < 1 or len(array) != length:
-        entity = "cell" if argument == "cell_data" else "node"
+def _check_values_to_write(argument_name: str, name: str, values: ArrayLike, num_entities: int) -> np.ndarray:
+    array = np.asarray(values)
+    if array.ndim < 1 or len(array) != num_entities:
+        entity_name = "cell" if argument_name == "cell_data" else "node"
         raise ValueError(
-            f"{argument}: {name!r} needs one value per {entity}, {length} in all, got shape {array.shape}."
+            f"{argument_name}: {name!r} needs one value per {entity_name}, {num_entities} in all, got shape "
+            f"{array.shape}."
         )
     if np.iscomplexobj(array):
-        raise ValueError(f"{argument}: {name!r} is complex, which mesh files cannot hold. Write its parts separately.")
+        raise ValueError(
+            f"{argument_name}: {name!r} is complex, which mesh files cannot hold. Write its parts separately."
+        )
     return array
 
 
@@ -334,9 +347,9 @@ def _call_meshio(path: Path, meshio_function: Any, *, writing: bool = False) -> 
     interpreter, are converted to `ValueError`; what meshio prints is captured for the message."""
     import meshio  # takes a tenth of a second
 
-    output = io.StringIO()
+    captured_output = io.StringIO()
     try:
-        with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
+        with contextlib.redirect_stdout(captured_output), contextlib.redirect_stderr(captured_output):
             return meshio_function(meshio)
     except OSError:
         raise
@@ -345,15 +358,15 @@ def _call_meshio(path: Path, meshio_function: Any, *, writing: bool = False) -> 
             raise
         is_meshio_error = isinstance(error, meshio.ReadError | meshio.WriteError | SystemExit)
         message = (
-            _shorten_message((output.getvalue().strip() or str(error)).replace(f"{path.parent}{os.sep}", ""))
+            _shorten_message((captured_output.getvalue().strip() or str(error)).replace(f"{path.parent}{os.sep}", ""))
             if is_meshio_error
             else ""
         )
-        fault = message if writing and message else "its content does not fit its format, or is cut off"
-        explanation = f", which says: {message}" if message and not writing else ""
+        fault_text = message if writing and message else "its content does not fit its format, or is cut off"
+        explanation_text = f", which says: {message}" if message and not writing else ""
         raise ValueError(
-            f"path: {path.name[:80]} does not work as a mesh file: {fault}. The ending of the name gives the format: "
-            f".vtu, .vtk, .msh, .inp and others that meshio knows{explanation}."
+            f"path: {path.name[:80]} does not work as a mesh file: {fault_text}. The ending of the name gives the "
+            f"format: .vtu, .vtk, .msh, .inp and others that meshio knows{explanation_text}."
         ) from None
 
 
@@ -363,65 +376,71 @@ def _shorten_message(error: BaseException | str) -> str:
     return message if len(message) <= _MAX_MESSAGE_LENGTH else f"{message[: _MAX_MESSAGE_LENGTH - 1]}…"
 
 
-def _convert_from_meshio(meshio_mesh: meshio.Mesh, scale: float, source: str) -> Mesh:
-    cell_types = {block.type for block in meshio_mesh.cells}
+def _convert_from_meshio(meshio_mesh: meshio.Mesh, unit_scale: float, source_name: str) -> Mesh:
+    cell_types = {cell_block.type for cell_block in meshio_mesh.cells}
     dimension = 3 if "tetra" in cell_types else 2
     if not cell_types:
-        raise ValueError(f"path: {source} does not work as a mesh file: there are no cells in it.")
+        raise ValueError(f"path: {source_name} does not work as a mesh file: there are no cells in it.")
     if _CELL_TYPES[dimension] not in cell_types:
         raise ValueError(
-            f"path: {source} holds cells of type {sorted(cell_types)}, but jeit needs linear triangles or tetrahedra. "
-            "Save it with elements of order 1 and without quadrilaterals or hexahedra."
+            f"path: {source_name} holds cells of type {sorted(cell_types)}, but jeit needs linear triangles or "
+            "tetrahedra. Save it with elements of order 1 and without quadrilaterals or hexahedra."
         )
     if unsupported_types := cell_types & ({"quad"} if dimension == 2 else {"hexahedron", "wedge", "pyramid"}):
         raise ValueError(
-            f"path: {source} mixes in cells of type {sorted(unsupported_types)}. Split them into simplices first."
+            f"path: {source_name} mixes in cells of type {sorted(unsupported_types)}. Split them into simplices first."
         )
-    points = np.asarray(meshio_mesh.points, dtype=float) * scale
-    cells = np.concatenate([block.data for block in meshio_mesh.cells if block.type == _CELL_TYPES[dimension]])
-    used_points, inverse = np.unique(cells, return_inverse=True)
-    cells = inverse.reshape(cells.shape)
+    points = np.asarray(meshio_mesh.points, dtype=float) * unit_scale
+    cells = np.concatenate(
+        [cell_block.data for cell_block in meshio_mesh.cells if cell_block.type == _CELL_TYPES[dimension]]
+    )
+    used_points, renumbered_cells = np.unique(cells, return_inverse=True)
+    cells = renumbered_cells.reshape(cells.shape)
     points = points[used_points]
-    new_index = np.full(len(meshio_mesh.points), -1)
-    new_index[used_points] = np.arange(len(used_points))
+    new_node_index = np.full(len(meshio_mesh.points), -1)
+    new_node_index[used_points] = np.arange(len(used_points))
     # The cells are not yet oriented, so boundary facets are identified as the facets that occur once.
-    keys, num_occurrences = np.unique(
+    facet_node_keys, num_occurrences = np.unique(
         topology.facet_keys(topology.cell_facets(cells), len(used_points)), return_counts=True
     )
-    boundary = keys[num_occurrences == 1]
-    tags = {}
+    boundary_facets = facet_node_keys[num_occurrences == 1]
+    facet_tags = {}
     for name, facets in _facet_groups(meshio_mesh, _FACET_TYPES[dimension]).items():
-        nodes = new_index[facets]
+        nodes = new_node_index[facets]
         nodes = nodes[(nodes >= 0).all(axis=1)]
-        nodes = nodes[np.isin(topology.facet_keys(nodes, len(used_points)), boundary)]
+        nodes = nodes[np.isin(topology.facet_keys(nodes, len(used_points)), boundary_facets)]
         if len(nodes):
-            tags[name] = nodes
-    return _create_mesh(points, cells, tags)
+            facet_tags[name] = nodes
+    return _create_mesh(points, cells, facet_tags)
 
 
-def _create_mesh(points: np.ndarray, cells: np.ndarray, tags: Mapping[str, ArrayLike]) -> Mesh:
+def _create_mesh(points: np.ndarray, cells: np.ndarray, facet_tags: Mapping[str, ArrayLike]) -> Mesh:
     """Create a mesh, which is two-dimensional if its triangles lie in a plane z = constant."""
     if cells.shape[1] == 3 and points.shape[1] == 3 and np.ptp(points[:, 2]) <= 1e-9 * np.ptp(points, axis=0).max():
         points = points[:, :2]
-    return Mesh.create(points, cells, tags=tags)
+    return Mesh.create(points, cells, tags=facet_tags)
 
 
 def _facet_groups(meshio_mesh: meshio.Mesh, facet_type: str) -> dict[str, np.ndarray]:
     """Nodes (t, d) of the facets in each named group of a mesh file."""
-    groups: dict[str, list[np.ndarray]] = {}
+    facets_by_group: dict[str, list[np.ndarray]] = {}
     facet_dimension = 2 if facet_type == "triangle" else 1
-    names = {int(value[0]): name for name, value in meshio_mesh.field_data.items() if int(value[1]) == facet_dimension}
+    group_names = {
+        int(number_and_dimension[0]): name
+        for name, number_and_dimension in meshio_mesh.field_data.items()
+        if int(number_and_dimension[1]) == facet_dimension
+    }
     physical_groups = meshio_mesh.cell_data.get("gmsh:physical", [])
-    for block, group_numbers in zip(meshio_mesh.cells, physical_groups, strict=False):
-        if block.type != facet_type:
+    for cell_block, group_numbers in zip(meshio_mesh.cells, physical_groups, strict=False):
+        if cell_block.type != facet_type:
             continue
-        for value in np.unique(group_numbers):
-            if value > 0:
-                name = names.get(int(value), f"physical_{value}")
-                groups.setdefault(name, []).append(block.data[np.asarray(group_numbers) == value])
-    if not groups:
-        for name, members in meshio_mesh.cell_sets.items():
-            for block, set_members in zip(meshio_mesh.cells, members, strict=False):
-                if block.type == facet_type and np.size(set_members) and not name.startswith("gmsh:"):
-                    groups.setdefault(name, []).append(block.data[np.asarray(set_members)])
-    return {name: np.concatenate(facets) for name, facets in groups.items()}
+        for group_number in np.unique(group_numbers):
+            if group_number > 0:
+                name = group_names.get(int(group_number), f"physical_{group_number}")
+                facets_by_group.setdefault(name, []).append(cell_block.data[np.asarray(group_numbers) == group_number])
+    if not facets_by_group:
+        for name, set_members_by_type in meshio_mesh.cell_sets.items():
+            for cell_block, set_members in zip(meshio_mesh.cells, set_members_by_type, strict=False):
+                if cell_block.type == facet_type and np.size(set_members) and not name.startswith("gmsh:"):
+                    facets_by_group.setdefault(name, []).append(cell_block.data[np.asarray(set_members)])
+    return {name: np.concatenate(facets) for name, facets in facets_by_group.items()}

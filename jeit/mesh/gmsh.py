@@ -70,10 +70,10 @@ def from_gmsh(
         raise ValueError(
             "source: Gmsh has no current model. Build one with the gmsh module, or give a file or outline."
         )
-    owns_session = not gmsh.isInitialized()
-    if owns_session:
+    is_session_owner = not gmsh.isInitialized()
+    if is_session_owner:
         gmsh.initialize(interruptible=False)
-    terminal_setting = gmsh.option.getNumber("General.Terminal")
+    previous_terminal_setting = gmsh.option.getNumber("General.Terminal")
     gmsh.option.setNumber("General.Terminal", 0)
     name = str(source)
     try:
@@ -87,14 +87,14 @@ def from_gmsh(
             _mesh_with_gmsh(gmsh, source, cell_size, dimension, path, name)
             return read(path, scale=scale)
     finally:
-        gmsh.option.setNumber("General.Terminal", terminal_setting)
-        if owns_session:
+        gmsh.option.setNumber("General.Terminal", previous_terminal_setting)
+        if is_session_owner:
             gmsh.finalize()
 
 
 def _mesh_with_gmsh(
     gmsh: ModuleType,
-    source: str | Path | Domain | None,
+    geometry_path: str | Path | Domain | None,
     cell_size: float | None,
     dimension: int | None,
     path: Path,
@@ -102,23 +102,23 @@ def _mesh_with_gmsh(
 ) -> None:
     """Mesh the geometry and write the mesh to `path`; error messages refer to the geometry by `name`."""
     try:
-        if isinstance(source, (str, Path)):
-            gmsh.open(str(source))
-        elif source is not None:
+        if isinstance(geometry_path, (str, Path)):
+            gmsh.open(str(geometry_path))
+        elif geometry_path is not None:
             gmsh.model.add("jeit")
-            _draw_outline(gmsh, source)
+            _draw_outline(gmsh, geometry_path)
         if cell_size is not None:
             gmsh.option.setNumber("Mesh.MeshSizeMax", cell_size)
         dimension = dimension or max(gmsh.model.getDimension(), 2)
         gmsh.model.mesh.generate(dimension)
         # If the geometry has any physical group, Gmsh does not write cells that are in no physical group.
         grouped_entities = {
-            entity
-            for group in gmsh.model.getPhysicalGroups(dimension)
-            for entity in gmsh.model.getEntitiesForPhysicalGroup(*group)
+            entity_tag
+            for group_tag in gmsh.model.getPhysicalGroups(dimension)
+            for entity_tag in gmsh.model.getEntitiesForPhysicalGroup(*group_tag)
         }
         ungrouped_entities = [
-            entity for _, entity in gmsh.model.getEntities(dimension) if entity not in grouped_entities
+            entity_tag for _, entity_tag in gmsh.model.getEntities(dimension) if entity_tag not in grouped_entities
         ]
         added_groups = (
             [(dimension, gmsh.model.addPhysicalGroup(dimension, ungrouped_entities))] if ungrouped_entities else []
@@ -128,7 +128,7 @@ def _mesh_with_gmsh(
         if added_groups:
             gmsh.model.removePhysicalGroups(added_groups)
     except Exception as error:
-        message = str(error).replace(str(source), name[:40]).rstrip(".")[:80]
+        message = str(error).replace(str(geometry_path), name[:40]).rstrip(".")[:80]
         raise ValueError(f"source: Gmsh could not mesh the geometry: {message}.") from error
 
 
@@ -143,9 +143,11 @@ class _GmshDrawing:
         self.loops.append(self.shape.addCurveLoop([self.shape.addCircle(*centre, 0.0, radius)]))
 
     def loop(self, vertices: np.ndarray) -> None:
-        corners = [self.shape.addPoint(float(x), float(y), 0.0) for x, y in vertices]
-        sides = [self.shape.addLine(a, b) for a, b in zip(corners, corners[1:] + corners[:1], strict=True)]
-        self.loops.append(self.shape.addCurveLoop(sides))
+        corner_tags = [self.shape.addPoint(float(x), float(y), 0.0) for x, y in vertices]
+        side_tags = [
+            self.shape.addLine(a, b) for a, b in zip(corner_tags, corner_tags[1:] + corner_tags[:1], strict=True)
+        ]
+        self.loops.append(self.shape.addCurveLoop(side_tags))
 
 
 def _draw_outline(gmsh: ModuleType, domain: Domain) -> None:

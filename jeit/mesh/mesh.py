@@ -115,27 +115,29 @@ class Mesh(Module):
                 "cells: the boundary cannot be found from traced node indices. Create the mesh outside the "
                 "transformed function and pass it in, or replace its points with equinox.tree_at."
             )
-        coordinates = checks.check_points(points) if has_values(points) else None
-        num_points, space = np.shape(points if coordinates is None else coordinates)
-        indices = checks.check_cells(cells, num_points, space)
-        dimension = indices.shape[1] - 1
-        if coordinates is not None:
-            checks.check_coinciding(coordinates)
-            indices = checks.orient(coordinates, indices)
-        if space > dimension:
+        checked_points = checks.check_points(points) if has_values(points) else None
+        num_points, space_dimension = np.shape(points if checked_points is None else checked_points)
+        checked_cells = checks.check_cells(cells, num_points, space_dimension)
+        dimension = checked_cells.shape[1] - 1
+        if checked_points is not None:
+            checks.check_coinciding(checked_points)
+            checked_cells = checks.orient(checked_points, checked_cells)
+        if space_dimension > dimension:
             from jeit.mesh import _surface
 
-            indices = _surface.orient_surface(indices, coordinates)
-        first_facets, second_facets, facets_of_one_cell = topology.pair_facets(indices)
-        checks.check_connected(first_facets // (dimension + 1), second_facets // (dimension + 1), len(indices))
-        facets = topology.cell_facets(indices)[facets_of_one_cell]
+            checked_cells = _surface.orient_surface(checked_cells, checked_points)
+        first_facets, second_facets, facets_of_one_cell = topology.pair_facets(checked_cells)
+        checks.check_connected(first_facets // (dimension + 1), second_facets // (dimension + 1), len(checked_cells))
+        boundary_facets = topology.cell_facets(checked_cells)[facets_of_one_cell]
         if dimension == 2:
-            facets = topology.order_loops(facets, coordinates) if len(facets) else facets
-        located_tags = checks.locate_tags(tags or {}, facets)
+            boundary_facets = (
+                topology.order_loops(boundary_facets, checked_points) if len(boundary_facets) else boundary_facets
+            )
+        located_tags = checks.locate_tags(tags or {}, boundary_facets)
         return Mesh(
-            points=as_array(points if coordinates is None else coordinates),
-            cells=as_array(indices.astype(np.int32)),
-            facets=as_array(facets.astype(np.int32)),
+            points=as_array(points if checked_points is None else checked_points),
+            cells=as_array(checked_cells.astype(np.int32)),
+            facets=as_array(boundary_facets.astype(np.int32)),
             tags={name: as_array(facet_indices.astype(np.int32)) for name, facet_indices in located_tags.items()},
         )
 
@@ -176,14 +178,14 @@ def measures(mesh: Mesh) -> Float[Array, " m"]:
     area = measures(mesh).sum()
     ```
     """
-    corners = mesh.points[mesh.cells]
-    edges = corners[:, 1:] - corners[:, :1]
+    cell_corners = mesh.points[mesh.cells]
+    edge_vectors = cell_corners[:, 1:] - cell_corners[:, :1]
     xp = namespace(mesh.points)
     if mesh.is_surface:
-        return 0.5 * _length(xp.cross(edges[:, 0], edges[:, 1]))
+        return 0.5 * _vector_lengths(xp.cross(edge_vectors[:, 0], edge_vectors[:, 1]))
     if mesh.dimension == 2:
-        return 0.5 * _cross_product(edges[:, 0], edges[:, 1])
-    return xp.sum(xp.cross(edges[:, 0], edges[:, 1]) * edges[:, 2], axis=-1) / 6.0
+        return 0.5 * _cross_product(edge_vectors[:, 0], edge_vectors[:, 1])
+    return xp.sum(xp.cross(edge_vectors[:, 0], edge_vectors[:, 1]) * edge_vectors[:, 2], axis=-1) / 6.0
 
 
 @numpy_or_compiled
@@ -208,23 +210,23 @@ def gradients(mesh: Mesh) -> Float[Array, "m k s"]:
     ```
     """
     xp = namespace(mesh.points)
-    corners = mesh.points[mesh.cells]
-    edges = corners[:, 1:] - corners[:, :1]
+    cell_corners = mesh.points[mesh.cells]
+    edge_vectors = cell_corners[:, 1:] - cell_corners[:, :1]
     if mesh.is_surface:
-        a, b = edges[:, 0], edges[:, 1]
-        normal = xp.cross(a, b)
-        determinant = xp.sum(normal**2, axis=-1)[:, None]
-        other_gradients = xp.stack([xp.cross(b, normal), xp.cross(normal, a)], axis=1)
+        a, b = edge_vectors[:, 0], edge_vectors[:, 1]
+        cell_normals = xp.cross(a, b)
+        squared_normals = xp.sum(cell_normals**2, axis=-1)[:, None]
+        other_gradients = xp.stack([xp.cross(b, cell_normals), xp.cross(cell_normals, a)], axis=1)
     elif mesh.dimension == 2:
-        a, b = edges[:, 0], edges[:, 1]
-        determinant = _cross_product(a, b)[:, None]
+        a, b = edge_vectors[:, 0], edge_vectors[:, 1]
+        squared_normals = _cross_product(a, b)[:, None]
         other_gradients = xp.stack([xp.stack([b[:, 1], -b[:, 0]], -1), xp.stack([-a[:, 1], a[:, 0]], -1)], axis=1)
     else:
-        a, b, c = edges[:, 0], edges[:, 1], edges[:, 2]
-        normal = xp.cross(b, c)
-        determinant = xp.sum(a * normal, axis=-1)[:, None]
-        other_gradients = xp.stack([normal, xp.cross(c, a), xp.cross(a, b)], axis=1)
-    other_gradients = other_gradients / determinant[:, :, None]
+        a, b, c = edge_vectors[:, 0], edge_vectors[:, 1], edge_vectors[:, 2]
+        cell_normals = xp.cross(b, c)
+        squared_normals = xp.sum(a * cell_normals, axis=-1)[:, None]
+        other_gradients = xp.stack([cell_normals, xp.cross(c, a), xp.cross(a, b)], axis=1)
+    other_gradients = other_gradients / squared_normals[:, :, None]
     # Explicit sum, because XLA converts a sum over such a short axis into a slow matrix product.
     first_gradient = -functools.reduce(operator.add, [other_gradients[:, k] for k in range(mesh.dimension)])
     return xp.concatenate([first_gradient[:, None], other_gradients], axis=1)
@@ -265,30 +267,30 @@ def normals(mesh: Mesh) -> Float[Array, "m 3"]:
     """
     if mesh.dimension != 2:
         raise ValueError("mesh: a solid's cells have no normals; take those of its surface, surface_of(mesh).")
-    return _normals(mesh)
+    return _cell_normals(mesh)
 
 
 @numpy_or_compiled
-def _normals(mesh: Mesh):
+def _cell_normals(mesh: Mesh):
     xp = namespace(mesh.points)
     if not mesh.is_surface:
         return xp.broadcast_to(np.array([0.0, 0.0, 1.0], mesh.points.dtype), (mesh.num_cells, 3))
-    corners = mesh.points[mesh.cells]
-    normal = xp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return normal / _length(normal)[:, None]
+    cell_corners = mesh.points[mesh.cells]
+    cell_normals = xp.cross(cell_corners[:, 1] - cell_corners[:, 0], cell_corners[:, 2] - cell_corners[:, 0])
+    return cell_normals / _vector_lengths(cell_normals)[:, None]
 
 
 @numpy_or_compiled
 def facet_measures(mesh: Mesh) -> Float[Array, " b"]:
     """Length in m (2-D) or area in m² (3-D) of every boundary facet (b,)."""
-    corners = mesh.points[mesh.facets]
-    edges = corners[:, 1:] - corners[:, :1]
+    facet_corners = mesh.points[mesh.facets]
+    edge_vectors = facet_corners[:, 1:] - facet_corners[:, :1]
     xp = namespace(mesh.points)
     if mesh.is_surface:
-        return _length(edges[:, 0])
+        return _vector_lengths(edge_vectors[:, 0])
     if mesh.dimension == 2:
-        return xp.sqrt(edges[:, 0, 0] ** 2 + edges[:, 0, 1] ** 2)
-    return 0.5 * xp.sqrt(xp.sum(xp.cross(edges[:, 0], edges[:, 1]) ** 2, axis=-1))
+        return xp.sqrt(edge_vectors[:, 0, 0] ** 2 + edge_vectors[:, 0, 1] ** 2)
+    return 0.5 * xp.sqrt(xp.sum(xp.cross(edge_vectors[:, 0], edge_vectors[:, 1]) ** 2, axis=-1))
 
 
 def boundary_loops(mesh: Mesh) -> tuple[Int[Array, " b"], Float[Array, " b"]]:
@@ -304,9 +306,9 @@ def boundary_loops(mesh: Mesh) -> tuple[Int[Array, " b"], Float[Array, " b"]]:
     is_loop_start = xp.concatenate([xp.ones(1, bool), mesh.facets[1:, 0] != mesh.facets[:-1, 1]])
     # Sums over all pairs of facets, because XLA converts a cumulative sum into dozens of small operations.
     facet_order = np.arange(mesh.num_facets)
-    loop = xp.sum((facet_order <= facet_order[:, None]) & is_loop_start, axis=1)
-    is_earlier = (facet_order < facet_order[:, None]) & (loop == loop[:, None])
-    return loop, xp.sum(xp.where(is_earlier, facet_measures(mesh), 0), axis=1)
+    loop_numbers = xp.sum((facet_order <= facet_order[:, None]) & is_loop_start, axis=1)
+    is_earlier = (facet_order < facet_order[:, None]) & (loop_numbers == loop_numbers[:, None])
+    return loop_numbers, xp.sum(xp.where(is_earlier, facet_measures(mesh), 0), axis=1)
 
 
 def interior_facets(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
@@ -321,7 +323,7 @@ def interior_facets(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([first_facets, second_facets], axis=1) // cells.shape[1], topology.cell_facets(cells)[first_facets]
 
 
-def _length(vectors):
+def _vector_lengths(vectors):
     """Lengths (m,) of vectors (m, 3), with an explicit sum for XLA."""
     return namespace(vectors).sqrt(vectors[:, 0] ** 2 + vectors[:, 1] ** 2 + vectors[:, 2] ** 2)
 

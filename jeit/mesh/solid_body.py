@@ -68,8 +68,8 @@ class Solid(Body):
             float(self.outline.area), self.thickness, num_points, cell_size, None
         )
         with nodes_of_solid(num_points, count_of_base_nodes(float(self.outline.area), self.thickness, None)):
-            plane = self.outline.mesh(num_points=num_base_points, cell_size=cell_size, refine=refine)
-        return layer(plane, self.thickness, num_layers)
+            base_mesh = self.outline.mesh(num_points=num_base_points, cell_size=cell_size, refine=refine)
+        return layer(base_mesh, self.thickness, num_layers)
 
 
 class OwnMesh(Body):
@@ -108,7 +108,7 @@ class OwnMesh(Body):
         points, facets = np.asarray(self.given.points), np.asarray(self.given.facets)
         # Facets are ordered head to tail, loop by loop.
         loop_starts = np.flatnonzero(facets[1:, 0] != facets[:-1, 1]) + 1
-        return tuple(as_array(points[loop[:, 0]]) for loop in np.split(facets, loop_starts))
+        return tuple(as_array(points[loop_facets[:, 0]]) for loop_facets in np.split(facets, loop_starts))
 
     def describe(self) -> dict[str, Any]:
         """Dimensions of the mesh, and numbers of its nodes and cells."""

@@ -152,7 +152,7 @@ def stacked_cells(cells: np.ndarray, num_nodes: int, num_layers: int) -> np.ndar
     """
     a, b, c = np.sort(cells.astype(np.int64), axis=1).T
     num_layer_nodes = num_nodes
-    prism = np.stack(
+    prism_tetrahedra = np.stack(
         [
             np.stack([a, b, c, c + num_layer_nodes], axis=1),
             np.stack([a, b, b + num_layer_nodes, c + num_layer_nodes], axis=1),
@@ -160,7 +160,7 @@ def stacked_cells(cells: np.ndarray, num_nodes: int, num_layers: int) -> np.ndar
         ],
         axis=1,
     ).reshape(-1, 4)
-    return np.concatenate([prism + k * num_nodes for k in range(num_layers)])
+    return np.concatenate([prism_tetrahedra + k * num_nodes for k in range(num_layers)])
 
 
 def stacked_wall(edges: np.ndarray, num_nodes: int, num_layers: int) -> np.ndarray:
@@ -169,7 +169,11 @@ def stacked_wall(edges: np.ndarray, num_nodes: int, num_layers: int) -> np.ndarr
     lower_triangles = np.stack([smaller_nodes, larger_nodes, larger_nodes + num_nodes], axis=1)
     upper_triangles = np.stack([smaller_nodes, smaller_nodes + num_nodes, larger_nodes + num_nodes], axis=1)
     return np.concatenate(
-        [face + k * num_nodes for k in range(num_layers) for face in (lower_triangles, upper_triangles)]
+        [
+            wall_triangle + k * num_nodes
+            for k in range(num_layers)
+            for wall_triangle in (lower_triangles, upper_triangles)
+        ]
     )
 
 
@@ -211,48 +215,48 @@ def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLi
     if mesh.dimension != 2:
         raise ValueError("mesh: a layer is made from a plane (2-D) mesh, this one is 3-D.")
     thickness = check_length("thickness", thickness)
-    levels = _check_heights(thickness, num_layers, heights)
-    num_layers = len(levels) - 1
-    plane, cells, facets = np.asarray(mesh.points), np.asarray(mesh.cells), np.asarray(mesh.facets)
-    num_nodes = len(plane)
+    level_heights = _check_heights(thickness, num_layers, heights)
+    num_layers = len(level_heights) - 1
+    plane_points, cells, boundary_edges = np.asarray(mesh.points), np.asarray(mesh.cells), np.asarray(mesh.facets)
+    num_nodes = len(plane_points)
     unstructured.check_total(num_nodes * (num_layers + 1), "num_layers")
-    points = np.column_stack([np.tile(plane, (num_layers + 1, 1)), np.repeat(levels, num_nodes)])
+    points = np.column_stack([np.tile(plane_points, (num_layers + 1, 1)), np.repeat(level_heights, num_nodes)])
 
     tetrahedra = stacked_cells(cells, num_nodes, num_layers)
 
     def wall_triangles(edges: np.ndarray) -> np.ndarray:
         return stacked_wall(edges, num_nodes, num_layers)
 
-    tags: dict[str, ArrayLike] = {
+    tagged_facets: dict[str, ArrayLike] = {
         "bottom": cells,
         "top": cells + num_layers * num_nodes,
-        "side": wall_triangles(facets),
+        "side": wall_triangles(boundary_edges),
     }
     for name, facet_indices in mesh.tags.items():
         new_name = _RENAMED_TAGS.get(name, name)
-        if new_name in tags:
+        if new_name in tagged_facets:
             raise ValueError(
                 f"mesh: its tag {name!r} would be called {new_name!r} in the layer, which is taken. Rename it."
             )
-        tags[new_name] = wall_triangles(facets[np.asarray(facet_indices)])
+        tagged_facets[new_name] = wall_triangles(boundary_edges[np.asarray(facet_indices)])
     with size_checked():
-        return Mesh.create(points, tetrahedra, tags=tags)
+        return Mesh.create(points, tetrahedra, tags=tagged_facets)
 
 
 def _check_heights(thickness: float, num_layers: int, heights: ArrayLike | None) -> np.ndarray:
     """Heights of the nodes of a layer in metres, lowest first."""
     if heights is None:
         return np.linspace(0.0, thickness, unstructured.check_count("num_layers", num_layers, 1) + 1)
-    levels = np.asarray(heights, float)
+    node_heights = np.asarray(heights, float)
     if (
-        levels.ndim != 1
-        or len(levels) < 2
-        or levels[0] != 0
-        or levels[-1] != thickness
-        or not (np.diff(levels) > 0).all()
+        node_heights.ndim != 1
+        or len(node_heights) < 2
+        or node_heights[0] != 0
+        or node_heights[-1] != thickness
+        or not (np.diff(node_heights) > 0).all()
     ):
         raise ValueError(f"heights must rise from 0 to the thickness, {thickness:g} m.")
-    return levels
+    return node_heights
 
 
 def box(
@@ -287,10 +291,10 @@ def box(
     """
     width, depth = check_length("width", width), check_length("depth", depth)
     height = check_length("height", height)
-    plane_points, layers = choose_layers(width * depth, height, num_points, cell_size, num_layers)
+    num_base_points, layer_count = choose_layers(width * depth, height, num_points, cell_size, num_layers)
     with size_checked(), nodes_of_solid(num_points, count_of_base_nodes(width * depth, height, num_layers)):
-        base = rectangle(width, depth, num_points=plane_points, cell_size=cell_size, refine=refine)
-        return layer(base, height, layers)
+        base_mesh = rectangle(width, depth, num_points=num_base_points, cell_size=cell_size, refine=refine)
+        return layer(base_mesh, height, layer_count)
 
 
 def cylinder(
@@ -325,17 +329,17 @@ def cylinder(
     ```
     """
     radius, height = check_length("radius", radius, 2), check_length("height", height)
-    plane_points, layers = choose_layers(np.pi * radius**2, height, num_points, cell_size, num_layers)
+    num_base_points, layer_count = choose_layers(np.pi * radius**2, height, num_points, cell_size, num_layers)
     with size_checked(), nodes_of_solid(num_points, count_of_base_nodes(np.pi * radius**2, height, num_layers)):
-        base = disk(
+        base_mesh = disk(
             radius,
-            num_points=plane_points,
+            num_points=num_base_points,
             cell_size=cell_size,
             refine=refine,
             num_boundary=num_boundary,
             boundary_points=boundary_points,
         )
-        return layer(base, height, layers)
+        return layer(base_mesh, height, layer_count)
 
 
 def count_of_base_nodes(area: float, height: float, num_layers: int | None) -> Callable[[int], int]:
@@ -357,8 +361,8 @@ def choose_layers(
     # A solid of base area A and height H, with node spacing h in the plane and along z, has n = (1.1 A / h²) (H / h +
     # 1) nodes.
     if num_layers is None:
-        spacing = np.cbrt(1.1 * area * height / num_nodes)
+        node_spacing = np.cbrt(1.1 * area * height / num_nodes)
         for _ in range(20):
-            spacing = np.sqrt(1.1 * area * (height / spacing + 1) / num_nodes)
-        num_layers = max(1, round(height / spacing))
+            node_spacing = np.sqrt(1.1 * area * (height / node_spacing + 1) / num_nodes)
+        num_layers = max(1, round(height / node_spacing))
     return max(4, round(num_nodes / (num_layers + 1))), num_layers

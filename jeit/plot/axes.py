@@ -21,26 +21,32 @@ def get_or_create_axes(ax: Axes | None, size: tuple[float, float] = (6.4, 5.6)) 
 
 
 # Distance of numbers from a body, and width of a digit in a small picture, divided by the size of the body.
-_TEXT_DISTANCE, _LETTER_WIDTH = 0.04, 0.021
+_RELATIVE_TEXT_DISTANCE, _RELATIVE_LETTER_WIDTH = 0.04, 0.021
 
 
 def hide_axes(ax: Axes, extent: tuple[float, float, float, float], *, numbered: bool = True) -> None:
     """Set equal scales of the x and y axes, and remove frame and ticks. Around the `extent` (metres), space is left for
     a scale bar and, if electrodes are `numbered`, for the longest number beside the body."""
     x_min, x_max, y_min, y_max = extent
-    size = max(x_max - x_min, y_max - y_min)
-    margin_width = (0.12 if numbered else 0.06) * size
+    largest_extent = max(x_max - x_min, y_max - y_min)
+    margin_width = (0.12 if numbered else 0.06) * largest_extent
     outer_texts = [
         text
         for text in ax.texts
         if text.get_horizontalalignment() != "center" and not x_min <= text.get_position()[0] <= x_max
     ]
     horizontal_margin = max(
-        [margin_width, *((_TEXT_DISTANCE + _LETTER_WIDTH * len(text.get_text())) * size for text in outer_texts)]
+        [
+            margin_width,
+            *(
+                (_RELATIVE_TEXT_DISTANCE + _RELATIVE_LETTER_WIDTH * len(text.get_text())) * largest_extent
+                for text in outer_texts
+            ),
+        ]
     )
     ax.set_aspect("equal")
     ax.set_xlim(x_min - horizontal_margin, x_max + horizontal_margin)
-    ax.set_ylim(y_min - 0.18 * size, y_max + (margin_width if numbered else 0.03 * size))
+    ax.set_ylim(y_min - 0.18 * largest_extent, y_max + (margin_width if numbered else 0.03 * largest_extent))
     ax.set_axis_off()
 
 
@@ -74,15 +80,28 @@ def draw_legend_above(ax: Axes) -> None:
 def draw_scale_bar(ax: Axes, extent: tuple[float, float, float, float]) -> None:
     """Draw a scale bar of a round length, about a quarter of the width of the picture, below its lower left corner."""
     x_min, x_max, y_min, y_max = extent
-    size = max(x_max - x_min, y_max - y_min)
-    length = _round_to_scale_length(0.27 * (x_max - x_min))
-    x, y = x_min - 0.06 * size, y_min - 0.125 * size
-    ax.plot([x, x + length], [y, y], color=DARK_GREY, linewidth=2.5, solid_capstyle="butt")
-    millimetres = 1e3 * length
+    largest_extent = max(x_max - x_min, y_max - y_min)
+    bar_length = _round_to_scale_length(0.27 * (x_max - x_min))
+    x, y = x_min - 0.06 * largest_extent, y_min - 0.125 * largest_extent
+    ax.plot([x, x + bar_length], [y, y], color=DARK_GREY, linewidth=2.5, solid_capstyle="butt")
+    length_in_millimetres = 1e3 * bar_length
     text_transform = ax.transData + ScaledTranslation(0, -3 / 72, ax.figure.dpi_scale_trans)
-    ax.text(x, y, f"{millimetres:g} mm", transform=text_transform, ha="left", va="top", color=DARK_GREY, fontsize=9)
+    ax.text(
+        x,
+        y,
+        f"{length_in_millimetres:g} mm",
+        transform=text_transform,
+        ha="left",
+        va="top",
+        color=DARK_GREY,
+        fontsize=9,
+    )
 
 
-def _round_to_scale_length(length: float) -> float:
-    power_of_ten = 10 ** math.floor(math.log10(length))
-    return max(step * power_of_ten for step in (1, 2, 5) if step * power_of_ten <= length * (1 + 1e-9))
+def _round_to_scale_length(max_length: float) -> float:
+    power_of_ten = 10 ** math.floor(math.log10(max_length))
+    return max(
+        leading_digit * power_of_ten
+        for leading_digit in (1, 2, 5)
+        if leading_digit * power_of_ten <= max_length * (1 + 1e-9)
+    )

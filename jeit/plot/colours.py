@@ -37,34 +37,38 @@ def draw_colour_bar(
 ) -> None:
     """Draw a slim colour bar at the right of `ax`, or on the axes `position`; `show_sign`: whether tick labels have a
     sign, for differences; `has_factor_labels`: whether the values are log₁₀ of factors, which the tick labels state."""
-    placement: dict[str, Any] = (
+    placement_options: dict[str, Any] = (
         {"ax": ax, "shrink": 0.72, "aspect": 28, "pad": 0.02} if position is None else {"cax": position}
     )
-    bar = ax.figure.colorbar(mappable, ticks=MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]), **placement)
+    colour_bar = ax.figure.colorbar(mappable, ticks=MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]), **placement_options)
     if has_factor_labels:
         tick_labels_by_value = _factor_ticks(mappable.get_clim()[1] or 0.0)
-        bar.set_ticks(list(tick_labels_by_value), labels=list(tick_labels_by_value.values()))
+        colour_bar.set_ticks(list(tick_labels_by_value), labels=list(tick_labels_by_value.values()))
     elif show_sign:
-        bar.ax.yaxis.set_major_formatter(
-            lambda value, _: "0" if abs(value) < 1e-12 else f"{value:+g}".replace("-", "−")
+        colour_bar.ax.yaxis.set_major_formatter(
+            lambda tick_value, _: "0" if abs(tick_value) < 1e-12 else f"{tick_value:+g}".replace("-", "−")
         )
-    bar.set_label(label, color=DARK_GREY)
-    bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
-    bar.ax.tick_params(length=2, color=LIGHT_GREY, labelcolor=DARK_GREY)
+    colour_bar.set_label(label, color=DARK_GREY)
+    colour_bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+    colour_bar.ax.tick_params(length=2, color=LIGHT_GREY, labelcolor=DARK_GREY)
 
 
 def _factor_ticks(max_log_factor: float) -> dict[float, str]:
     """Ticks of a colour bar from -`max_log_factor` to `max_log_factor`, log₁₀ of factors, and their labels, such as
     "×2" and "÷2"."""
-    factors = [1 + step * 10.0**exponent for exponent in (-4, -3, -2, -1) for step in (1, 2, 5)]
-    factors += [step * 10.0**exponent for exponent in range(10) for step in (2, 5, 10)]
-    labels_by_value, spacing = {0.0: "1"}, _MIN_TICK_SPACING * max_log_factor
-    for factor in sorted(factors, reverse=True):
-        tick_value = math.log10(factor)
-        if spacing <= tick_value <= max_log_factor * (1 + 1e-9) and all(
-            abs(tick_value - other_tick) >= spacing for other_tick in labels_by_value
+    candidate_factors = [
+        1 + leading_digit * 10.0**exponent_of_ten for exponent_of_ten in (-4, -3, -2, -1) for leading_digit in (1, 2, 5)
+    ]
+    candidate_factors += [
+        leading_digit * 10.0**exponent_of_ten for exponent_of_ten in range(10) for leading_digit in (2, 5, 10)
+    ]
+    labels_by_value, min_spacing = {0.0: "1"}, _MIN_TICK_SPACING * max_log_factor
+    for candidate_factor in sorted(candidate_factors, reverse=True):
+        tick_value = math.log10(candidate_factor)
+        if min_spacing <= tick_value <= max_log_factor * (1 + 1e-9) and all(
+            abs(tick_value - other_tick) >= min_spacing for other_tick in labels_by_value
         ):
-            labels_by_value |= {tick_value: f"×{factor:g}", -tick_value: f"÷{factor:g}"}
+            labels_by_value |= {tick_value: f"×{candidate_factor:g}", -tick_value: f"÷{candidate_factor:g}"}
     return labels_by_value
 
 
@@ -73,9 +77,9 @@ def choose_si_prefix(max_value: float, unit: str) -> tuple[float, str]:
     its prefix, such as (1e3, "mS")."""
     if not unit or unit == "%" or not (math.isfinite(max_value) and max_value > 0):
         return 1.0, unit
-    exponent = 3 * math.floor(math.log10(max_value) / 3 + 1e-9)
-    exponent = min(max(exponent, -12), 9)
-    return 10.0**-exponent, _SI_PREFIXES[exponent] + unit
+    exponent_of_ten = 3 * math.floor(math.log10(max_value) / 3 + 1e-9)
+    exponent_of_ten = min(max(exponent_of_ten, -12), 9)
+    return 10.0**-exponent_of_ten, _SI_PREFIXES[exponent_of_ten] + unit
 
 
 class ColourScale(Module):
@@ -123,24 +127,26 @@ class ColourScale(Module):
         max_value = float(np.abs(values).max()) if self.limit is None else float(self.limit)
         if not np.isfinite(max_value):
             raise ValueError("values must be finite to be drawn.")
-        factor, prefixed_unit = choose_si_prefix(max_value, unit)
-        upper_limit = factor * max_value or 1.0
+        prefix_factor, prefixed_unit = choose_si_prefix(max_value, unit)
+        upper_limit = prefix_factor * max_value or 1.0
         if self.difference:
             lower_limit = -upper_limit
         else:
-            lower_limit = factor * float(values.min())
+            lower_limit = prefix_factor * float(values.min())
             if lower_limit >= upper_limit:  # a constant image
                 lower_limit, upper_limit = (
                     lower_limit - 0.05 * abs(lower_limit) - 1e-12,
                     upper_limit + 0.05 * abs(upper_limit) + 1e-12,
                 )
         conductivity_name = "sheet conductivity" if unit == "S" else "conductivity"
-        quantity = self.quantity or (
+        quantity_name = self.quantity or (
             f"Change of {conductivity_name}" if self.difference else conductivity_name.capitalize()
         )
-        label = f"{quantity} ({prefixed_unit})" if prefixed_unit else quantity
+        axis_label = f"{quantity_name} ({prefixed_unit})" if prefixed_unit else quantity_name
         colour_map = self.colour_map or (DIVERGING_COLOUR_MAP if self.difference else SEQUENTIAL_COLOUR_MAP)
-        return FittedScale(factor, label, {"cmap": colour_map, "vmin": lower_limit, "vmax": upper_limit}, self)
+        return FittedScale(
+            prefix_factor, axis_label, {"cmap": colour_map, "vmin": lower_limit, "vmax": upper_limit}, self
+        )
 
 
 class FittedScale(Module):

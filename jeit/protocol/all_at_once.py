@@ -55,19 +55,23 @@ def measurement_patterns(num_electrodes: int, measurement: Reading, reference: i
     patterns = measurement_patterns(16, "against", reference=0)
     ```
     """
-    count = check_count(num_electrodes, "measurement_patterns", 2)
+    electrode_count = check_count(num_electrodes, "measurement_patterns", 2)
     check_choice(measurement, READINGS, "measurement_patterns", "measurement")
     if measurement != "against" and reference is not None:
         raise ValueError(f"reference has no use with measurement = {measurement!r}; leave it out, or read against it.")
     if measurement == "adjacent":
-        return pair_patterns(ring_pairs(count, 1), count)
+        return pair_patterns(ring_pairs(electrode_count, 1), electrode_count)
     if measurement == "mean-removed":
-        return np.eye(count) - 1 / count
+        return np.eye(electrode_count) - 1 / electrode_count
     if measurement == "mean":
-        return np.eye(count) - (1 - np.eye(count)) / (count - 1)
-    reference_index = count - 1 if reference is None else int(electrode_indices(reference, count)[0])
-    other_indices = np.delete(np.arange(count), reference_index)
-    return pair_patterns(np.stack([other_indices, np.full(count - 1, reference_index)], axis=1), count)
+        return np.eye(electrode_count) - (1 - np.eye(electrode_count)) / (electrode_count - 1)
+    reference_index = (
+        electrode_count - 1 if reference is None else int(electrode_indices(reference, electrode_count)[0])
+    )
+    other_indices = np.delete(np.arange(electrode_count), reference_index)
+    return pair_patterns(
+        np.stack([other_indices, np.full(electrode_count - 1, reference_index)], axis=1), electrode_count
+    )
 
 
 def from_matrices(
@@ -102,16 +106,16 @@ def from_matrices(
     drive, measurement = _convert_to_matrix(drive, "drive"), _convert_to_matrix(measurement, "measurement")
     if not large_currents:
         _check_currents(drive, "from_matrices")
-    shape = (drive.shape[0], measurement.shape[0])
-    selected = np.ones(shape, dtype=bool) if select is None else np.asarray(select)
-    if selected.shape != shape or selected.dtype != bool:
+    selection_shape = (drive.shape[0], measurement.shape[0])
+    is_selected = np.ones(selection_shape, dtype=bool) if select is None else np.asarray(select)
+    if is_selected.shape != selection_shape or is_selected.dtype != bool:
         raise ValueError(
-            f"from_matrices: select has shape {selected.shape} of {selected.dtype}; give booleans of shape "
-            f"{shape}, one per drive (rows) and measurement pattern (columns)."
+            f"from_matrices: select has shape {is_selected.shape} of {is_selected.dtype}; give booleans of shape "
+            f"{selection_shape}, one per drive (rows) and measurement pattern (columns)."
         )
-    if not selected.any():
+    if not is_selected.any():
         raise ValueError("from_matrices: select chooses no channel. Set at least one entry to True.")
-    drive_index, measurement_index = np.nonzero(selected)
+    drive_index, measurement_index = np.nonzero(is_selected)
     return Protocol(drive, measurement, drive_index, measurement_index, name)
 
 
@@ -144,31 +148,39 @@ def from_channels(
     protocol = from_channels(known.drive, known.channel_measurement, known.drive_index)
     ```
     """
-    drive, rows = _convert_to_matrix(drive, "drive"), _convert_to_matrix(channel_measurement, "measurement")
+    drive, measurement_rows = _convert_to_matrix(drive, "drive"), _convert_to_matrix(channel_measurement, "measurement")
     if not large_currents:
         _check_currents(drive, "from_channels")
     drive_indices = np.asarray(drive_index)
-    if drive_indices.shape != (len(rows),):
+    if drive_indices.shape != (len(measurement_rows),):
         raise ValueError(
             f"from_channels: drive_index has shape {drive_indices.shape}; give one drive number for each of the "
-            f"{len(rows)} channels."
+            f"{len(measurement_rows)} channels."
         )
-    if not np.all(np.isfinite(rows)):
+    if not np.all(np.isfinite(measurement_rows)):
         raise ValueError("from_channels: the measurement patterns contain NaN or infinity. Mask channels instead.")
-    _, first_rows, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    _, first_row_indices, distinct_row_indices = np.unique(
+        measurement_rows, axis=0, return_index=True, return_inverse=True
+    )
     # Keep the order of first appearance, so that a file's numbering of its patterns is preserved.
-    order_of_appearance = np.argsort(first_rows)
-    rank = np.empty_like(order_of_appearance)
-    rank[order_of_appearance] = np.arange(len(order_of_appearance))
-    return Protocol(drive, rows[first_rows[order_of_appearance]], drive_indices, rank[inverse.ravel()], name)
+    order_of_appearance = np.argsort(first_row_indices)
+    appearance_ranks = np.empty_like(order_of_appearance)
+    appearance_ranks[order_of_appearance] = np.arange(len(order_of_appearance))
+    return Protocol(
+        drive,
+        measurement_rows[first_row_indices[order_of_appearance]],
+        drive_indices,
+        appearance_ranks[distinct_row_indices.ravel()],
+        name,
+    )
 
 
-def _convert_to_matrix(values: Any, pattern_kind: str) -> np.ndarray:
-    if not has_values(values):
-        return values
-    if hasattr(values, "toarray"):  # a scipy.sparse matrix, as loadmat returns for EIDORS patterns
-        values = values.toarray()
-    matrix = np.asarray(values)
+def _convert_to_matrix(pattern_values: Any, pattern_kind: str) -> np.ndarray:
+    if not has_values(pattern_values):
+        return pattern_values
+    if hasattr(pattern_values, "toarray"):  # a scipy.sparse matrix, as loadmat returns for EIDORS patterns
+        pattern_values = pattern_values.toarray()
+    matrix = np.asarray(pattern_values)
     if matrix.ndim != 2 or matrix.dtype.kind not in "fiu":
         raise ValueError(
             f"Protocol: {pattern_kind} patterns must be a matrix of real numbers, one row per pattern; got shape "
@@ -177,9 +189,9 @@ def _convert_to_matrix(values: Any, pattern_kind: str) -> np.ndarray:
     return matrix.astype(float)
 
 
-def _check_currents(drive, function_name: str) -> None:
-    if has_values(drive) and drive.size and np.all(np.isfinite(drive)):
-        check_amplitude(float(np.max(np.abs(drive))), function_name)
+def _check_currents(drive_patterns, function_name: str) -> None:
+    if has_values(drive_patterns) and drive_patterns.size and np.all(np.isfinite(drive_patterns)):
+        check_amplitude(float(np.max(np.abs(drive_patterns))), function_name)
 
 
 # Drive patterns whose distinguishability, relative to the maximum, is below this value are due to rounding.
@@ -214,12 +226,16 @@ def trigonometric(
     protocol = trigonometric(16)
     ```
     """
-    count = check_count(num_electrodes, "trigonometric", 3)
-    angle = 2 * np.pi * np.arange(count) / count
-    waves = [wave(k * angle) for k in range(1, count // 2 + 1) for wave in (np.cos, np.sin)]
-    drive = np.array(waves[: count - 1])
-    drive -= drive.mean(axis=1, keepdims=True)  # removes rounding errors that violate Kirchhoff's law
-    return _all_combinations("trigonometric", drive, measurement, reference, current)
+    electrode_count = check_count(num_electrodes, "trigonometric", 3)
+    electrode_angles = 2 * np.pi * np.arange(electrode_count) / electrode_count
+    wave_patterns = [
+        wave_function(k * electrode_angles)
+        for k in range(1, electrode_count // 2 + 1)
+        for wave_function in (np.cos, np.sin)
+    ]
+    drive_patterns = np.array(wave_patterns[: electrode_count - 1])
+    drive_patterns -= drive_patterns.mean(axis=1, keepdims=True)  # removes rounding errors that violate Kirchhoff's law
+    return _combine_all_patterns("trigonometric", drive_patterns, measurement, reference, current)
 
 
 def haar(
@@ -251,17 +267,22 @@ def haar(
     protocol = haar(16)
     ```
     """
-    count = check_count(num_electrodes, "haar", 2)
-    groups, drives = [np.arange(count)], []
-    while groups:
-        group = groups.pop(0)
-        first_half, second_half = np.array_split(group, 2)
-        pattern = np.zeros(count)
-        pattern[first_half], pattern[second_half] = len(second_half), -len(first_half)
-        drives.append(pattern / len(first_half))  # the first half is at least as large as the second
-        groups += [group_half for group_half in (first_half, second_half) if len(group_half) > 1]
-    drive = np.array(drives)
-    return _all_combinations("haar", drive / np.abs(drive).max(axis=1, keepdims=True), measurement, reference, current)
+    electrode_count = check_count(num_electrodes, "haar", 2)
+    electrode_groups, drive_rows = [np.arange(electrode_count)], []
+    while electrode_groups:
+        electrode_group = electrode_groups.pop(0)
+        first_electrodes, second_electrodes = np.array_split(electrode_group, 2)
+        drive_pattern = np.zeros(electrode_count)
+        drive_pattern[first_electrodes], drive_pattern[second_electrodes] = (
+            len(second_electrodes),
+            -len(first_electrodes),
+        )
+        drive_rows.append(drive_pattern / len(first_electrodes))  # the first half is at least as large as the second
+        electrode_groups += [half_group for half_group in (first_electrodes, second_electrodes) if len(half_group) > 1]
+    drive_patterns = np.array(drive_rows)
+    return _combine_all_patterns(
+        "haar", drive_patterns / np.abs(drive_patterns).max(axis=1, keepdims=True), measurement, reference, current
+    )
 
 
 def optimal(
@@ -299,62 +320,68 @@ def optimal(
     protocol = optimal(transfer, number=5)
     ```
     """
-    first_transfer = _check_transfer("transfer", transfer)
-    count = len(first_transfer)
+    first_transfer = _check_transfer_impedance("transfer", transfer)
+    electrode_count = len(first_transfer)
     check_current(current, "optimal")
-    max_drives = count - 1 if number is None else check_count(number, "optimal: number", 1)
+    max_drives = electrode_count - 1 if number is None else check_count(number, "optimal: number", 1)
     # Project the matrices to an orthonormal basis of the currents that sum to zero.
-    basis = scipy.linalg.null_space(np.ones((1, count)))
-    power_matrix = basis.T @ first_transfer @ basis
-    change = power_matrix
+    current_basis = scipy.linalg.null_space(np.ones((1, electrode_count)))
+    power_matrix = current_basis.T @ first_transfer @ current_basis
+    transfer_change = power_matrix
     if other is not None:
-        second_transfer = _check_transfer("other", other)
+        second_transfer = _check_transfer_impedance("other", other)
         if second_transfer.shape != first_transfer.shape:
             raise ValueError(
                 f"other: its shape is {second_transfer.shape}, and that of transfer {first_transfer.shape}; give one "
                 "body's."
             )
-        change = power_matrix - basis.T @ second_transfer @ basis
-    if np.linalg.norm(change) <= _MIN_DISTINGUISHABILITY * np.linalg.norm(power_matrix):
+        transfer_change = power_matrix - current_basis.T @ second_transfer @ current_basis
+    if np.linalg.norm(transfer_change) <= _MIN_DISTINGUISHABILITY * np.linalg.norm(power_matrix):
         raise ValueError("other: it equals transfer, and no current distinguishes them.")
     if power is None:
-        values, directions = _sort_descending(np.linalg.eigh(change @ change))
+        eigenvalues, drive_directions = _sort_by_eigenvalue(np.linalg.eigh(transfer_change @ transfer_change))
     else:
-        directions, values = _drives_for_power(power_matrix, change, power, other is None)
-    is_distinguishing = values > _MIN_DISTINGUISHABILITY * values[0]
-    drive = (basis @ directions[:, is_distinguishing][:, :max_drives]).T
+        drive_directions, eigenvalues = _drives_for_power(power_matrix, transfer_change, power, other is None)
+    is_distinguishing = eigenvalues > _MIN_DISTINGUISHABILITY * eigenvalues[0]
+    drive_patterns = (current_basis @ drive_directions[:, is_distinguishing][:, :max_drives]).T
     # The sign of an eigenvector is arbitrary: make its largest component positive.
-    drive *= np.sign(drive[np.arange(len(drive)), np.abs(drive).argmax(axis=1)])[:, None]
+    drive_patterns *= np.sign(drive_patterns[np.arange(len(drive_patterns)), np.abs(drive_patterns).argmax(axis=1)])[
+        :, None
+    ]
     if power is None:
-        drive /= np.abs(drive).max(axis=1, keepdims=True)
-        return _all_combinations("optimal", drive, measurement, reference, current)
-    drive *= np.sqrt(power / np.einsum("si,ij,sj->s", drive, first_transfer, drive))[:, None]
-    check_amplitude(float(np.abs(drive).max()), "optimal: power")
-    return _all_combinations("optimal for a given power", drive, measurement, reference, 1.0)
+        drive_patterns /= np.abs(drive_patterns).max(axis=1, keepdims=True)
+        return _combine_all_patterns("optimal", drive_patterns, measurement, reference, current)
+    drive_patterns *= np.sqrt(power / np.einsum("si,ij,sj->s", drive_patterns, first_transfer, drive_patterns))[:, None]
+    check_amplitude(float(np.abs(drive_patterns).max()), "optimal: power")
+    return _combine_all_patterns("optimal for a given power", drive_patterns, measurement, reference, 1.0)
 
 
-def _drives_for_power(power_matrix, change, power: float, has_one_body: bool) -> tuple[np.ndarray, np.ndarray]:
+def _drives_for_power(
+    power_matrix, transfer_change, drive_power: float, has_one_body: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """Directions of the drives that maximise distinguishability for fixed power, and their squared
     distinguishabilities, the largest first."""
     if has_one_body:
         raise ValueError("power needs other: with one body alone the currents for a given power are those of no power.")
-    if isinstance(power, bool) or not isinstance(power, int | float) or not 0 < power < np.inf:
-        raise ValueError(f"power must be a positive number of watts; it is {power!r}.")
-    symmetric = (power_matrix + power_matrix.T) / 2
-    if np.linalg.eigvalsh(symmetric)[0] <= 0:
+    if isinstance(drive_power, bool) or not isinstance(drive_power, int | float) or not 0 < drive_power < np.inf:
+        raise ValueError(f"power must be a positive number of watts; it is {drive_power!r}.")
+    symmetric_power_matrix = (power_matrix + power_matrix.T) / 2
+    if np.linalg.eigvalsh(symmetric_power_matrix)[0] <= 0:
         raise ValueError("transfer: some currents dissipate no power in it; is it the transfer impedance of a body?")
-    values, directions = _sort_descending(scipy.linalg.eigh(change @ change, symmetric))
-    return directions, values
+    eigenvalues, drive_directions = _sort_by_eigenvalue(
+        scipy.linalg.eigh(transfer_change @ transfer_change, symmetric_power_matrix)
+    )
+    return drive_directions, eigenvalues
 
 
-def _sort_descending(values_and_vectors) -> tuple[np.ndarray, np.ndarray]:
+def _sort_by_eigenvalue(eigenpairs) -> tuple[np.ndarray, np.ndarray]:
     """Sort eigenvalues and eigenvectors by eigenvalue, with the largest first."""
-    values, vectors = values_and_vectors
-    return values[::-1], vectors[:, ::-1]
+    eigenvalues, eigenvectors = eigenpairs
+    return eigenvalues[::-1], eigenvectors[:, ::-1]
 
 
-def _check_transfer(name: str, transfer: ArrayLike) -> np.ndarray:
-    matrix = np.asarray(transfer)
+def _check_transfer_impedance(name: str, transfer_impedance: ArrayLike) -> np.ndarray:
+    matrix = np.asarray(transfer_impedance)
     if matrix.ndim == 3 and matrix.shape[1] == matrix.shape[2]:
         raise ValueError(
             f"{name} has shape {matrix.shape}, of {counted(len(matrix), 'frame')}; give one, (L, L): {name}[0] of the "
@@ -370,8 +397,14 @@ def _check_transfer(name: str, transfer: ArrayLike) -> np.ndarray:
     return (matrix + matrix.T) / 2
 
 
-def _all_combinations(name: str, drive, measurement: Reading, reference: int | None, current: Current) -> Protocol:
+def _combine_all_patterns(
+    protocol_name: str, drive_patterns, measurement: Reading, reference: int | None, current: Current
+) -> Protocol:
     """Protocol that combines every drive pattern with every measurement pattern of the kind `measurement`."""
-    check_current(current, name)
-    rows = measurement_patterns(drive.shape[1], measurement, reference)
-    return from_matrices(current * drive, rows, name=f"{name}, {measurement} measurement, {drive.shape[1]} electrodes")
+    check_current(current, protocol_name)
+    measurement_rows = measurement_patterns(drive_patterns.shape[1], measurement, reference)
+    return from_matrices(
+        current * drive_patterns,
+        measurement_rows,
+        name=f"{protocol_name}, {measurement} measurement, {drive_patterns.shape[1]} electrodes",
+    )

@@ -34,17 +34,17 @@ def pair_patterns(pairs: np.ndarray, num_electrodes: int) -> np.ndarray:
     """Convert electrode pairs (P, 2) to patterns (P, L) over L electrodes: +1 at the first electrode of the pair, -1 at
     the second."""
     patterns = np.zeros((len(pairs), num_electrodes))
-    rows = np.arange(len(pairs))
-    patterns[rows, pairs[:, 0]] = 1.0
-    patterns[rows, pairs[:, 1]] = -1.0
+    row_indices = np.arange(len(pairs))
+    patterns[row_indices, pairs[:, 0]] = 1.0
+    patterns[row_indices, pairs[:, 1]] = -1.0
     return patterns
 
 
 def ring_pairs(num_electrodes: int, offset: int) -> np.ndarray:
     """Pairs (L, 2) of every electrode of a ring with the electrode that is `offset` positions further along the
     ring."""
-    start = np.arange(num_electrodes)
-    return np.stack([start, (start + offset) % num_electrodes], axis=1)
+    first_electrodes = np.arange(num_electrodes)
+    return np.stack([first_electrodes, (first_electrodes + offset) % num_electrodes], axis=1)
 
 
 @dataclass(frozen=True)
@@ -78,29 +78,31 @@ class CrossedPairs:
         check_current(current, self.where)
         check_choice(reciprocal, ("all", "half"), self.where, "reciprocal")
         check_choice(order, ("rotating", "fixed"), self.where, "order")
-        num_rows = len(self.measurement)
-        drive_index = np.repeat(np.arange(len(self.drive)), num_rows)
-        measurement_index = np.tile(np.arange(num_rows), len(self.drive))
+        num_measurement_patterns = len(self.measurement)
+        drive_index = np.repeat(np.arange(len(self.drive)), num_measurement_patterns)
+        measurement_index = np.tile(np.arange(num_measurement_patterns), len(self.drive))
         if order == "rotating":
             # Drive i begins with measurement pair i: the pairs are in ring order, one per electrode.
-            measurement_index = (measurement_index + drive_index) % num_rows
+            measurement_index = (measurement_index + drive_index) % num_measurement_patterns
         # Channels are selected with NumPy at unit current, so that the argument `current` may be traced.
-        drive = pair_patterns(self.drive, self.num_electrodes)
-        measurement = pair_patterns(self.measurement, self.num_electrodes)
+        drive_patterns = pair_patterns(self.drive, self.num_electrodes)
+        measurement_patterns = pair_patterns(self.measurement, self.num_electrodes)
         is_selected = np.ones(len(drive_index), dtype=bool)
         if not driven_electrodes:
-            is_selected &= ~shares_electrode(drive, measurement)[drive_index, measurement_index]
+            is_selected &= ~shares_electrode(drive_patterns, measurement_patterns)[drive_index, measurement_index]
         if reciprocal == "half":
-            pairs, _ = reciprocal_channel_pairs(drive, measurement, drive_index, measurement_index)
-            is_selected[pairs[:, 1]] = False
+            reciprocal_pairs, _ = reciprocal_channel_pairs(
+                drive_patterns, measurement_patterns, drive_index, measurement_index
+            )
+            is_selected[reciprocal_pairs[:, 1]] = False
         if not is_selected.any():
             raise ValueError(
                 f"{self.where}: every channel measures on a driven electrode, so none is left. Pass "
                 "driven_electrodes=True, or measure other pairs."
             )
         return Protocol(
-            drive=current * drive,
-            measurement=measurement,
+            drive=current * drive_patterns,
+            measurement=measurement_patterns,
             drive_index=drive_index[is_selected],
             measurement_index=measurement_index[is_selected],
             name=name,
@@ -176,16 +178,19 @@ def skip(
     ```
     """
     function_name = "adjacent" if skipped == 0 else "skip"
-    count = check_count(num_electrodes, function_name, 4)
+    electrode_count = check_count(num_electrodes, function_name, 4)
     measurement_skipped = skipped if measurement_skipped is None else measurement_skipped
-    _check_skipped(skipped, "skipped", count, "skip")
-    _check_skipped(measurement_skipped, "measurement_skipped", count, "skip")
-    kind = "adjacent" if skipped == 0 else f"skip-{skipped}"
+    _check_skipped(skipped, "skipped", electrode_count, "skip")
+    _check_skipped(measurement_skipped, "measurement_skipped", electrode_count, "skip")
+    skip_name = "adjacent" if skipped == 0 else f"skip-{skipped}"
     if measurement_skipped != skipped:
-        kind += f", skip-{measurement_skipped} measurement"
-    drive, measurement = ring_pairs(count, skipped + 1), ring_pairs(count, measurement_skipped + 1)
-    return CrossedPairs(function_name, count, drive, measurement).protocol(
-        f"{kind}, {count} electrodes",
+        skip_name += f", skip-{measurement_skipped} measurement"
+    drive_pairs, measurement_pairs = (
+        ring_pairs(electrode_count, skipped + 1),
+        ring_pairs(electrode_count, measurement_skipped + 1),
+    )
+    return CrossedPairs(function_name, electrode_count, drive_pairs, measurement_pairs).protocol(
+        f"{skip_name}, {electrode_count} electrodes",
         current=current,
         driven_electrodes=driven_electrodes,
         reciprocal=reciprocal,
@@ -193,12 +198,17 @@ def skip(
     )
 
 
-def _check_skipped(value, name: str, count: int, function_name: str) -> None:
-    """Raise `ValueError` unless the argument `name` is a number of electrodes that a pair of a ring of `count`
-    electrodes can skip."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value <= count - 2:
+def _check_skipped(num_skipped, argument_name: str, electrode_count: int, function_name: str) -> None:
+    """Raise `ValueError` unless the argument `argument_name` is a number of electrodes that a pair of a ring of
+    `electrode_count` electrodes can skip."""
+    if (
+        isinstance(num_skipped, bool)
+        or not isinstance(num_skipped, (int, np.integer))
+        or not 0 <= num_skipped <= electrode_count - 2
+    ):
         raise ValueError(
-            f"{function_name}: {name} must be an integer from 0 to {count - 2} for {count} electrodes; got {value!r}."
+            f"{function_name}: {argument_name} must be an integer from 0 to {electrode_count - 2} for "
+            f"{electrode_count} electrodes; got {num_skipped!r}."
         )
 
 
@@ -227,17 +237,17 @@ def opposite(
     protocol = opposite(16)
     ```
     """
-    count = check_count(num_electrodes, "opposite", 4)
-    if count % 2:
+    electrode_count = check_count(num_electrodes, "opposite", 4)
+    if electrode_count % 2:
         raise ValueError(
-            f"opposite: {count} electrodes have no opposite pairs. Use an even number, or `skip(..., "
-            f"{count // 2 - 1})`."
+            f"opposite: {electrode_count} electrodes have no opposite pairs. Use an even number, or `skip(..., "
+            f"{electrode_count // 2 - 1})`."
         )
     check_choice(drives, ("distinct", "all"), "opposite", "drives")
-    pairs = ring_pairs(count, count // 2)
-    drive = pairs[: count // 2] if drives == "distinct" else pairs
-    return CrossedPairs("opposite", count, drive, ring_pairs(count, 1)).protocol(
-        f"opposite, {count} electrodes",
+    opposite_pairs = ring_pairs(electrode_count, electrode_count // 2)
+    drive_pairs = opposite_pairs[: electrode_count // 2] if drives == "distinct" else opposite_pairs
+    return CrossedPairs("opposite", electrode_count, drive_pairs, ring_pairs(electrode_count, 1)).protocol(
+        f"opposite, {electrode_count} electrodes",
         current=current,
         driven_electrodes=driven_electrodes,
         order=order,
@@ -273,15 +283,15 @@ def all_against_one(
     protocol = all_against_one(16, common=0, measurement="adjacent")
     ```
     """
-    count = check_count(num_electrodes, "all_against_one", 3)
+    electrode_count = check_count(num_electrodes, "all_against_one", 3)
     check_choice(measurement, ("common", "adjacent"), "all_against_one", "measurement")
-    electrode_indices(common, count)
-    pairs = np.array([(k, common) for k in range(count) if k != common])
+    electrode_indices(common, electrode_count)
+    drive_pairs = np.array([(k, common) for k in range(electrode_count) if k != common])
     if driven_electrodes is None:
         driven_electrodes = measurement == "common"
-    measurement_pairs = pairs if measurement == "common" else ring_pairs(count, 1)
-    return CrossedPairs("all_against_one", count, pairs, measurement_pairs).protocol(
-        f"all against electrode {common}, {measurement} measurement, {count} electrodes",
+    measurement_pairs = drive_pairs if measurement == "common" else ring_pairs(electrode_count, 1)
+    return CrossedPairs("all_against_one", electrode_count, drive_pairs, measurement_pairs).protocol(
+        f"all against electrode {common}, {measurement} measurement, {electrode_count} electrodes",
         current=current,
         driven_electrodes=driven_electrodes,
         reciprocal=reciprocal,
@@ -318,18 +328,18 @@ def reference_electrode(
     protocol = reference_electrode(16)
     ```
     """
-    count = check_count(num_boundary, "reference_electrode", 4)
-    reference = count if reference is None else reference
-    electrode_indices(reference, count + 1)
-    _check_skipped(skipped, "skipped", count, "reference_electrode")
-    boundary = np.array([k for k in range(count + 1) if k != reference])
+    boundary_count = check_count(num_boundary, "reference_electrode", 4)
+    reference = boundary_count if reference is None else reference
+    electrode_indices(reference, boundary_count + 1)
+    _check_skipped(skipped, "skipped", boundary_count, "reference_electrode")
+    boundary_electrodes = np.array([k for k in range(boundary_count + 1) if k != reference])
     drive_name = "adjacent" if skipped == 0 else f"skip-{skipped}"
-    drive, measurement = (
-        boundary[ring_pairs(count, skipped + 1)],
-        np.stack([boundary, np.full(count, reference)], axis=1),
+    drive_pairs, measurement_pairs = (
+        boundary_electrodes[ring_pairs(boundary_count, skipped + 1)],
+        np.stack([boundary_electrodes, np.full(boundary_count, reference)], axis=1),
     )
-    return CrossedPairs("reference_electrode", count + 1, drive, measurement).protocol(
-        f"{drive_name} drive against reference electrode, {count} + 1 electrodes",
+    return CrossedPairs("reference_electrode", boundary_count + 1, drive_pairs, measurement_pairs).protocol(
+        f"{drive_name} drive against reference electrode, {boundary_count} + 1 electrodes",
         current=current,
         driven_electrodes=driven_electrodes,
         order=order,
@@ -359,19 +369,19 @@ def two_terminal(
     protocol = two_terminal(8)
     ```
     """
-    count = check_count(num_electrodes, "two_terminal", 2)
+    electrode_count = check_count(num_electrodes, "two_terminal", 2)
     check_current(current, "two_terminal")
     if pairs is None:
-        pairs = np.array([(i, j) for i in range(count) for j in range(i + 1, count)])
-    checked_pairs = check_pairs(pairs, count, "two_terminal")
-    patterns = pair_patterns(checked_pairs, count)
-    channels = np.arange(len(checked_pairs))
+        pairs = np.array([(i, j) for i in range(electrode_count) for j in range(i + 1, electrode_count)])
+    checked_pairs = check_pairs(pairs, electrode_count, "two_terminal")
+    pair_pattern_matrix = pair_patterns(checked_pairs, electrode_count)
+    pair_indices = np.arange(len(checked_pairs))
     return Protocol(
-        drive=current * patterns,
-        measurement=patterns,
-        drive_index=channels,
-        measurement_index=channels,
-        name=f"two-terminal, {len(checked_pairs)} pairs, {count} electrodes",
+        drive=current * pair_pattern_matrix,
+        measurement=pair_pattern_matrix,
+        drive_index=pair_indices,
+        measurement_index=pair_indices,
+        name=f"two-terminal, {len(checked_pairs)} pairs, {electrode_count} electrodes",
     )
 
 
@@ -401,10 +411,10 @@ def bipolar(
     protocol = bipolar(8, [[0, 4], [2, 6]], [[1, 2], [3, 4], [5, 6]])
     ```
     """
-    count = check_count(num_electrodes, "bipolar", 2)
-    drive = check_pairs(drive_pairs, count, "bipolar: drive_pairs")
-    measurement = check_pairs(measurement_pairs, count, "bipolar: measurement_pairs")
-    return CrossedPairs("bipolar", count, drive, measurement).protocol(
+    electrode_count = check_count(num_electrodes, "bipolar", 2)
+    checked_drive_pairs = check_pairs(drive_pairs, electrode_count, "bipolar: drive_pairs")
+    checked_measurement_pairs = check_pairs(measurement_pairs, electrode_count, "bipolar: measurement_pairs")
+    return CrossedPairs("bipolar", electrode_count, checked_drive_pairs, checked_measurement_pairs).protocol(
         name,
         current=current,
         driven_electrodes=driven_electrodes,

@@ -26,31 +26,31 @@ def check_patterns(patterns, pattern_kind: str) -> None:
         )
     if not has_values(patterns):
         return
-    values = np.asarray(patterns)
-    invalid_rows = np.flatnonzero(~np.all(np.isfinite(values), axis=1))
+    pattern_array = np.asarray(patterns)
+    invalid_rows = np.flatnonzero(~np.all(np.isfinite(pattern_array), axis=1))
     if invalid_rows.size:
         raise ValueError(
             f"Protocol: {pattern_kind} pattern {invalid_rows[0]} contains NaN or infinity. Leave missing electrodes "
             "out of the patterns with 0, and mask their channels."
         )
-    max_weights = np.max(np.abs(values), axis=1)
-    invalid_rows = np.flatnonzero(max_weights == 0)
+    max_pattern_weights = np.max(np.abs(pattern_array), axis=1)
+    invalid_rows = np.flatnonzero(max_pattern_weights == 0)
     if invalid_rows.size:
         raise ValueError(
             f"Protocol: {pattern_kind} pattern {invalid_rows[0]} is all zero: it drives or measures nothing. Remove it "
             f"({invalid_rows.size} such rows)."
         )
-    relative_sums = np.abs(values.sum(axis=1)) / max_weights
-    invalid_rows = np.flatnonzero(relative_sums > 1e-9)
+    relative_pattern_sums = np.abs(pattern_array.sum(axis=1)) / max_pattern_weights
+    invalid_rows = np.flatnonzero(relative_pattern_sums > 1e-9)
     if invalid_rows.size:
-        reason = (
+        zero_sum_reason = (
             "current that goes in must come out"
             if pattern_kind == "drive"
             else "only differences of potential can be measured; subtract a reference electrode"
         )
         raise ValueError(
-            f"Protocol: {pattern_kind} pattern {invalid_rows[0]} sums to {values[invalid_rows[0]].sum():.6g}, not to "
-            f"zero ({reason}). If the matrix has one row per electrode, transpose it."
+            f"Protocol: {pattern_kind} pattern {invalid_rows[0]} sums to {pattern_array[invalid_rows[0]].sum():.6g}, "
+            f"not to zero ({zero_sum_reason}). If the matrix has one row per electrode, transpose it."
         )
 
 
@@ -62,11 +62,11 @@ def check_indices(index, num_patterns: int, name: str, pattern_kind: str) -> Non
         )
     if not has_values(index):
         return
-    values = np.asarray(index)
-    if values.min() < 0 or values.max() >= num_patterns:
+    index_array = np.asarray(index)
+    if index_array.min() < 0 or index_array.max() >= num_patterns:
         raise ValueError(
-            f"Protocol: {name} runs from {values.min()} to {values.max()}, but there are {num_patterns} {pattern_kind} "
-            f"patterns, numbered 0 to {num_patterns - 1}. Indices are 0-based: subtract 1 from MATLAB's."
+            f"Protocol: {name} runs from {index_array.min()} to {index_array.max()}, but there are {num_patterns} "
+            f"{pattern_kind} patterns, numbered 0 to {num_patterns - 1}. Indices are 0-based: subtract 1 from MATLAB's."
         )
 
 
@@ -75,10 +75,10 @@ def check_current(current, function_name: str) -> None:
     in milliamperes."""
     if not has_values(current):
         return
-    value = np.asarray(current)
-    if value.ndim != 0 or value.dtype.kind not in "fiu" or not np.isfinite(value) or value <= 0:
+    amplitude = np.asarray(current)
+    if amplitude.ndim != 0 or amplitude.dtype.kind not in "fiu" or not np.isfinite(amplitude) or amplitude <= 0:
         raise ValueError(f"{function_name}: current must be one positive, finite number in amperes; got {current!r}.")
-    check_amplitude(float(value), function_name)
+    check_amplitude(float(amplitude), function_name)
 
 
 def check_amplitude(value: float, function_name: str) -> None:
@@ -108,34 +108,44 @@ def check_count(num_electrodes, function_name: str, minimum: int) -> int:
 
 def electrode_indices(electrodes, num_electrodes: int) -> np.ndarray:
     """Return 0-based electrode indices as an array. Raises `ValueError` for an index that is not an electrode."""
-    values = np.atleast_1d(np.asarray(electrodes))
-    if values.size == 0:
+    index_array = np.atleast_1d(np.asarray(electrodes))
+    if index_array.size == 0:
         return np.zeros(0, dtype=int)
-    if values.ndim != 1 or values.dtype.kind not in "iu" or values.min() < 0 or values.max() >= num_electrodes:
+    if (
+        index_array.ndim != 1
+        or index_array.dtype.kind not in "iu"
+        or index_array.min() < 0
+        or index_array.max() >= num_electrodes
+    ):
         raise ValueError(
             f"electrodes {electrodes!r}: give integers from 0 to {num_electrodes - 1} "
             f"(0-based; there are {num_electrodes} electrodes)."
         )
-    return values
+    return index_array
 
 
 def check_pairs(pairs, num_electrodes: int, argument_name: str) -> np.ndarray:
     """Return electrode pairs (P, 2) as 0-based indices. Raises `ValueError` for arrays of a different shape or type,
     electrodes that do not exist, and an electrode paired with itself."""
-    values = np.asarray(pairs)
-    if values.ndim != 2 or values.shape[1] != 2 or values.shape[0] == 0 or values.dtype.kind not in "iu":
+    pair_array = np.asarray(pairs)
+    if (
+        pair_array.ndim != 2
+        or pair_array.shape[1] != 2
+        or pair_array.shape[0] == 0
+        or pair_array.dtype.kind not in "iu"
+    ):
         raise ValueError(
-            f"{argument_name}: give pairs of electrodes as integers of shape (P, 2); got shape {values.shape} of "
-            f"{values.dtype}."
+            f"{argument_name}: give pairs of electrodes as integers of shape (P, 2); got shape {pair_array.shape} of "
+            f"{pair_array.dtype}."
         )
-    electrode_indices(values.ravel(), num_electrodes)
-    equal_pairs = np.flatnonzero(values[:, 0] == values[:, 1])
+    electrode_indices(pair_array.ravel(), num_electrodes)
+    equal_pairs = np.flatnonzero(pair_array[:, 0] == pair_array[:, 1])
     if equal_pairs.size:
         raise ValueError(
-            f"{argument_name}: pair {equal_pairs[0]} is electrode {values[equal_pairs[0], 0]} with itself. Use two "
+            f"{argument_name}: pair {equal_pairs[0]} is electrode {pair_array[equal_pairs[0], 0]} with itself. Use two "
             "different electrodes."
         )
-    return values
+    return pair_array
 
 
 def check_choice(value, choices: tuple[str, ...], function_name: str, name: str) -> None:
@@ -147,19 +157,19 @@ def check_choice(value, choices: tuple[str, ...], function_name: str, name: str)
         )
 
 
-def _convert_to_float(values) -> Array:
-    return as_array(values, float)
+def _convert_to_float(pattern_values) -> Array:
+    return as_array(pattern_values, float)
 
 
-def _convert_to_indices(values) -> Array:
-    if not isinstance(values, jax.Array) and np.asarray(values).dtype.kind not in "iub":
+def _convert_to_indices(index_values) -> Array:
+    if not isinstance(index_values, jax.Array) and np.asarray(index_values).dtype.kind not in "iub":
         raise ValueError("Protocol: drive_index and measurement_index must be integers (0-based).")
-    return as_array(values, np.int32)
+    return as_array(index_values, np.int32)
 
 
 @numpy_or_compiled
-def _select_rows(patterns, row_indices):
-    return patterns[row_indices]
+def _select_rows(pattern_matrix, row_indices):
+    return pattern_matrix[row_indices]
 
 
 class Protocol(Module):
@@ -252,10 +262,13 @@ class Protocol(Module):
 
         Raises `ValueError` for an index that is not an electrode.
         """
-        indices = electrode_indices(electrodes, self.num_electrodes)
-        driven = np.any(np.asarray(self.drive)[:, indices] != 0, axis=1)
-        measured = np.any(np.asarray(self.measurement)[:, indices] != 0, axis=1)
-        return np.logical_or(driven[np.asarray(self.drive_index)], measured[np.asarray(self.measurement_index)])
+        checked_electrodes = electrode_indices(electrodes, self.num_electrodes)
+        has_driven_electrode = np.any(np.asarray(self.drive)[:, checked_electrodes] != 0, axis=1)
+        has_measured_electrode = np.any(np.asarray(self.measurement)[:, checked_electrodes] != 0, axis=1)
+        return np.logical_or(
+            has_driven_electrode[np.asarray(self.drive_index)],
+            has_measured_electrode[np.asarray(self.measurement_index)],
+        )
 
     def mask_without(self, electrodes: int | Sequence[int]) -> Bool[np.ndarray, " M"]:
         """Whether each channel (M,) is still usable when `electrodes` (0-based) are missing or broken."""
@@ -266,8 +279,8 @@ class Protocol(Module):
 
         The voltage of such a channel includes the voltage drop at the contact impedance.
         """
-        shared = shares_electrode(np.asarray(self.drive), np.asarray(self.measurement))
-        return shared[np.asarray(self.drive_index), np.asarray(self.measurement_index)]
+        has_shared_electrode = shares_electrode(np.asarray(self.drive), np.asarray(self.measurement))
+        return has_shared_electrode[np.asarray(self.drive_index), np.asarray(self.measurement_index)]
 
     def subset(self, keep: ArrayLike) -> "Protocol":
         """Create a protocol with only the channels selected by `keep`, and the drive and measurement patterns that they
@@ -276,30 +289,34 @@ class Protocol(Module):
         `keep` is a boolean mask (M,) or a sequence of channel indices; the corresponding voltages are `voltages[...,
         keep]`. Raises `ValueError` for a mask of a wrong length, or if no channel is selected.
         """
-        channels = np.asarray(keep)
-        if channels.dtype == bool:
-            if channels.shape != (self.num_measurements,):
+        kept_channels = np.asarray(keep)
+        if kept_channels.dtype == bool:
+            if kept_channels.shape != (self.num_measurements,):
                 raise ValueError(
-                    f"subset: the mask has shape {channels.shape}, the protocol {self.num_measurements} "
+                    f"subset: the mask has shape {kept_channels.shape}, the protocol {self.num_measurements} "
                     "channels. Give one True or False per channel."
                 )
-            channels = np.flatnonzero(channels)
-        elif channels.size and (
-            channels.dtype.kind not in "iu" or channels.min() < 0 or channels.max() >= self.num_measurements
+            kept_channels = np.flatnonzero(kept_channels)
+        elif kept_channels.size and (
+            kept_channels.dtype.kind not in "iu"
+            or kept_channels.min() < 0
+            or kept_channels.max() >= self.num_measurements
         ):
             raise ValueError(
                 f"subset: channels must be integers from 0 to {self.num_measurements - 1}, or a boolean mask."
             )
-        if channels.size == 0:
+        if kept_channels.size == 0:
             raise ValueError("subset: no channel is left. Keep at least one.")
-        drives, drive_index = np.unique(np.asarray(self.drive_index)[channels], return_inverse=True)
-        rows, measurement_index = np.unique(np.asarray(self.measurement_index)[channels], return_inverse=True)
+        drive_rows, drive_index = np.unique(np.asarray(self.drive_index)[kept_channels], return_inverse=True)
+        measurement_rows, measurement_index = np.unique(
+            np.asarray(self.measurement_index)[kept_channels], return_inverse=True
+        )
         return Protocol(
-            drive=_select_rows(self.drive, drives),
-            measurement=_select_rows(self.measurement, rows),
+            drive=_select_rows(self.drive, drive_rows),
+            measurement=_select_rows(self.measurement, measurement_rows),
             drive_index=drive_index,
             measurement_index=measurement_index,
-            name=f"{self.name}, {channels.size} of {self.num_measurements} channels",
+            name=f"{self.name}, {kept_channels.size} of {self.num_measurements} channels",
         )
 
     def repeated_facts(self, channels: ArrayLike | None = None) -> int:
@@ -312,21 +329,21 @@ class Protocol(Module):
         they are assumed to be measured one by one with independent noise, even if the pairs form a ring. No channel of
         such a drive is counted.
         """
-        rows = np.asarray(self.measurement)
+        measurement_rows = np.asarray(self.measurement)
         used_channels = np.arange(self.num_measurements) if channels is None else np.asarray(channels)
-        drive, measurement = (
+        drive_indices, measurement_indices = (
             np.asarray(self.drive_index)[used_channels],
             np.asarray(self.measurement_index)[used_channels],
         )
         # Differences of two electrodes are independent, so only drives with other measurements need be examined.
-        has_many_electrodes = np.count_nonzero(rows, axis=1) > 2
-        num_redundant_channels, ranks = 0, {}
-        for drive_number in np.unique(drive[has_many_electrodes[measurement]]):
-            drive_rows = np.sort(measurement[drive == drive_number])
-            key = drive_rows.tobytes()
-            if key not in ranks:
-                ranks[key] = int(np.linalg.matrix_rank(rows[drive_rows], tol=1e-9))
-            num_redundant_channels += len(drive_rows) - ranks[key]
+        has_many_electrodes = np.count_nonzero(measurement_rows, axis=1) > 2
+        num_redundant_channels, ranks_by_rows = 0, {}
+        for drive_number in np.unique(drive_indices[has_many_electrodes[measurement_indices]]):
+            rows_of_drive = np.sort(measurement_indices[drive_indices == drive_number])
+            rows_key = rows_of_drive.tobytes()
+            if rows_key not in ranks_by_rows:
+                ranks_by_rows[rows_key] = int(np.linalg.matrix_rank(measurement_rows[rows_of_drive], tol=1e-9))
+            num_redundant_channels += len(rows_of_drive) - ranks_by_rows[rows_key]
         return num_redundant_channels
 
     def reciprocal_pairs(self) -> tuple[Int[np.ndarray, "P 2"], Float[np.ndarray, " P"]]:
@@ -365,10 +382,10 @@ class Protocol(Module):
         )
 
 
-def _pattern_rows(patterns, pattern_indices) -> np.ndarray:
-    """Pattern of each channel: the rows `pattern_indices` of `patterns`. NumPy is used, because JAX would compile the
-    indexing."""
-    return np.asarray(patterns)[np.asarray(pattern_indices)]
+def _pattern_rows(pattern_matrix, pattern_indices) -> np.ndarray:
+    """Pattern of each channel: the rows `pattern_indices` of `pattern_matrix`. NumPy is used, because JAX would compile
+    the indexing."""
+    return np.asarray(pattern_matrix)[np.asarray(pattern_indices)]
 
 
 def shares_electrode(drive: Float[np.ndarray, "S L"], measurement: Float[np.ndarray, "K L"]) -> Bool[np.ndarray, "S K"]:

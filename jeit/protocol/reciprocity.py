@@ -16,11 +16,11 @@ def _direction_keys(patterns: np.ndarray) -> tuple[list[bytes], np.ndarray]:
     """A hashable key of each pattern (row), the same for proportional patterns, and the scale of each pattern: pattern
     = scale * unit pattern."""
     # The first entry that is not tiny determines scale and sign, so that proportional rows have the same unit row.
-    size = np.max(np.abs(patterns), axis=1, keepdims=True)
-    first_nonzero_indices = np.argmax(np.abs(patterns) > 1e-9 * size, axis=1)
-    scale = patterns[np.arange(len(patterns)), first_nonzero_indices]
-    unit = np.round(patterns / scale[:, None], 9) + 0.0  # + 0.0 turns -0.0 into 0.0
-    return [row.tobytes() for row in unit], scale
+    max_pattern_weights = np.max(np.abs(patterns), axis=1, keepdims=True)
+    first_nonzero_indices = np.argmax(np.abs(patterns) > 1e-9 * max_pattern_weights, axis=1)
+    pattern_scales = patterns[np.arange(len(patterns)), first_nonzero_indices]
+    unit_patterns = np.round(patterns / pattern_scales[:, None], 9) + 0.0  # + 0.0 turns -0.0 into 0.0
+    return [unit_pattern.tobytes() for unit_pattern in unit_patterns], pattern_scales
 
 
 def reciprocal_channel_pairs(
@@ -31,20 +31,20 @@ def reciprocal_channel_pairs(
 
     The arguments are those of `Protocol`. Each channel is paired only with the last of its reciprocal channels.
     """
-    drive_key, drive_scale = _direction_keys(drive)
-    measurement_key, measurement_scale = _direction_keys(measurement)
-    channel = {
-        (drive_key[d], measurement_key[m]): k
+    drive_keys, drive_scales = _direction_keys(drive)
+    measurement_keys, measurement_scales = _direction_keys(measurement)
+    channel_by_keys = {
+        (drive_keys[d], measurement_keys[m]): k
         for k, (d, m) in enumerate(zip(drive_index, measurement_index, strict=True))
     }
-    gain = drive_scale[drive_index] * measurement_scale[measurement_index]
-    pairs, ratios = [], []
+    channel_gains = drive_scales[drive_index] * measurement_scales[measurement_index]
+    reciprocal_pairs, voltage_ratios = [], []
     for first_channel, (d, m) in enumerate(zip(drive_index, measurement_index, strict=True)):
-        reciprocal_channel = channel.get((measurement_key[m], drive_key[d]))
+        reciprocal_channel = channel_by_keys.get((measurement_keys[m], drive_keys[d]))
         if reciprocal_channel is not None and first_channel < reciprocal_channel:
-            pairs.append((first_channel, reciprocal_channel))
-            ratios.append(gain[reciprocal_channel] / gain[first_channel])
-    return np.array(pairs, dtype=int).reshape(-1, 2), np.array(ratios, dtype=float)
+            reciprocal_pairs.append((first_channel, reciprocal_channel))
+            voltage_ratios.append(channel_gains[reciprocal_channel] / channel_gains[first_channel])
+    return np.array(reciprocal_pairs, dtype=int).reshape(-1, 2), np.array(voltage_ratios, dtype=float)
 
 
 def transfer_between_drives(
@@ -67,22 +67,26 @@ def transfer_between_drives(
       drive j flows (Z: transfer impedance). For example, the voltage of a skip-1 pair is the sum of the voltages of two
       adjacent pairs.
     - `is_known` (S, S): whether drive i is a linear combination of the measurement patterns of drive j.
-    - `noise` (S, S), watts: standard deviation of each entry of `transfer`.
+    - `transfer_noise` (S, S), watts: standard deviation of each entry of `transfer`.
     """
     num_drives = drive.shape[0]
     transfer = np.zeros((voltages.shape[0], num_drives, num_drives), dtype=voltages.dtype)
     is_known = np.zeros((num_drives, num_drives), dtype=bool)
-    noise = np.zeros((num_drives, num_drives))
+    transfer_noise = np.zeros((num_drives, num_drives))
     deviation = np.ones(len(mask)) if deviation is None else deviation
     drive_norms = np.linalg.norm(drive, axis=1)
     for drive_number in range(num_drives):
         channels = np.flatnonzero((drive_index == drive_number) & mask)
         if channels.size == 0:
             continue
-        rows, scale = measurement[measurement_index[channels]], deviation[channels]
+        measurement_rows, channel_deviations = measurement[measurement_index[channels]], deviation[channels]
         # Among all combinations of channels that equal a drive, choose the combination with the least noise.
-        combination = drive @ np.linalg.pinv(rows / scale[:, None], rcond=1e-10) / scale
-        is_known[:, drive_number] = np.linalg.norm(combination @ rows - drive, axis=1) <= 1e-8 * drive_norms
-        transfer[:, :, drive_number] = voltages[:, channels] @ combination.T
-        noise[:, drive_number] = np.linalg.norm(combination * scale, axis=1)
-    return transfer, is_known, noise
+        channel_combination = (
+            drive @ np.linalg.pinv(measurement_rows / channel_deviations[:, None], rcond=1e-10) / channel_deviations
+        )
+        is_known[:, drive_number] = (
+            np.linalg.norm(channel_combination @ measurement_rows - drive, axis=1) <= 1e-8 * drive_norms
+        )
+        transfer[:, :, drive_number] = voltages[:, channels] @ channel_combination.T
+        transfer_noise[:, drive_number] = np.linalg.norm(channel_combination * channel_deviations, axis=1)
+    return transfer, is_known, transfer_noise

@@ -28,7 +28,7 @@ from jaxtyping import Array, Int
 # Maximum number of threads that work in NumPy at once: each thread needs its own memory, and all share the memory
 # bandwidth.
 _MAX_THREADS = 4
-_thread = threading.local()
+_thread_state = threading.local()
 
 
 def number_of_cores() -> int:
@@ -76,9 +76,11 @@ def over_cores(function: Callable[[Int[np.ndarray, "c s"]], Array], num_parts: i
     parts_by_core = np.minimum(np.arange(num_cores * num_groups * group_size), num_parts - 1).reshape(
         num_cores, num_groups, group_size
     )
-    with ThreadPoolExecutor(num_cores) as pool:
-        results = list(pool.map(lambda part: jax.block_until_ready(function(part)), parts_by_core))
-    return results[0] if num_cores == 1 else jnp.concatenate(results)
+    with ThreadPoolExecutor(num_cores) as thread_pool:
+        part_results = list(
+            thread_pool.map(lambda part_index: jax.block_until_ready(function(part_index)), parts_by_core)
+        )
+    return part_results[0] if num_cores == 1 else jnp.concatenate(part_results)
 
 
 def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
@@ -105,7 +107,7 @@ def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
     on_cores(lambda part: squares.__setitem__(part, part**2), range(4))
     ```
     """
-    call, is_nested_call = _Call(function, parts), getattr(_thread, "has_core", False)
+    call, is_nested_call = _CallOnCores(function, parts), getattr(_thread_state, "has_core", False)
     with one_thread_of_blas() if len(parts) > 1 else contextlib.nullcontext():
         if len(parts) <= 1 or is_nested_call or not call.take_core():
             call.process_parts()
@@ -115,7 +117,7 @@ def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
         raise call.errors[0]
 
 
-class _Call:
+class _CallOnCores:
     """A call of `on_cores`. Its state is in an object, because functions that refer to each other would keep the arrays
     of the parts in memory."""
 
@@ -125,7 +127,7 @@ class _Call:
         self.threads: list[Any] = []
         # A part is abandoned with the call that it belongs to, and with the calls around that.
         self.abandoned = threading.Event()
-        self.abandoned_calls = (*getattr(_thread, "abandoned_calls", ()), self.abandoned)
+        self.abandoned_calls = (*getattr(_thread_state, "abandoned_calls", ()), self.abandoned)
         self.free_cores = _free_cores(os.getpid())
 
     def take_core(self) -> bool:
@@ -137,8 +139,8 @@ class _Call:
 
     def process_parts(self) -> None:
         """Process parts until none is left, and start further threads meanwhile."""
-        outer_abandoned_calls, _thread.abandoned_calls = (
-            getattr(_thread, "abandoned_calls", ()),
+        outer_abandoned_calls, _thread_state.abandoned_calls = (
+            getattr(_thread_state, "abandoned_calls", ()),
             self.abandoned_calls,
         )
         try:
@@ -147,18 +149,18 @@ class _Call:
                     if len(self.remaining_parts) > 1:
                         self.take_core()
                     try:
-                        part = self.remaining_parts.popleft()
+                        remaining_part = self.remaining_parts.popleft()
                     except IndexError:  # another thread has taken the last part
                         break
-                    self.function(part)
+                    self.function(remaining_part)
         except BaseException as error:
             self.abandoned.set()
             self.errors.append(error)
         finally:
-            _thread.abandoned_calls = outer_abandoned_calls
+            _thread_state.abandoned_calls = outer_abandoned_calls
 
     def _process_parts_on_core(self) -> None:
-        _thread.has_core = True
+        _thread_state.has_core = True
         try:
             self.process_parts()
         finally:
@@ -167,8 +169,10 @@ class _Call:
     def wait_until_done(self) -> None:
         """Wait until all threads have ended, or one of them with an error."""
         try:
-            while not self.errors and (running := [thread for thread in self.threads if not thread.done()]):
-                wait(running, return_when=FIRST_COMPLETED)
+            while not self.errors and (
+                running_threads := [helper_thread for helper_thread in self.threads if not helper_thread.done()]
+            ):
+                wait(running_threads, return_when=FIRST_COMPLETED)
         except BaseException:  # the user has interrupted
             self.abandoned.set()
             raise
@@ -188,13 +192,13 @@ def results_on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> li
     results_on_cores(lambda part: part**2, range(4))
     ```
     """
-    results: list[Any] = [None] * len(parts)
+    part_results: list[Any] = [None] * len(parts)
 
-    def store(part_index: int) -> None:
-        results[part_index] = function(parts[part_index])
+    def store_result(part_index: int) -> None:
+        part_results[part_index] = function(parts[part_index])
 
-    on_cores(store, range(len(parts)))
-    return results
+    on_cores(store_result, range(len(parts)))
+    return part_results
 
 
 def check_not_abandoned() -> None:
@@ -209,14 +213,14 @@ def check_not_abandoned() -> None:
     check_not_abandoned()
     ```
     """
-    if any(call.is_set() for call in getattr(_thread, "abandoned_calls", ())):
+    if any(abandoned_call.is_set() for abandoned_call in getattr(_thread_state, "abandoned_calls", ())):
         raise RuntimeError("abandoned, because another part of the computation has ended with an error.")
 
 
 def parts_for_cores(number: int) -> list[slice]:
     """The indices 0 … `number` - 1 split into slices of about equal size, one for each core."""
-    boundaries = np.linspace(0, number, min(number_of_cores(), _MAX_THREADS, number) + 1).astype(int).tolist()
-    return [slice(start, end) for start, end in itertools.pairwise(boundaries)]
+    slice_boundaries = np.linspace(0, number, min(number_of_cores(), _MAX_THREADS, number) + 1).astype(int).tolist()
+    return [slice(slice_start, slice_end) for slice_start, slice_end in itertools.pairwise(slice_boundaries)]
 
 
 class _FreeCores:
@@ -224,43 +228,43 @@ class _FreeCores:
     cores, as a thread that waits for others lends its core."""
 
     def __init__(self, number: int):
-        self._number, self._max_threads, self._num_threads = number, number + 1, 0
+        self._num_free_cores, self._max_threads, self._num_threads = number, number + 1, 0
         self._lock = threading.Lock()
 
     def acquire(self) -> bool:
         """Take a core for a thread, if one is free."""
         with self._lock:
-            if self._number <= 0 or self._num_threads == self._max_threads:
+            if self._num_free_cores <= 0 or self._num_threads == self._max_threads:
                 return False
-            self._number, self._num_threads = self._number - 1, self._num_threads + 1
+            self._num_free_cores, self._num_threads = self._num_free_cores - 1, self._num_threads + 1
             return True
 
     def release(self) -> None:
         """Return the core of a thread that has ended."""
         with self._lock:
-            self._number, self._num_threads = self._number + 1, self._num_threads - 1
+            self._num_free_cores, self._num_threads = self._num_free_cores + 1, self._num_threads - 1
 
     @contextlib.contextmanager
     def lend(self) -> Iterator[None]:
         """Lend the core of the calling thread while this thread waits. If another thread still uses the core then, both
         share it until one of them ends."""
         with self._lock:
-            self._number += 1
+            self._num_free_cores += 1
         try:
             yield
         finally:
             with self._lock:
-                self._number -= 1
+                self._num_free_cores -= 1
 
 
 @functools.cache
-def _free_cores(process: int) -> _FreeCores:
+def _free_cores(process_id: int) -> _FreeCores:
     """The free cores of a process."""
     return _FreeCores(min(number_of_cores(), _MAX_THREADS))
 
 
 @functools.cache
-def _thread_pool(process: int) -> ThreadPoolExecutor:
+def _thread_pool(process_id: int) -> ThreadPoolExecutor:
     """Threads of a process that process parts (a forked process needs new ones). They are few and reused, because
     memory that new threads allocate and free, about a hundred megabytes, is not returned to the system."""
     return ThreadPoolExecutor(min(number_of_cores(), _MAX_THREADS) + 1, "jeit-core")
@@ -273,8 +277,8 @@ def blas() -> threadpoolctl.ThreadpoolController:
     return threadpoolctl.ThreadpoolController().select(user_api="blas")
 
 
-_active_limits: list[Any] = []
-_limits_lock = threading.Lock()
+_active_blas_limits: list[Any] = []
+_blas_limits_lock = threading.Lock()
 
 
 @contextlib.contextmanager
@@ -289,24 +293,26 @@ def one_thread_of_blas() -> Iterator[None]:
         np.linalg.inv(chain)
     ```
     """
-    with _limits_lock:
-        if not _active_limits:
-            _take_control()
-        _active_limits.append(None if _active_limits else blas().limit(limits=1))
+    with _blas_limits_lock:
+        if not _active_blas_limits:
+            _take_control_of_blas()
+        _active_blas_limits.append(None if _active_blas_limits else blas().limit(limits=1))
     try:
         yield
     finally:
-        with _limits_lock:
-            thread_limit = _active_limits.pop()
+        with _blas_limits_lock:
+            thread_limit = _active_blas_limits.pop()
             if thread_limit is not None:  # the first context stores the original limits, and is removed last
-                _take_control()
+                _take_control_of_blas()
                 thread_limit.restore_original_limits()
-                _take_control()
+                _take_control_of_blas()
 
 
-def _take_control() -> None:
+def _take_control_of_blas() -> None:
     """Let any thread set the number of threads of BLAS next: from version 3.8 on, threadpoolctl obeys only the thread
     that set it first."""
-    for library in blas().lib_controllers:
-        if isinstance(library, threadpoolctl.OpenBLASController) and hasattr(library, "clear_controlling_thread"):
-            library.clear_controlling_thread(force=True)
+    for blas_library in blas().lib_controllers:
+        if isinstance(blas_library, threadpoolctl.OpenBLASController) and hasattr(
+            blas_library, "clear_controlling_thread"
+        ):
+            blas_library.clear_controlling_thread(force=True)

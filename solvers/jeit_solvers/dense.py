@@ -99,49 +99,49 @@ def symmetric_inverse(matrix: Inexact[Array, "s s"]) -> Inexact[Array, "s s"]:
     if not np.isfinite(matrix).all():
         return host.full_like(matrix, np.nan)
     try:
-        inverse = host.linalg.inv(matrix)
+        host_inverse = host.linalg.inv(matrix)
     except np.linalg.LinAlgError:
         return host.full_like(matrix, np.nan)
-    return (inverse + inverse.T) / 2
+    return (host_inverse + host_inverse.T) / 2
 
 
 @jax.custom_jvp
 def _symmetric_inverse(matrix: Inexact[Array, "s s"]) -> Inexact[Array, "s s"]:
-    inverse = inverse_cholesky(matrix[None])[0]
-    return inverse.T @ inverse
+    inverse_factor = inverse_cholesky(matrix[None])[0]
+    return inverse_factor.T @ inverse_factor
 
 
 @_symmetric_inverse.defjvp
 def _symmetric_inverse_jvp(primals, tangents):
-    inverse = _symmetric_inverse(*primals)
-    return inverse, -inverse @ tangents[0] @ inverse
+    matrix_inverse = _symmetric_inverse(*primals)
+    return matrix_inverse, -matrix_inverse @ tangents[0] @ matrix_inverse
 
 
 def _inverse_cholesky_lapack(matrices: Any) -> Any:
     """Inverse Cholesky factors of NumPy arrays, as defined in `inverse_cholesky`, computed by LAPACK."""
     # Scale the diagonal to order one by powers of two: LAPACK's inverse is less accurate for rows of different orders
     # of magnitude.
-    diagonal = np.diagonal(matrices, axis1=-2, axis2=-1)
-    scale = np.ldexp(1.0, -(np.frexp(diagonal)[1] // 2)).astype(matrices.dtype)
+    matrix_diagonals = np.diagonal(matrices, axis1=-2, axis2=-1)
+    diagonal_scales = np.ldexp(1.0, -(np.frexp(matrix_diagonals)[1] // 2)).astype(matrices.dtype)
     try:
-        lower_factor = np.linalg.cholesky(matrices * scale[:, None] * scale[..., None])
-        return np.tril(np.linalg.inv(lower_factor)) * scale[:, None]
+        lower_factor = np.linalg.cholesky(matrices * diagonal_scales[:, None] * diagonal_scales[..., None])
+        return np.tril(np.linalg.inv(lower_factor)) * diagonal_scales[:, None]
     except np.linalg.LinAlgError:
         return np.full_like(matrices, np.nan)
 
 
-def _transposed(matrices: Inexact[Array, "batch a b"]) -> Inexact[Array, "batch b a"]:
+def _transpose(matrices: Inexact[Array, "batch a b"]) -> Inexact[Array, "batch b a"]:
     return namespace(matrices).swapaxes(matrices, -1, -2)
 
 
 def _inverse_square_root(pivot: Inexact[Array, "batch 1"]) -> Inexact[Array, "batch 1"]:
     xp = namespace(pivot)
-    root = 1 / xp.sqrt(pivot) if xp is np else jax.lax.rsqrt(pivot)
+    inverse_root = 1 / xp.sqrt(pivot) if xp is np else jax.lax.rsqrt(pivot)
     if not jnp.issubdtype(pivot.dtype, jnp.complexfloating):
-        return root
+        return inverse_root
     # With a positive definite real part of the matrix, the real part of every pivot is positive; other matrices yield
     # NaN.
-    return xp.where(pivot.real > 0, root, xp.nan)
+    return xp.where(pivot.real > 0, inverse_root, xp.nan)
 
 
 def _inverse_cholesky_recursive(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
@@ -149,83 +149,89 @@ def _inverse_cholesky_recursive(matrices: Inexact[Array, "batch s s"]) -> Inexac
     all operations are matrix products, which are three to four times faster than LAPACK's inverse of a triangular
     matrix. The smallest blocks are inverted by unrolled code in large batches. In small batches a loop over short
     vectors inverts larger blocks, the larger the fewer the matrices."""
-    batch, size, _ = matrices.shape
+    batch_size, matrix_size, _ = matrices.shape
     is_numpy_array = isinstance(matrices, np.ndarray)
-    uses_lapack = is_numpy_array and not np.iscomplexobj(matrices)
-    block = _LAPACK_BLOCK_SIZE if uses_lapack else _BLOCK_SIZE if batch > 4 else 2 * _BLOCK_SIZE
-    uses_loop = not is_numpy_array and batch <= _MIN_UNROLLED_BATCH
-    if size <= (_MAX_BLOCKS_OF_LOOP * block if uses_loop else block):
-        if uses_lapack:
+    is_lapack_used = is_numpy_array and not np.iscomplexobj(matrices)
+    block_size = _LAPACK_BLOCK_SIZE if is_lapack_used else _BLOCK_SIZE if batch_size > 4 else 2 * _BLOCK_SIZE
+    is_loop_used = not is_numpy_array and batch_size <= _MIN_UNROLLED_BATCH
+    if matrix_size <= (_MAX_BLOCKS_OF_LOOP * block_size if is_loop_used else block_size):
+        if is_lapack_used:
             return _inverse_cholesky_lapack(matrices)
-        return _inverse_cholesky_by_rows(matrices) if uses_loop else _inverse_cholesky_unrolled(matrices)
-    first_size = block * -(-size // (2 * block))
+        return _inverse_cholesky_by_rows(matrices) if is_loop_used else _inverse_cholesky_unrolled(matrices)
+    first_size = block_size * -(-matrix_size // (2 * block_size))
     first_inverse = _inverse_cholesky_recursive(matrices[:, :first_size, :first_size])
-    lower_block = matrices[:, first_size:, :first_size] @ _transposed(first_inverse)
+    lower_block = matrices[:, first_size:, :first_size] @ _transpose(first_inverse)
     second_inverse = _inverse_cholesky_recursive(
-        matrices[:, first_size:, first_size:] - lower_block @ _transposed(lower_block)
+        matrices[:, first_size:, first_size:] - lower_block @ _transpose(lower_block)
     )
     lower_left = -(second_inverse @ (lower_block @ first_inverse))
     xp = namespace(matrices)
     upper_rows = xp.concatenate(
-        [first_inverse, xp.zeros((*first_inverse.shape[:-1], size - first_size), matrices.dtype)], axis=-1
+        [first_inverse, xp.zeros((*first_inverse.shape[:-1], matrix_size - first_size), matrices.dtype)], axis=-1
     )
     return xp.concatenate([upper_rows, xp.concatenate([lower_left, second_inverse], axis=-1)], axis=-2)
 
 
 def _inverse_cholesky_unrolled(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
     """Inverse Cholesky factors by elimination of [A | 1] to [L^T | W], row by row, in unrolled code."""
-    size, xp = matrices.shape[-1], namespace(matrices)
-    identity = xp.broadcast_to(xp.eye(size, dtype=matrices.dtype), matrices.shape)
-    augmented_matrices = xp.concatenate([matrices, identity], axis=-1)
-    rows = []
-    for k in range(size):
-        row = augmented_matrices[:, k]
-        for previous in rows:
-            row = row - previous[:, k : k + 1] * previous
-        rows.append(row * _inverse_square_root(row[:, k : k + 1]))
-    return xp.stack(rows, axis=1)[..., size:]
+    matrix_size, xp = matrices.shape[-1], namespace(matrices)
+    identity_matrices = xp.broadcast_to(xp.eye(matrix_size, dtype=matrices.dtype), matrices.shape)
+    augmented_matrices = xp.concatenate([matrices, identity_matrices], axis=-1)
+    finished_rows = []
+    for k in range(matrix_size):
+        current_row = augmented_matrices[:, k]
+        for previous_row in finished_rows:
+            current_row = current_row - previous_row[:, k : k + 1] * previous_row
+        finished_rows.append(current_row * _inverse_square_root(current_row[:, k : k + 1]))
+    return xp.stack(finished_rows, axis=1)[..., matrix_size:]
 
 
 def _inverse_cholesky_by_rows(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
     """Inverse Cholesky factors by the elimination of `_inverse_cholesky_unrolled` in a loop, in which each row is
     reduced by all previous rows in one product."""
-    size = matrices.shape[-1]
-    identity = jnp.broadcast_to(jnp.eye(size, dtype=matrices.dtype), matrices.shape)
-    augmented_matrices = jnp.concatenate([matrices, identity], axis=-1)
+    matrix_size = matrices.shape[-1]
+    identity_matrices = jnp.broadcast_to(jnp.eye(matrix_size, dtype=matrices.dtype), matrices.shape)
+    augmented_matrices = jnp.concatenate([matrices, identity_matrices], axis=-1)
 
     def next_row(finished_rows, k):
-        weights = _transposed(jax.lax.dynamic_index_in_dim(finished_rows, k, axis=2))
-        row = jax.lax.dynamic_index_in_dim(augmented_matrices, k, axis=1) - weights @ finished_rows
-        row = row * _inverse_square_root(jax.lax.dynamic_slice_in_dim(row, k, 1, axis=2))
-        return jax.lax.dynamic_update_slice_in_dim(finished_rows, row, k, axis=1), None
+        row_weights = _transpose(jax.lax.dynamic_index_in_dim(finished_rows, k, axis=2))
+        current_row = jax.lax.dynamic_index_in_dim(augmented_matrices, k, axis=1) - row_weights @ finished_rows
+        current_row = current_row * _inverse_square_root(jax.lax.dynamic_slice_in_dim(current_row, k, 1, axis=2))
+        return jax.lax.dynamic_update_slice_in_dim(finished_rows, current_row, k, axis=1), None
 
-    finished_rows, _ = jax.lax.scan(next_row, jnp.zeros_like(augmented_matrices), jnp.arange(size))
-    return finished_rows[..., size:]
+    finished_rows, _ = jax.lax.scan(next_row, jnp.zeros_like(augmented_matrices), jnp.arange(matrix_size))
+    return finished_rows[..., matrix_size:]
 
 
 def _inverse_cholesky_by_block_rows(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
     """Inverse Cholesky factor W, as defined in `inverse_cholesky`, computed by a loop over blocks k of rows of W. Let
     A_k and E_k be the rows k of A and of the identity, and G = A_k W^T. The new diagonal block satisfies A_kk - G G^T =
     (W_kk^T W_kk)^-1, and the new rows are W_kk (E_k - G W). The compiled loop body does not depend on the size."""
-    size, dtype = matrices.shape[-1], matrices.dtype
-    block = 32 if size <= 256 else 64
-    padding = -size % block
-    if padding:
-        matrices = jnp.pad(matrices, [(0, 0), (0, padding), (0, padding)])
-        matrices = matrices + jnp.asarray(np.diag(np.arange(size + padding) >= size), dtype)
-    identity = jnp.eye(size + padding, dtype=dtype)
+    matrix_size, dtype = matrices.shape[-1], matrices.dtype
+    block_size = 32 if matrix_size <= 256 else 64
+    num_padding_rows = -matrix_size % block_size
+    if num_padding_rows:
+        matrices = jnp.pad(matrices, [(0, 0), (0, num_padding_rows), (0, num_padding_rows)])
+        matrices = matrices + jnp.asarray(np.diag(np.arange(matrix_size + num_padding_rows) >= matrix_size), dtype)
+    identity_matrix = jnp.eye(matrix_size + num_padding_rows, dtype=dtype)
 
-    def next_rows(inverse, block_index):
-        start = block_index * block
-        rows = jax.lax.dynamic_slice_in_dim(matrices, start, block, axis=1)
-        lower_block = rows @ _transposed(inverse)
-        pivot = jax.lax.dynamic_slice_in_dim(rows, start, block, axis=2) - lower_block @ _transposed(lower_block)
-        identity_rows = jax.lax.dynamic_slice_in_dim(identity, start, block, axis=0) - lower_block @ inverse
-        new_rows = _inverse_cholesky_recursive(pivot) @ identity_rows
-        return jax.lax.dynamic_update_slice_in_dim(inverse, new_rows, start, axis=1), None
+    def next_rows(inverse_factors, block_index):
+        first_row = block_index * block_size
+        block_rows = jax.lax.dynamic_slice_in_dim(matrices, first_row, block_size, axis=1)
+        lower_block = block_rows @ _transpose(inverse_factors)
+        pivot_block = jax.lax.dynamic_slice_in_dim(
+            block_rows, first_row, block_size, axis=2
+        ) - lower_block @ _transpose(lower_block)
+        identity_rows = (
+            jax.lax.dynamic_slice_in_dim(identity_matrix, first_row, block_size, axis=0) - lower_block @ inverse_factors
+        )
+        new_rows = _inverse_cholesky_recursive(pivot_block) @ identity_rows
+        return jax.lax.dynamic_update_slice_in_dim(inverse_factors, new_rows, first_row, axis=1), None
 
-    inverse, _ = jax.lax.scan(next_rows, jnp.zeros_like(matrices), jnp.arange((size + padding) // block))
-    return inverse[:, :size, :size]
+    inverse_factors, _ = jax.lax.scan(
+        next_rows, jnp.zeros_like(matrices), jnp.arange((matrix_size + num_padding_rows) // block_size)
+    )
+    return inverse_factors[:, :matrix_size, :matrix_size]
 
 
 # The cost at a point, and a function that returns, for a given damping, a step from this point with the slope and
@@ -261,15 +267,15 @@ def ridge_model(
     if not isinstance(jacobian, np.ndarray):
         jacobian = jax.lax.optimization_barrier(jacobian)
     weighted_residual = precision @ residual
-    cost = 0.5 * (residual @ weighted_residual + point @ point)
+    ridge_cost = 0.5 * (residual @ weighted_residual + point @ point)
 
-    def step(damping):
-        direction = ridge_step(jacobian, residual, point, covariance, precision, 1 + damping)
-        data_change = jacobian @ direction
-        slope = weighted_residual @ data_change + point @ direction
-        return direction, slope, data_change @ precision @ data_change + direction @ direction
+    def step_for_damping(damping):
+        step_direction = ridge_step(jacobian, residual, point, covariance, precision, 1 + damping)
+        data_change = jacobian @ step_direction
+        cost_slope = weighted_residual @ data_change + point @ step_direction
+        return step_direction, cost_slope, data_change @ precision @ data_change + step_direction @ step_direction
 
-    return cost, step
+    return ridge_cost, step_for_damping
 
 
 def ridge_step(
@@ -303,8 +309,10 @@ def ridge_step(
     num_data, num_unknowns = jacobian.shape
     if num_unknowns <= num_data:
         weighted_transpose = jacobian.T @ precision
-        identity = np.eye(num_unknowns, dtype=jacobian.dtype)
-        return -solve_definite(weighted_transpose @ jacobian + ridge * identity, weighted_transpose @ residual + point)
+        identity_matrix = np.eye(num_unknowns, dtype=jacobian.dtype)
+        return -solve_definite(
+            weighted_transpose @ jacobian + ridge * identity_matrix, weighted_transpose @ residual + point
+        )
     dual_solution = solve_definite(jacobian @ jacobian.T + ridge * covariance, residual - jacobian @ point / ridge)
     return -point / ridge - dual_solution @ jacobian
 
@@ -330,5 +338,5 @@ def solve_definite(matrix: Float[Array, "n n"], vector: Float[Array, " n"]) -> F
             )
         except np.linalg.LinAlgError:
             return np.full_like(vector, np.nan)  # pyright: ignore[reportReturnType]
-    inverse = inverse_cholesky(matrix[None])[0]
-    return inverse.T @ (inverse @ vector)
+    inverse_factor = inverse_cholesky(matrix[None])[0]
+    return inverse_factor.T @ (inverse_factor @ vector)

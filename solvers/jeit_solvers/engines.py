@@ -76,15 +76,15 @@ def differentiable_batches(function: Callable[..., Any], batch_rule: Callable[..
     def _(primals, tangents):
         leaves, structure = jax.tree.flatten(primals)
         directions = jax.tree.leaves(tangents, is_leaf=_is_zero_tangent)
-        moving = [number for number, direction in enumerate(directions) if not _is_zero_tangent(direction)]
+        moving_indices = [number for number, direction in enumerate(directions) if not _is_zero_tangent(direction)]
 
-        def restricted(*values):
+        def moving_function(*values):
             all_leaves = list(leaves)
-            for number, value in zip(moving, values, strict=True):
+            for number, value in zip(moving_indices, values, strict=True):
                 all_leaves[number] = value
             return function(*jax.tree.unflatten(structure, all_leaves))
 
-        return jax.jvp(restricted, [leaves[i] for i in moving], [directions[i] for i in moving])
+        return jax.jvp(moving_function, [leaves[i] for i in moving_indices], [directions[i] for i in moving_indices])
 
     return differentiable
 
@@ -103,26 +103,28 @@ def map_one_by_one(
     """Call a function for each element of a batch: one after the other on a CPU, all at once on accelerators."""
     del axis_size
     leaves, structure = jax.tree.flatten(arguments)
-    flags = jax.tree.leaves(batched_flags)
-    batched_leaves = [leaf for leaf, is_batched in zip(leaves, flags, strict=True) if is_batched]
-    shared_leaves = [leaf for leaf, is_batched in zip(leaves, flags, strict=True) if not is_batched]
+    batch_flags = jax.tree.leaves(batched_flags)
+    batched_leaves = [leaf for leaf, is_batched in zip(leaves, batch_flags, strict=True) if is_batched]
+    shared_leaves = [leaf for leaf, is_batched in zip(leaves, batch_flags, strict=True) if not is_batched]
 
-    def call(function, own_values, constants):
+    def call_once(function, own_values, constants):
         own_values, constants = iter(own_values), iter(constants)
         return function(
-            *jax.tree.unflatten(structure, [next(own_values) if flag else next(constants) for flag in flags])
+            *jax.tree.unflatten(
+                structure, [next(own_values) if is_batched else next(constants) for is_batched in batch_flags]
+            )
         )
 
     def call_in_turn(batched_leaves, shared_leaves):
-        return jax.lax.map(lambda own_values: call(batched_function, own_values, shared_leaves), batched_leaves)
+        return jax.lax.map(lambda own_values: call_once(batched_function, own_values, shared_leaves), batched_leaves)
 
     def call_together(batched_leaves, shared_leaves):
-        return jax.vmap(lambda own_values: call(unbatched_function, own_values, shared_leaves))(batched_leaves)
+        return jax.vmap(lambda own_values: call_once(unbatched_function, own_values, shared_leaves))(batched_leaves)
 
     return jax.lax.platform_dependent(batched_leaves, shared_leaves, cpu=call_in_turn, default=call_together)
 
 
-_Function = TypeVar("_Function", bound=Callable[..., Any])
+_FunctionType = TypeVar("_FunctionType", bound=Callable[..., Any])
 
 _IMPORTING_PROCESS_ID = os.getpid()
 # Size of a complex step for derivatives; its square is negligible in double precision.
@@ -164,8 +166,8 @@ def on_device(tree: Any) -> Any:
         return jax.tree.map(_on_device, tree)
 
 
-def _on_device(leaf: Any) -> Any:
-    return jax.device_put(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
+def _on_device(pytree_leaf: Any) -> Any:
+    return jax.device_put(pytree_leaf) if isinstance(pytree_leaf, np.ndarray | np.generic) else pytree_leaf
 
 
 # Size in bytes from which an array is allocated in memory that JAX can use without a copy (copying smaller arrays is
@@ -175,10 +177,10 @@ _MIN_SHARED_BYTES, _JAX_ALIGNMENT = 1_000_000, 64
 
 def empty_for_jax(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
     """Return an uninitialised NumPy array whose memory JAX can use without a copy."""
-    size = math.prod(shape) * dtype.itemsize
-    memory = np.empty(size + _JAX_ALIGNMENT, np.uint8)
-    start = -memory.ctypes.data % _JAX_ALIGNMENT
-    return memory[start : start + size].view(dtype).reshape(shape)
+    num_bytes = math.prod(shape) * dtype.itemsize
+    padded_memory = np.empty(num_bytes + _JAX_ALIGNMENT, np.uint8)
+    aligned_start = -padded_memory.ctypes.data % _JAX_ALIGNMENT
+    return padded_memory[aligned_start : aligned_start + num_bytes].view(dtype).reshape(shape)
 
 
 def product_for_jax(
@@ -193,10 +195,10 @@ def product_for_jax(
 
 
 @jax.jit
-def _to_jax(array) -> Any:
+def _to_jax(host_array) -> Any:
     """Convert a NumPy array to a JAX array in a quarter of the time of `jax.device_put`. This conversion cannot be used
     in forked processes, where compiled functions do not run."""
-    return array
+    return host_array
 
 
 def as_array(values: Any, dtype: Any = None) -> Array:
@@ -217,25 +219,25 @@ def evaluate_in_numpy(function: Callable[..., Any], *arguments: Any, **named: An
         return function(*arguments, **named)
 
 
-def numpy_or_compiled(function: _Function) -> _Function:
+def numpy_or_compiled(function: _FunctionType) -> _FunctionType:
     """Make `function` of arrays run in NumPy if all values are known, and in a compiled program if any array is traced.
 
     The results are JAX arrays, unless all arguments are NumPy arrays.
     """
-    compiled = jax.jit(function)
+    compiled_function = jax.jit(function)
 
     @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
         leaves = jax.tree.leaves((arguments, named))
         if not has_values(leaves):
-            return compiled(*arguments, **named)
+            return compiled_function(*arguments, **named)
         result = evaluate_in_numpy(function, *arguments, **named)
         return result if namespace(leaves) is np else on_device(result)
 
     return call  # pyright: ignore[reportReturnType]
 
 
-def values_at_once(function: _Function) -> _Function:
+def values_at_once(function: _FunctionType) -> _FunctionType:
     """Make `function` of arrays run in NumPy if all values are known, and unchanged, not compiled, if any array is
     traced.
 
@@ -258,21 +260,21 @@ class RecentResultsCache:
     arrays in them, are the same objects as before."""
 
     def __init__(self, make: Callable[..., Any], size: int = 4):
-        self._make, self._size = make, size
-        self._cached: list[tuple[tuple[Any, ...], list[Any], Any, Any]] = []
+        self._make_result, self._max_results = make, size
+        self._cached_results: list[tuple[tuple[Any, ...], list[Any], Any, Any]] = []
 
     def __call__(self, *trees: Any) -> Any:
         """Return the result of `make` for these arguments, computed now or taken from the cache."""
-        cached = self._cached[::-1]
-        for cached_key, _, _, result in cached:
+        cached_results = self._cached_results[::-1]
+        for cached_key, _, _, result in cached_results:
             if _are_identical(cached_key, trees):
                 return result
         leaves, structure = jax.tree.flatten(trees)
-        for _, cached_key, treedef, result in cached:
+        for _, cached_key, treedef, result in cached_results:
             if _are_identical(cached_key, leaves) and treedef == structure:  # structures take far longer to compare
                 return result
-        result = self._make(*trees)
-        self._cached = [*self._cached, (trees, leaves, structure, result)][-self._size :]
+        result = self._make_result(*trees)
+        self._cached_results = [*self._cached_results, (trees, leaves, structure, result)][-self._max_results :]
         return result
 
 
@@ -322,12 +324,12 @@ def complex_slope(function: Callable[[Any], Any], x: Any, row_index: int) -> Any
     return _complex_step(function, x, row_index)[1]
 
 
-def _complex_step(function, x, row: int) -> tuple[Any, Any]:
+def _complex_step(function, x, argument_row: int) -> tuple[Any, Any]:
     shifted_point = x.astype(complex)
-    shifted_point[row] += 1j * _COMPLEX_STEP
+    shifted_point[argument_row] += 1j * _COMPLEX_STEP
     complex_values = function(shifted_point)
     return jax.tree.map(np.real, complex_values), jax.tree.map(
-        lambda values: np.imag(values) / _COMPLEX_STEP, complex_values
+        lambda complex_value: np.imag(complex_value) / _COMPLEX_STEP, complex_values
     )
 
 
@@ -339,8 +341,8 @@ def slopes(function: Callable[[Any], Any], x: Any) -> tuple[Any, list[Any]]:
     function is analytic. JAX uses forward differentiation.
     """
     if isinstance(x, np.ndarray):
-        values_and_slopes = [_complex_step(function, x, row) for row in range(len(x))]
-        return values_and_slopes[0][0], [slope for _, slope in values_and_slopes]
+        values_and_slopes = [_complex_step(function, x, argument_row) for argument_row in range(len(x))]
+        return values_and_slopes[0][0], [row_slope for _, row_slope in values_and_slopes]
     value, derivative = jax.linearize(function, x)
     return value, [derivative(direction) for direction in jnp.eye(len(x))[:, :, None] * jnp.ones_like(x)]
 
@@ -378,9 +380,9 @@ def sum_into(shape: tuple[int, ...], index: Any, values: Inexact[Array, "*i"]) -
 def set_at(total: Shaped[Array, "*n"], index: Any, values: Any) -> Shaped[Array, "*n"]:
     """Copy of `total` with the entries at `index` replaced by `values`; JAX ignores indices beyond the end."""
     if isinstance(total, np.ndarray):
-        result: Any = np.array(total)
-        result[index] = values
-        return result
+        copied_total: Any = np.array(total)
+        copied_total[index] = values
+        return copied_total
     return total.at[index].set(values, mode="drop")
 
 
@@ -424,17 +426,17 @@ def _(*arguments: Any, function: Callable[..., Any], shape: tuple[int, ...], kin
     return ShapedArray(shape, kind)
 
 
-def _lower_numpy_call(context: Any, *arguments: Any, function: Callable[..., Any], **_: Any) -> Any:
-    def call(*values: Any) -> tuple[np.ndarray]:
+def _lower_numpy_call(lowering_context: Any, *arguments: Any, function: Callable[..., Any], **_: Any) -> Any:
+    def call_on_host(*values: Any) -> tuple[np.ndarray]:
         return (function(*map(np.asarray, values)),)
 
     results, _, _ = mlir.emit_python_callback(
-        context,
-        call,
+        lowering_context,
+        call_on_host,
         None,
         list(arguments),
-        context.avals_in,
-        context.avals_out,
+        lowering_context.avals_in,
+        lowering_context.avals_out,
         has_side_effect=False,
         returns_token=False,
     )
@@ -442,7 +444,7 @@ def _lower_numpy_call(context: Any, *arguments: Any, function: Callable[..., Any
 
 
 def _batch_numpy_call(arguments: Sequence[Any], axes: Sequence[Any], **parameters: Any) -> tuple[Any, int]:
-    batches = [
+    batched_arguments = [
         jnp.moveaxis(argument, axis, 0) for argument, axis in zip(arguments, axes, strict=True) if axis is not None
     ]
 
@@ -453,7 +455,7 @@ def _batch_numpy_call(arguments: Sequence[Any], axes: Sequence[Any], **parameter
             **parameters,
         )
 
-    return jax.lax.map(call_for_element, batches), 0
+    return jax.lax.map(call_for_element, batched_arguments), 0
 
 
 mlir.register_lowering(_numpy_call, _lower_numpy_call)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 
 # For each function: attributes of the bound method that Equinox created, without the bound object.
-_BOUND: dict[Any, tuple[type, dict[str, Any]]] = {}
+_BOUND_METHOD_TYPES: dict[Any, tuple[type, dict[str, Any]]] = {}
 
 
 class Module(eqx.Module):
@@ -23,17 +23,17 @@ class Module(eqx.Module):
     if not TYPE_CHECKING:
 
         def __getattribute__(self, name: str) -> Any:
-            attribute = object.__getattribute__(self, name)
-            if type(attribute) is not MethodType or attribute.__self__ is not self or name.startswith("__"):
-                return attribute
-            cached = _BOUND.get(attribute.__func__)
-            if cached is None:
-                bound = super().__getattribute__(name)
-                attributes = dict(getattr(bound, "__dict__", {}))
-                if attributes.pop("__self__", None) is self:
-                    _BOUND[attribute.__func__] = type(bound), attributes
-                return bound
-            method_type, attributes = cached
-            bound = object.__new__(method_type)
-            bound.__dict__.update(attributes, __self__=self)
-            return bound
+            raw_attribute = object.__getattribute__(self, name)
+            if type(raw_attribute) is not MethodType or raw_attribute.__self__ is not self or name.startswith("__"):
+                return raw_attribute
+            cached_method_type = _BOUND_METHOD_TYPES.get(raw_attribute.__func__)
+            if cached_method_type is None:
+                bound_method = super().__getattribute__(name)
+                bound_attributes = dict(getattr(bound_method, "__dict__", {}))
+                if bound_attributes.pop("__self__", None) is self:
+                    _BOUND_METHOD_TYPES[raw_attribute.__func__] = type(bound_method), bound_attributes
+                return bound_method
+            method_type, bound_attributes = cached_method_type
+            bound_method = object.__new__(method_type)
+            bound_method.__dict__.update(bound_attributes, __self__=self)
+            return bound_method

@@ -193,8 +193,8 @@ def test_a_long_session_of_contacts_keeps_little(calibration, imager, still, fra
     course = [*frames, *still, *still, *frames, *frames[::-1]]  # two touches, of which one ends
     for number, frame in enumerate(course):
         view.picture(LiveFrame(number, number / 60, 0.0, frame))
-    assert [(touch.number, len(touch.observations)) for touch in view._tracker.open] == [(1, 1)]
-    assert view._tracker.closed == ()
+    assert [(touch.number, len(touch.observations)) for touch in view._contact_tracker.open] == [(1, 1)]
+    assert view._contact_tracker.closed == ()
 
 
 def test_frames_of_one_moment_are_tracked(calibration, imager, still, frames):

@@ -195,7 +195,7 @@ def test_an_abandoned_recording_writes_nothing_into_the_next(tmp_path, monkeypat
     monkeypatch.setattr(recording.os, "write", hangs)
     monkeypatch.setattr(recording, "_END_TIMEOUT", 0.05)
     first = recorder.start()
-    hung = recorder._thread
+    hung = recorder._writer_thread
     recorder.add(frame(0, frames[0]))
     assert "Not recorded" in recorder.stop()
     second = recorder.start()
@@ -218,7 +218,7 @@ def test_frames_without_space_are_counted(tmp_path, monkeypatch):
     monkeypatch.setattr(recording, "_MAX_WAITING_BYTES", 5000)
     for number, values in enumerate(noisy(30)):
         recorder.add(frame(number, values))
-    wait_for(lambda: recorder._num_lost)
+    wait_for(lambda: recorder._num_lost_lines)
     assert "could not be recorded" in state_of(recorder)["problem"]
     report = recorder.stop()
     assert "0 frames" in report

@@ -378,5 +378,5 @@ def test_hub_outlives_a_closed_loop():
 
     with session:
         asyncio.run(begin())
-        hub._thread.join(5)
-        assert not hub._thread.is_alive()
+        hub._watch_thread.join(5)
+        assert not hub._watch_thread.is_alive()

@@ -164,18 +164,18 @@ def test_results_are_kept_for_a_time_within_their_memory(monkeypatch):
     pixels = np.zeros((10, 10), np.float32)
     with Session(Given(noisy(60), pause=5e-3), Blank(lambda frame: Picture(pixels)), history=0.1) as session:
         session.wait()
-        kept = [one.frame.number for one in session._results]
+        kept = [one.frame.number for one in session._stored_results]
     assert 10 < len(kept) < 30
     assert kept[-1] == 59
     assert session.result(0) is None
     monkeypatch.setattr(session_module, "_MAX_BYTES", 12_000)
     with Session(Given(noisy(60)), Blank(lambda frame: Picture(pixels))) as session:
         session.wait()
-        assert 5 < len(session._results) <= 12
+        assert 5 < len(session._stored_results) <= 12
     monkeypatch.setattr(session_module, "_MAX_BYTES", 10)
     with Session(Given(noisy(5)), Blank(lambda frame: Picture(pixels))) as session:
         session.wait()
-        assert [one.frame.number for one in session._results] == [4]
+        assert [one.frame.number for one in session._stored_results] == [4]
 
 
 def test_a_new_reference_is_of_the_next_frames_and_is_recorded(tmp_path):

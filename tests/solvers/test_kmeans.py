@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jeit_solvers import kmeans
-from jeit_solvers.clustering import _kmeans_plus_plus, _lloyd
+from jeit_solvers.clustering import _kmeans_plus_plus, _lloyd_iterations
 
 
 def blobs(seed=0, count=30, number=400, d=24):
@@ -44,7 +44,7 @@ def lloyd(points, centres, steps):
 
 
 # One program for any number of steps.
-_descent = jax.jit(_lloyd)
+_descent = jax.jit(_lloyd_iterations)
 
 
 def descend(points, start, steps):
@@ -102,7 +102,7 @@ def test_every_step_equals_lloyd(steps):
     start = points[np.random.default_rng(2).choice(len(points), 30, replace=False)]
     ended, centres = descend(points, start, steps)
     labels, expected = lloyd(points, start, steps)
-    assert int(ended.steps) == steps
+    assert int(ended.num_steps) == steps
     np.testing.assert_array_equal(ended.labels, labels)
     np.testing.assert_allclose(centres, expected, rtol=1e-10, atol=1e-12)
     assert float(ended.inertia) == pytest.approx(squared_distances(points, expected).min(axis=1).sum(), rel=1e-10)
@@ -120,7 +120,7 @@ def test_empty_clusters_take_the_farthest_points():
     assert ended.inertia < square.sum()
     for steps in (2, 300):
         ended, centres = descend(points, start, steps)
-        labels, expected = lloyd(points, start, int(ended.steps))
+        labels, expected = lloyd(points, start, int(ended.num_steps))
         np.testing.assert_array_equal(ended.labels, labels)
         np.testing.assert_allclose(centres, expected, rtol=1e-10, atol=1e-12)
     assert ended.is_converged

@@ -70,51 +70,62 @@ def read(
         if sensor_description.protocol_section is not None or (description_source is None and like)
         else matlab.load(path, *PATTERN_NAMES)
     )
-    protocols = sensor_description.protocols(path) or (
+    candidate_protocols = sensor_description.protocols(path) or (
         [(_stored_protocol(stored_patterns, path), "")] if stored_patterns else []
     )
-    if not protocols and like is not None:
-        protocols = [(like.protocol, "")]
-    keys, frame_names, key_notes = _keys(matlab.shapes(path), sensor_description, channel_counts(protocols), path)
-    variables = matlab.load(path, *keys)
-    vectors = [matlab.numbers(variables, key, path) for key in keys]
-    if vectors[0].ndim == 3 or sensor_description.patterns_measured:
-        if len(vectors) > 1:
-            raise ValueError(f"{path.name}: [data] keys names {len(vectors)} arrays; give one, of all frames.")
-        table = frames_of(vectors[0], sensor_description.layout.axes, path.name)
+    if not candidate_protocols and like is not None:
+        candidate_protocols = [(like.protocol, "")]
+    array_keys, frame_names, key_notes = _keys_to_read(
+        matlab.shapes(path), sensor_description, channel_counts(candidate_protocols), path
+    )
+    file_variables = matlab.load(path, *array_keys)
+    voltage_vectors = [matlab.numbers(file_variables, array_key, path) for array_key in array_keys]
+    if voltage_vectors[0].ndim == 3 or sensor_description.patterns_measured:
+        if len(voltage_vectors) > 1:
+            raise ValueError(f"{path.name}: [data] keys names {len(voltage_vectors)} arrays; give one, of all frames.")
+        frame_table = frames_of(voltage_vectors[0], sensor_description.layout.axes, path.name)
         sensor_description = replace(sensor_description, layout=replace(sensor_description.layout, frames_in="rows"))
-    elif len(vectors) == 1:
-        table = vectors[0]
-        if 1 in table.shape and table.size in channel_counts(protocols):  # a vector is one frame
-            table = table.reshape(-1, 1)
+    elif len(voltage_vectors) == 1:
+        frame_table = voltage_vectors[0]
+        if 1 in frame_table.shape and frame_table.size in channel_counts(candidate_protocols):  # a vector is one frame
+            frame_table = frame_table.reshape(-1, 1)
     else:
-        lengths = {vector.size for vector in vectors}
-        if len(lengths) > 1:
-            raise ValueError(f"{path.name}: variables {', '.join(keys)} differ in length ({sorted(lengths)}).")
-        table = np.stack([vector.ravel() for vector in vectors], axis=1)
+        vector_lengths = {voltage_vector.size for voltage_vector in voltage_vectors}
+        if len(vector_lengths) > 1:
+            raise ValueError(
+                f"{path.name}: variables {', '.join(array_keys)} differ in length ({sorted(vector_lengths)})."
+            )
+        frame_table = np.stack([voltage_vector.ravel() for voltage_vector in voltage_vectors], axis=1)
     # A matrix contains one frame per column, as in EIDORS, unless the number of channels shows that rows are frames.
-    frames = frames_in_table(table, channel_counts(protocols), sensor_description.layout, default_axis="columns")
+    frames = frames_in_table(
+        frame_table, channel_counts(candidate_protocols), sensor_description.layout, default_axis="columns"
+    )
     frames = frames._replace(notes=(*key_notes, *frames.notes))
-    measurement = create_measurement_of_frames(path, sensor_description, frames, protocols, like=like)
+    measurement = create_measurement_of_frames(path, sensor_description, frames, candidate_protocols, like=like)
     return measurement if measurement.frame_names or not frame_names else replace(measurement, frame_names=frame_names)
 
 
-def _keys(
-    shapes: dict[str, tuple[int, ...]], sensor_description: Description, counts: list[int], path: Path
+def _keys_to_read(
+    array_shapes: dict[str, tuple[int, ...]],
+    sensor_description: Description,
+    allowed_channel_counts: list[int],
+    path: Path,
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
     """Return the names of the arrays to read, the names of their frames, and a note if an array was selected by its
     shape."""
     if sensor_description.layout.keys:
         return sensor_description.layout.keys, (), ()
-    reference_names = [name for name in REFERENCE_NAMES if name in shapes]
-    object_names = [name for name in OBJECT_NAMES if name in shapes]
+    reference_names = [name for name in REFERENCE_NAMES if name in array_shapes]
+    object_names = [name for name in OBJECT_NAMES if name in array_shapes]
     if reference_names and object_names:
         return (reference_names[0], object_names[0]), ("reference", "object"), ()
     if reference_names or object_names:
         return ((reference_names + object_names)[0],), (), ()
-    shapes = {name: shape for name, shape in shapes.items() if name not in PATTERN_NAMES}
+    array_shapes = {name: array_shape for name, array_shape in array_shapes.items() if name not in PATTERN_NAMES}
     fitting_shapes = {
-        name: shape for name, shape in shapes.items() if set(shape) & set(counts) or math.prod(shape) in counts
+        name: array_shape
+        for name, array_shape in array_shapes.items()
+        if set(array_shape) & set(allowed_channel_counts) or math.prod(array_shape) in allowed_channel_counts
     }
     if len(fitting_shapes) == 1:
         (name,) = fitting_shapes
@@ -122,35 +133,40 @@ def _keys(
     refusal_beginning = "as many numbers as a frame's are in" if fitting_shapes else "there are"
     usual_names = ", ".join(REFERENCE_NAMES + OBJECT_NAMES)
     raise ValueError(
-        f"{path.name}: none of {usual_names} is there; {refusal_beginning} {_shapes_text(fitting_shapes or shapes)}. "
-        "Name the array of frames by key=, or by [data] keys in the description; --reference-key names that of the "
-        "reference."
+        f"{path.name}: none of {usual_names} is there; {refusal_beginning} "
+        f"{_shapes_text(fitting_shapes or array_shapes)}. Name the array of frames by key=, or by [data] keys in the "
+        "description; --reference-key names that of the reference."
     )
 
 
-def _shapes_text(shapes: dict[str, tuple[int, ...]]) -> str:
+def _shapes_text(array_shapes: dict[str, tuple[int, ...]]) -> str:
     return (
-        names_text([f"{name} ({' × '.join(map(str, shape))})" for name, shape in shapes.items()])
-        if shapes
+        names_text([f"{name} ({' × '.join(map(str, array_shape))})" for name, array_shape in array_shapes.items()])
+        if array_shapes
         else "no numbers"
     )
 
 
-def _stored_protocol(variables: dict, path: Path) -> Protocol:
-    missing_keys = [key for key in PATTERN_NAMES if key not in variables]
+def _stored_protocol(file_variables: dict, path: Path) -> Protocol:
+    missing_keys = [pattern_key for pattern_key in PATTERN_NAMES if pattern_key not in file_variables]
     if missing_keys:
         raise ValueError(
             f"{path.name} does not say what was driven and measured: '{missing_keys[0]}' is missing, and no "
             "description gives a [protocol]. Save stim (L, S), meas (M, L) and meas_stim (M) with the data, "
             "or write a description."
         )
-    stim, meas, stimulation_index = (matlab.numbers(variables, key, path) for key in PATTERN_NAMES)
+    drive_patterns, measurement_patterns, stimulation_index = (
+        matlab.numbers(file_variables, pattern_key, path) for pattern_key in PATTERN_NAMES
+    )
     stimulation_index = stimulation_index.ravel()
     if np.any(stimulation_index != np.round(stimulation_index)):
         raise ValueError(f"{path.name}: meas_stim must hold whole numbers, the drive of each measurement, from 1.")
     try:
         return from_channels(
-            stim.T, meas, stimulation_index.astype(int) - 1, name=f"{path.stem}, {len(stimulation_index)} channels"
+            drive_patterns.T,
+            measurement_patterns,
+            stimulation_index.astype(int) - 1,
+            name=f"{path.stem}, {len(stimulation_index)} channels",
         )
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from None

@@ -24,13 +24,13 @@ from jeit.protocol import from_matrices
 
 class _Tank(NamedTuple):
     """A tank with electrodes at equal distances, the first at 12 o'clock. **Fields**: `radius`, metres;
-    `electrode_width`, metres; `contact_impedance`: initial value for calibration, in ohm·m; `clockwise`: whether the
+    `electrode_width`, metres; `contact_impedance`: initial value for calibration, in ohm·m; `is_clockwise`: whether the
     numbers of the electrodes increase clockwise."""
 
     radius: float
     electrode_width: float
     contact_impedance: float
-    clockwise: bool
+    is_clockwise: bool
 
 
 class Kit4:
@@ -40,7 +40,7 @@ class Kit4:
     VARIABLES = (frozenset({"Uel", "CurrentPattern", "MeasPattern"}),)
     """Variables that identify a file of the archive."""
     # Contact impedance: a fit to measurements of the empty tank yields about 1e-4 m / 1.3 mS.
-    _TANK = _Tank(0.14, 0.025, contact_impedance=0.08, clockwise=True)
+    _ROUND_TANK = _Tank(0.14, 0.025, contact_impedance=0.08, is_clockwise=True)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -59,27 +59,32 @@ class Kit4:
 
         Raises `ValueError` for a file whose arrays have other shapes.
         """
-        keys = "Uel", "CurrentPattern", "MeasPattern"
-        variables = matlab.load(path, *keys)
-        voltages, currents, differences = (matlab.numbers(variables, key, path) for key in keys)
-        num_electrodes, num_drives = currents.shape
-        if differences.shape[0] != num_electrodes or voltages.shape != (differences.shape[1], num_drives):
+        variable_keys = "Uel", "CurrentPattern", "MeasPattern"
+        file_variables = matlab.load(path, *variable_keys)
+        voltages, drive_currents, measured_differences = (
+            matlab.numbers(file_variables, variable_key, path) for variable_key in variable_keys
+        )
+        num_electrodes, num_drives = drive_currents.shape
+        if measured_differences.shape[0] != num_electrodes or voltages.shape != (
+            measured_differences.shape[1],
+            num_drives,
+        ):
             raise ValueError(
-                f"{path.name}: Uel {voltages.shape} should be (measurements, drives) = ({differences.shape[1]}, "
-                f"{num_drives}), as MeasPattern {differences.shape} and CurrentPattern {currents.shape} say. Is the "
-                "file damaged?"
+                f"{path.name}: Uel {voltages.shape} should be (measurements, drives) = "
+                f"({measured_differences.shape[1]}, {num_drives}), as MeasPattern {measured_differences.shape} and "
+                f"CurrentPattern {drive_currents.shape} say. Is the file damaged?"
             )
-        return _measurement(
+        return _screened_measurement(
             path,
             "KIT4",
             voltages.T.ravel(),
-            currents,
-            differences,
-            cls._TANK,
-            notes=(
+            drive_currents,
+            measured_differences,
+            cls._ROUND_TANK,
+            measurement_notes=(
                 "currents are assumed to be in milliamperes (±1.41421 in the file, without a unit).",
-                f"electrodes are assumed to be {100 * cls._TANK.electrode_width:.1f} cm wide, which fits the empty "
-                "tank best.",
+                f"electrodes are assumed to be {100 * cls._ROUND_TANK.electrode_width:.1f} cm wide, which fits the "
+                "empty tank best.",
             ),
         )
 
@@ -91,7 +96,7 @@ class Ktc2023:
     VARIABLES = (frozenset({"Mpat", "Inj", "Uel"}), frozenset({"Mpat", "Injref", "Uelref"}))
     """Variables that identify a file of the challenge, and a reference file."""
     # Contact impedance: a fit to measurements of the empty tank yields nearly zero.
-    _TANK = _Tank(0.115, 0.115 * np.radians(5.625), contact_impedance=0.01, clockwise=False)
+    _ROUND_TANK = _Tank(0.115, 0.115 * np.radians(5.625), contact_impedance=0.01, is_clockwise=False)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -110,58 +115,60 @@ class Ktc2023:
         Raises `ValueError` for a file whose arrays have other shapes.
         """
         variable_suffix = "" if "Inj" in matlab.variable_names(path) else "ref"
-        keys = f"Inj{variable_suffix}", f"Uel{variable_suffix}", "Mpat"
-        variables = matlab.load(path, *keys)
-        currents, voltages, differences = (matlab.numbers(variables, key, path) for key in keys)
-        num_electrodes, num_drives = currents.shape
-        num_channels = num_drives * differences.shape[1]
-        if differences.shape[0] != num_electrodes or voltages.size != num_channels:
+        variable_keys = f"Inj{variable_suffix}", f"Uel{variable_suffix}", "Mpat"
+        file_variables = matlab.load(path, *variable_keys)
+        drive_currents, voltages, measured_differences = (
+            matlab.numbers(file_variables, variable_key, path) for variable_key in variable_keys
+        )
+        num_electrodes, num_drives = drive_currents.shape
+        num_channels = num_drives * measured_differences.shape[1]
+        if measured_differences.shape[0] != num_electrodes or voltages.size != num_channels:
             raise ValueError(
-                f"{path.name}: {voltages.size} voltages, but {num_drives} drives and {differences.shape[1]} "
+                f"{path.name}: {voltages.size} voltages, but {num_drives} drives and {measured_differences.shape[1]} "
                 f"measurement patterns make {num_channels}. Is the file damaged?"
             )
-        return _measurement(
+        return _screened_measurement(
             path,
             "KTC 2023",
             voltages.ravel(),
-            currents,
-            differences,
-            cls._TANK,
-            notes=("currents are assumed to be in milliamperes (about 1.4 in the file, without a unit).",),
+            drive_currents,
+            measured_differences,
+            cls._ROUND_TANK,
+            measurement_notes=("currents are assumed to be in milliamperes (about 1.4 in the file, without a unit).",),
         )
 
 
-def _has_variables(path: Path, kinds: tuple[frozenset[str], ...]) -> bool:
-    """Whether a file is a .mat file with all variables of one of the `kinds`."""
+def _has_variables(path: Path, variable_sets: tuple[frozenset[str], ...]) -> bool:
+    """Whether a file is a .mat file with all variables of one of the `variable_sets`."""
     if path.suffix.lower() != ".mat":
         return False
-    names = matlab.variable_names(path)
-    return any(variables <= names for variables in kinds)
+    variable_names = matlab.variable_names(path)
+    return any(required_variables <= variable_names for required_variables in variable_sets)
 
 
-def _measurement(
+def _screened_measurement(
     path: Path,
     name: str,
     voltages: Float[np.ndarray, " M"],
-    currents: Float[np.ndarray, "L D"],
-    differences: Float[np.ndarray, "L K"],
-    tank: _Tank,
-    notes: tuple[str, ...],
+    drive_currents: Float[np.ndarray, "L D"],
+    measured_differences: Float[np.ndarray, "L K"],
+    round_tank: _Tank,
+    measurement_notes: tuple[str, ...],
 ) -> Measurement:
     """Screen a frame of `voltages`, ordered drive by drive, with a protocol called `name` that consists of the
-    `currents` of D drives, in milliamperes, and K `differences` of L electrodes."""
+    `drive_currents` of D drives, in milliamperes, and K `measured_differences` of L electrodes."""
     protocol = from_matrices(
-        1e-3 * currents.T,
-        differences.T.astype(float),
-        name=f"{name}, {currents.shape[1]} drives, {differences.shape[1]} adjacent differences",
+        1e-3 * drive_currents.T,
+        measured_differences.T.astype(float),
+        name=f"{name}, {drive_currents.shape[1]} drives, {measured_differences.shape[1]} adjacent differences",
     )
-    positions = ring(tank.radius, len(currents), clockwise=tank.clockwise)
+    electrode_positions = ring(round_tank.radius, len(drive_currents), clockwise=round_tank.is_clockwise)
     return screen(
         voltages,
         protocol,
-        electrodes=BoundaryElectrodes(positions, tank.electrode_width, tank.contact_impedance),
-        domain=Disk(tank.radius),
+        electrodes=BoundaryElectrodes(electrode_positions, round_tank.electrode_width, round_tank.contact_impedance),
+        domain=Disk(round_tank.radius),
         name=path.stem,
         source=str(path),
-        notes=notes,
+        notes=measurement_notes,
     )

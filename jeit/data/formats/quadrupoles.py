@@ -32,7 +32,7 @@ from jeit.files import check_electrodes, read_toml
 from jeit.protocol import from_channels
 
 DESCRIPTION = "text with a line for each measurement: electrodes a, b, m, n and the voltage or resistance"
-_HEAD_BYTES, _MAX_HEADING_LINES = 65536, 400
+_NUM_HEAD_BYTES, _MAX_HEADING_LINES = 65536, 400
 # Column names, reduced to letters and digits, of the four electrodes: current enters at the first and leaves at the
 # second; the voltage is the potential of the third minus the potential of the fourth.
 _ELECTRODE_NAMES = (
@@ -62,33 +62,33 @@ _ASSUMED_CURRENT = 1e-3
 
 
 class _QuadrupoleTable(NamedTuple):
-    """Content of a file: `names` of the columns, and `scales`, their units in SI units; `rows` of numbers; `positions`
-    of the electrodes, or None; `is_unified`, whether the file has the unified data format; and `notes`."""
+    """Content of a file: `column_names`, and `column_units` in SI units; `table_rows` of numbers;
+    `electrode_positions`, or None; `is_unified`, whether the file has the unified data format; and `table_notes`."""
 
-    names: list[str]
-    scales: list[float]
-    rows: Float[np.ndarray, "R C"]
-    positions: np.ndarray | None
+    column_names: list[str]
+    column_units: list[float]
+    table_rows: Float[np.ndarray, "R C"]
+    electrode_positions: np.ndarray | None
     is_unified: bool
-    notes: tuple[str, ...]
+    table_notes: tuple[str, ...]
 
     def column(self, name: str) -> Float[np.ndarray, " R"] | None:
         """The values of the column `name`, a key of `_COLUMN_NAMES`, in SI units; None if there is no such column."""
-        column_index = next((k for k, column_name in enumerate(self.names) if column_name in _COLUMN_NAMES[name]), None)
-        return None if column_index is None else self.scales[column_index] * self.rows[:, column_index]
+        column_index = next((k for k, heading in enumerate(self.column_names) if heading in _COLUMN_NAMES[name]), None)
+        return None if column_index is None else self.column_units[column_index] * self.table_rows[:, column_index]
 
 
 def recognises(path: Path) -> bool:
     """Whether a file is text whose heading names four electrodes and a voltage or resistance."""
     with path.open("rb") as file:
-        head = file.read(_HEAD_BYTES)
+        head_bytes = file.read(_NUM_HEAD_BYTES)
     try:
-        text = head.decode("utf-8-sig")
+        text = head_bytes.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        if error.start < len(head) - 4:
+        if error.start < len(head_bytes) - 4:
             return False
-        text = head[: error.start].decode("utf-8-sig")
-    return _heading(text.splitlines()[:-1] or text.splitlines()) is not None
+        text = head_bytes[: error.start].decode("utf-8-sig")
+    return _find_heading(text.splitlines()[:-1] or text.splitlines()) is not None
 
 
 def read(
@@ -107,72 +107,74 @@ def read(
     if like is not None and description is None and find_description(path) is None:
         sensor_description = description_like(like)
     else:
-        sensor_description = _describe_body(path, description, table.positions)
+        sensor_description = _describe_body(path, description, table.electrode_positions)
     num_described = None if sensor_description.electrodes is None else sensor_description.electrodes.num_electrodes
     electrodes, notes = _electrode_indices(path, table, num_described)
     num_electrodes = num_described or max(
-        int(electrodes.max()) + 1, 0 if table.positions is None else len(table.positions)
+        int(electrodes.max()) + 1, 0 if table.electrode_positions is None else len(table.electrode_positions)
     )
     check_electrodes(path.name, num_electrodes)
-    amplitude, current_notes = _current_amplitude(path, sensor_description, table, like)
-    values = _channel_voltages(table, amplitude)
-    channels, frames, times, channel_notes = _arrange_frames(path, table, electrodes, values, like)
-    drives, drive_index = np.unique(channels[:, :2], axis=0, return_inverse=True)
+    current_amplitude, current_notes = _current_amplitude(path, sensor_description, table, like)
+    line_voltages = _channel_voltages(table, current_amplitude)
+    quadrupoles, frames, frame_times, channel_notes = _arrange_frames(path, table, electrodes, line_voltages, like)
+    drive_pairs, drive_index = np.unique(quadrupoles[:, :2], axis=0, return_inverse=True)
     protocol = from_channels(
-        amplitude * _pair_patterns(drives, num_electrodes),
-        _pair_patterns(channels[:, 2:], num_electrodes),
+        current_amplitude * _pair_patterns(drive_pairs, num_electrodes),
+        _pair_patterns(quadrupoles[:, 2:], num_electrodes),
         drive_index.ravel(),
-        name=f"{len(drives)} drives, {len(channels)} channels, {num_electrodes} electrodes",
+        name=f"{len(drive_pairs)} drives, {len(quadrupoles)} channels, {num_electrodes} electrodes",
     )
-    recording = Recording(frames, protocol, times=times, notes=(*table.notes, *notes, *current_notes, *channel_notes))
+    recording = Recording(
+        frames, protocol, times=frame_times, notes=(*table.table_notes, *notes, *current_notes, *channel_notes)
+    )
     return correct_signs(create_measurement(path, recording, replace(sensor_description, protocol_section=None)), like)
 
 
 def electrode_positions(path: Path) -> Float[np.ndarray, "L d"] | None:
     """Positions (electrodes, dimensions) of the electrodes in metres, from a file of four-electrode measurements; None
     if the file states none. Raises `ValueError` for lines that do not match the heading."""
-    return _read_table(path).positions
+    return _read_table(path).electrode_positions
 
 
-def _heading(lines: Sequence[str]) -> tuple[int, list[str], list[float]] | None:
+def _find_heading(lines: Sequence[str]) -> tuple[int, list[str], list[float]] | None:
     """Index of the line that names the columns, names of the columns, and their units in SI units; None if there is no
     such line."""
     for line_index, line in enumerate(lines[:_MAX_HEADING_LINES]):
         cells = _split_cells(re.sub(r"\s+([(\[])", r"\1", line.lstrip("#% \t")))
         if not 5 <= len(cells) <= 60:
             continue
-        names, scales = zip(*map(_parse_column_name, cells), strict=True)
+        names, units = zip(*map(_parse_column_name, cells), strict=True)
         if _electrode_columns(names) is None:
             continue
         found_names = {name for name, known_spellings in _COLUMN_NAMES.items() if set(known_spellings) & set(names)}
         if found_names & {"real", "u", "r"} or {"rhoa", "k"} <= found_names:
-            return line_index, list(names), list(scales)
+            return line_index, list(names), list(units)
     return None
 
 
 def _split_cells(line: str) -> list[str]:
     """Cells of a line, separated by commas, semicolons or tabs, or else by spaces."""
-    separator = next((character for character in ";\t," if character in line), None)
-    return [cell.strip(' \t"') for cell in line.strip(" \r\n").split(separator)]
+    cell_separator = next((line_character for line_character in ";\t," if line_character in line), None)
+    return [cell_text.strip(' \t"') for cell_text in line.strip(" \r\n").split(cell_separator)]
 
 
-def _parse_column_name(cell: str) -> tuple[str, float]:
+def _parse_column_name(cell_text: str) -> tuple[str, float]:
     """The letters and digits of a column's name, and the value of the column's unit in SI units."""
-    unit_match = _UNIT_PATTERN.match(cell)
-    unit = "" if unit_match is None else (unit_match[2] or unit_match[3]).lower()
-    text = (unit_match[1] if unit_match is not None and unit in _UNIT_VALUES else cell).lower()
+    unit_match = _UNIT_PATTERN.match(cell_text)
+    unit_text = "" if unit_match is None else (unit_match[2] or unit_match[3]).lower()
+    text = (unit_match[1] if unit_match is not None and unit_text in _UNIT_VALUES else cell_text).lower()
     text = re.sub(r"\+$", "plus", re.sub(r"-$", "minus", text))
     text = re.sub(r"[^0-9a-z]", "", text)
-    return re.sub(r"(?<=plus|inus)(index|electrode|el)$", "", text), _UNIT_VALUES.get(unit, 1.0)
+    return re.sub(r"(?<=plus|inus)(index|electrode|el)$", "", text), _UNIT_VALUES.get(unit_text, 1.0)
 
 
-def _electrode_columns(names: Sequence[str]) -> list[int] | None:
+def _electrode_columns(column_names: Sequence[str]) -> list[int] | None:
     """Indices of the columns with the four electrodes of each measurement, or None."""
     return next(
         (
-            [names.index(name) for name in electrode_names]
+            [column_names.index(name) for name in electrode_names]
             for electrode_names in _ELECTRODE_NAMES
-            if set(electrode_names) <= set(names)
+            if set(electrode_names) <= set(column_names)
         ),
         None,
     )
@@ -185,13 +187,13 @@ def _read_table(path: Path) -> _QuadrupoleTable:
         text = read_file_bytes(path).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise ValueError(f"{path.name} is not text; is it damaged?") from None
-    heading = _heading(text)
-    if heading is None:
+    column_heading = _find_heading(text)
+    if column_heading is None:
         raise ValueError(
             f"{path.name}: no line names the columns of four electrodes, such as a, b, m, n, and of a voltage u or a "
             "resistance r."
         )
-    heading_index, names, scales = heading
+    heading_index, column_names, column_units = column_heading
     preceding_lines = [
         (line_number, line.split("#")[0].split()) for line_number, line in enumerate(text[:heading_index], 1)
     ]
@@ -200,39 +202,39 @@ def _read_table(path: Path) -> _QuadrupoleTable:
         len(preceding_lines) > 1 and preceding_lines[-1][1][0].isdecimal() and preceding_lines[0][1][0].isdecimal()
     )
     positions, num_stated = _header_positions(path, preceding_lines) if is_unified else (None, None)
-    electrode_columns = _electrode_columns(names)
+    electrode_columns = _electrode_columns(column_names)
     known_names = set().union(*_COLUMN_NAMES.values())
-    used_columns = [k for k, name in enumerate(names) if name in known_names or k in (electrode_columns or ())]
-    rows: list[list[float]] = []
+    used_columns = [k for k, name in enumerate(column_names) if name in known_names or k in (electrode_columns or ())]
+    table_rows: list[list[float]] = []
     notes: tuple[str, ...] = ()
     for line_number, line in enumerate(text[heading_index + 1 :], heading_index + 2):
-        if not (line.split("#")[0].strip() and (num_stated is None or len(rows) < num_stated)):
+        if not (line.split("#")[0].strip() and (num_stated is None or len(table_rows) < num_stated)):
             continue
         cells = _split_cells(line.split("#")[0])
         try:
-            row = np.full(len(names), np.nan)
-            row[used_columns] = [float(cells[k].replace(",", ".") or "nan") for k in used_columns]
+            table_row = np.full(len(column_names), np.nan)
+            table_row[used_columns] = [float(cells[k].replace(",", ".") or "nan") for k in used_columns]
         except (ValueError, IndexError):
-            if line_number == len(text) and rows:
+            if line_number == len(text) and table_rows:
                 notes = (f"line {line_number}, the last, is cut off, and left out.",)
                 break
             raise ValueError(
-                f"{path.name}, line {line_number}: {line.strip()[:40]!r} is not {counted(len(names), 'column')} of "
-                "numbers, as the heading says; where a value is missing write nan."
+                f"{path.name}, line {line_number}: {line.strip()[:40]!r} is not {counted(len(column_names), 'column')} "
+                "of numbers, as the heading says; where a value is missing write nan."
             ) from None
-        rows.append(row.tolist())
-    if not rows:
+        table_rows.append(table_row.tolist())
+    if not table_rows:
         raise ValueError(f"{path.name} holds no measurement.")
-    if num_stated is not None and len(rows) < num_stated:
-        notes = (*notes, f"it states {counted(num_stated, 'measurement')}, and holds {len(rows)}: is it cut off?")
-    return _QuadrupoleTable(names, scales, np.array(rows), positions, is_unified, notes)
+    if num_stated is not None and len(table_rows) < num_stated:
+        notes = (*notes, f"it states {counted(num_stated, 'measurement')}, and holds {len(table_rows)}: is it cut off?")
+    return _QuadrupoleTable(column_names, column_units, np.array(table_rows), positions, is_unified, notes)
 
 
 def _header_positions(path: Path, preceding_lines: Sequence[tuple[int, list[str]]]) -> tuple[np.ndarray, int]:
     """Coordinates of the electrodes, and number of measurements, from the lines above the names of the columns."""
     num_electrodes, num_stated = int(preceding_lines[0][1][0]), int(preceding_lines[-1][1][0])
     try:
-        positions = np.array([[float(cell) for cell in cells] for _, cells in preceding_lines[1:-1]])
+        positions = np.array([[float(cell_text) for cell_text in cells] for _, cells in preceding_lines[1:-1]])
         assert positions.shape[0] == num_electrodes
         assert positions.shape[1] in (2, 3)
     except (ValueError, IndexError, AssertionError):
@@ -252,14 +254,14 @@ def _describe_body(path: Path, description: str | Path | None, positions: np.nda
         return parse_description({}, path.name)
     if positions is None or not Path(description_source).is_file():
         return load_description(description_source)
-    tables: dict[str, Any] = read_toml(description_source)
-    electrode_section = tables.get("electrodes")
+    description_sections: dict[str, Any] = read_toml(description_source)
+    electrode_section = description_sections.get("electrodes")
     if isinstance(electrode_section, dict) and "positions" not in electrode_section:
         added_keys = (
             {"positions": positions.tolist()} if "layout" not in electrode_section else {"number": len(positions)}
         )
-        tables = {**tables, "electrodes": {**added_keys, **electrode_section}}
-    return parse_description(tables, Path(description_source).name, Path(description_source).parent)
+        description_sections = {**description_sections, "electrodes": {**added_keys, **electrode_section}}
+    return parse_description(description_sections, Path(description_source).name, Path(description_source).parent)
 
 
 def _electrode_indices(
@@ -267,11 +269,11 @@ def _electrode_indices(
 ) -> tuple[Int[np.ndarray, "R 4"], tuple[str, ...]]:
     """Return the four electrodes of each line, counted from 0, and notes. Raises `ValueError` for invalid electrode
     numbers."""
-    numbers = table.rows[:, _electrode_columns(table.names) or []]
+    numbers = table.table_rows[:, _electrode_columns(table.column_names) or []]
     if not (np.isfinite(numbers).all() and (numbers == numbers.round()).all() and np.abs(numbers).max() < 1e6):
         raise ValueError(f"{path.name}: electrodes must be whole numbers.")
     electrodes, notes = numbers.astype(int), ()
-    num_electrodes = num_described if table.positions is None else len(table.positions)
+    num_electrodes = num_described if table.electrode_positions is None else len(table.electrode_positions)
     if not table.is_unified and electrodes.min() == 0:
         notes = ("electrodes are counted from 0.",)
     else:
@@ -295,21 +297,21 @@ def _electrode_indices(
     return electrodes, notes
 
 
-def _measurement_name(row: int | np.integer) -> str:
-    return f"measurement {int(row) + 1}"
+def _measurement_name(electrode_row: int | np.integer) -> str:
+    return f"measurement {int(electrode_row) + 1}"
 
 
 def _current_amplitude(
-    path: Path, sensor_description: Description, table: _QuadrupoleTable, like: Measurement | None
+    path: Path, sensor_description: Description, table: _QuadrupoleTable, template: Measurement | None
 ) -> tuple[float, tuple[str, ...]]:
     """Amplitude of the drive current in amperes, and a note if the amplitude is assumed."""
-    if like is not None:
-        return float(np.abs(np.asarray(like.protocol.drive)).max()), ()
+    if template is not None:
+        return float(np.abs(np.asarray(template.protocol.drive)).max()), ()
     protocol = sensor_description.protocol(path)
     if protocol is not None:
         return float(np.abs(np.asarray(protocol.drive)).max()), ()
-    current = table.column("i")
-    known_currents = np.zeros(0) if current is None else np.abs(current[np.isfinite(current) & (current != 0)])
+    currents = table.column("i")
+    known_currents = np.zeros(0) if currents is None else np.abs(currents[np.isfinite(currents) & (currents != 0)])
     if known_currents.size:
         return float(np.median(known_currents)), ()
     has_voltages = table.column("u") is not None or table.column("real") is not None
@@ -317,75 +319,84 @@ def _current_amplitude(
     return _ASSUMED_CURRENT, (f"the file states no current: {1e3 * _ASSUMED_CURRENT:g} mA {assumption_text}.",)
 
 
-def _channel_voltages(table: _QuadrupoleTable, amplitude: float) -> Inexact[np.ndarray, " R"]:
-    """Voltage of each line of the table, scaled to the current `amplitude`; NaN for a line whose current is zero."""
-    resistances, currents, apparent_resistivities, geometric_factors = (
+def _channel_voltages(table: _QuadrupoleTable, current_amplitude: float) -> Inexact[np.ndarray, " R"]:
+    """Voltage of each line of the table, scaled to the current `current_amplitude`; NaN for a line whose current is
+    zero."""
+    line_resistances, currents, apparent_resistivities, geometric_factors = (
         table.column(name) for name in ("r", "i", "rhoa", "k")
     )
-    real, imag = (table.column(name) for name in ("real", "imag"))
+    real_part, imaginary_part = (table.column(name) for name in ("real", "imag"))
     voltages = table.column("u")
-    voltages = real if voltages is None else voltages
+    voltages = real_part if voltages is None else voltages
     with np.errstate(divide="ignore", invalid="ignore"):
         if voltages is not None:
-            complex_voltages = voltages if imag is None else voltages + 1j * imag
+            complex_voltages = voltages if imaginary_part is None else voltages + 1j * imaginary_part
             return (
                 complex_voltages
                 if currents is None
-                else np.where(currents == 0, np.nan, amplitude * complex_voltages / currents)
+                else np.where(currents == 0, np.nan, current_amplitude * complex_voltages / currents)
             )
-        if resistances is None:
+        if line_resistances is None:
             assert apparent_resistivities is not None
             assert geometric_factors is not None
-            resistances = np.where(geometric_factors == 0, np.nan, apparent_resistivities / geometric_factors)
-        return amplitude * resistances
+            line_resistances = np.where(geometric_factors == 0, np.nan, apparent_resistivities / geometric_factors)
+        return current_amplitude * line_resistances
 
 
 def _arrange_frames(
     path: Path,
     table: _QuadrupoleTable,
     electrodes: Int[np.ndarray, "R 4"],
-    values: Inexact[np.ndarray, " R"],
-    like: Measurement | None,
+    line_voltages: Inexact[np.ndarray, " R"],
+    template: Measurement | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, tuple[str, ...]]:
     """Group the values of a file's lines into frames. Returns the electrodes (channels, 4), voltages (frames,
     channels), times of the frames, and notes. Voltages are NaN for channels that have no line in a frame."""
-    channels, channel_of_line = np.unique(electrodes, axis=0, return_inverse=True)
+    quadrupoles, channel_of_line = np.unique(electrodes, axis=0, return_inverse=True)
     channel_of_line, notes = channel_of_line.ravel(), ()
-    frame_of_line, frame_notes = _frame_of_lines(path, table.column("frame"), channel_of_line, len(channels))
-    frames = np.full((frame_of_line.max() + 1, len(channels)), np.nan, values.dtype)
-    if len(np.unique(frame_of_line * len(channels) + channel_of_line)) < len(frame_of_line):
+    frame_of_line, frame_notes = _frame_of_lines(path, table.column("frame"), channel_of_line, len(quadrupoles))
+    frames = np.full((frame_of_line.max() + 1, len(quadrupoles)), np.nan, line_voltages.dtype)
+    if len(np.unique(frame_of_line * len(quadrupoles) + channel_of_line)) < len(frame_of_line):
         raise ValueError(
             f"{path.name}: a frame measures the same electrodes twice; number its frames, or average them."
         )
-    frames[frame_of_line, channel_of_line] = values
+    frames[frame_of_line, channel_of_line] = line_voltages
     first_lines = np.unique(frame_of_line, return_index=True)[1]
-    times = table.column("time")
-    times = (
+    line_times = table.column("time")
+    line_times = (
         None
-        if times is None or len(first_lines) < 2 or not np.isfinite(times[first_lines]).all()
-        else times[first_lines]
+        if line_times is None or len(first_lines) < 2 or not np.isfinite(line_times[first_lines]).all()
+        else line_times[first_lines]
     )
-    if like is not None:
-        drives, measurements = (
-            np.asarray(patterns) for patterns in (like.protocol.channel_drive, like.protocol.channel_measurement)
+    if template is not None:
+        drive_patterns, measurement_patterns = (
+            np.asarray(patterns)
+            for patterns in (template.protocol.channel_drive, template.protocol.channel_measurement)
         )
         electrodes_of_channels = np.stack(
-            [find(patterns, axis=1) for patterns in (drives, measurements) for find in (np.argmax, np.argmin)], axis=1
+            [
+                find_extreme(patterns, axis=1)
+                for patterns in (drive_patterns, measurement_patterns)
+                for find_extreme in (np.argmax, np.argmin)
+            ],
+            axis=1,
         )
-        channel_numbers = {tuple(channel): k for k, channel in enumerate(channels.tolist())}
+        channel_numbers = {tuple(quadrupole): k for k, quadrupole in enumerate(quadrupoles.tolist())}
         channel_indices = np.array(
-            [channel_numbers.get(tuple(channel), -1) for channel in electrodes_of_channels.tolist()]
+            [channel_numbers.get(tuple(quadrupole), -1) for quadrupole in electrodes_of_channels.tolist()]
         )
         if 2 * (channel_indices >= 0).sum() > len(channel_indices):
-            num_excluded = len(channels) - int((channel_indices >= 0).sum())
+            num_excluded = len(quadrupoles) - int((channel_indices >= 0).sum())
             notes = (
-                (f"{counted(num_excluded, 'channel')} that '{like.name}' lacks are left out.",) if num_excluded else ()
+                (f"{counted(num_excluded, 'channel')} that '{template.name}' lacks are left out.",)
+                if num_excluded
+                else ()
             )
-            channels, frames = (
+            quadrupoles, frames = (
                 electrodes_of_channels,
                 np.where(channel_indices >= 0, frames[:, channel_indices], np.nan),
             )
-    return channels, frames, times, (*frame_notes, *notes)
+    return quadrupoles, frames, line_times, (*frame_notes, *notes)
 
 
 def _frame_of_lines(
@@ -395,12 +406,14 @@ def _frame_of_lines(
     separated."""
     if stated_frames is not None and np.isfinite(stated_frames).all():
         return np.unique(stated_frames, return_inverse=True)[1].ravel(), ()
-    rows = np.arange(len(channel_of_line))
-    if (channel_of_line == channel_of_line[rows % num_channels]).all():
+    line_indices = np.arange(len(channel_of_line))
+    if (channel_of_line == channel_of_line[line_indices % num_channels]).all():
         num_frames = -(-len(channel_of_line) // num_channels)
-        return rows // num_channels, (f"its lines repeat: {counted(num_frames, 'frame')}.",) if num_frames > 1 else ()
+        return line_indices // num_channels, (
+            f"its lines repeat: {counted(num_frames, 'frame')}.",
+        ) if num_frames > 1 else ()
     repeated_measurements = names_text(
-        [str(row + 1) for row in rows[1:][np.isin(channel_of_line[1:], channel_of_line[:1])][:3]]
+        [str(line_index + 1) for line_index in line_indices[1:][np.isin(channel_of_line[1:], channel_of_line[:1])][:3]]
     )
     raise ValueError(
         f"{path.name}: some electrodes are measured twice, and no column numbers frames; add one named frame"
@@ -408,7 +421,7 @@ def _frame_of_lines(
     )
 
 
-def _pair_patterns(pairs: Int[np.ndarray, "n 2"], num_electrodes: int) -> Float[np.ndarray, "n L"]:
+def _pair_patterns(electrode_pairs: Int[np.ndarray, "n 2"], num_electrodes: int) -> Float[np.ndarray, "n L"]:
     """Patterns (pairs, electrodes) with +1 and -1 at the two electrodes of each pair."""
-    identity = np.eye(num_electrodes)
-    return identity[pairs[:, 0]] - identity[pairs[:, 1]]
+    identity_matrix = np.eye(num_electrodes)
+    return identity_matrix[electrode_pairs[:, 0]] - identity_matrix[electrode_pairs[:, 1]]

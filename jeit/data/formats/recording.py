@@ -61,24 +61,26 @@ def create_measurement(path: Path, recording: Recording, sensor_description: Des
     Raises `ValueError` if the protocol has a different number of channels, or if the number of names is not the number
     of frames.
     """
-    layout = sensor_description.layout
-    notes = (*recording.notes, *component_notes(recording.voltages, layout))
-    layout = replace(layout, frames_in="rows", complex_pairs=False)
-    if recording.frame_names and not layout.frame_names:
-        layout = replace(layout, frame_names=recording.frame_names)
-    sensor_description = replace(sensor_description, layout=layout, notes=(*sensor_description.notes, *notes))
-    # Current patterns in the file have already been read as part of the recording.
-    uses_own_protocol = sensor_description.protocol_section is None or sensor_description.patterns_measured
-    frames = arrange_frames(recording.voltages, layout, path.name)
-    mask = None if recording.usable is None or not uses_own_protocol else recording.usable
-    measurement = scale_to_volts(
-        path, sensor_description, frames, recording.protocol if uses_own_protocol else None, mask
+    described_layout = sensor_description.layout
+    recording_notes = (*recording.notes, *component_notes(recording.voltages, described_layout))
+    described_layout = replace(described_layout, frames_in="rows", complex_pairs=False)
+    if recording.frame_names and not described_layout.frame_names:
+        described_layout = replace(described_layout, frame_names=recording.frame_names)
+    sensor_description = replace(
+        sensor_description, layout=described_layout, notes=(*sensor_description.notes, *recording_notes)
     )
-    if recording.times is None or layout.averaged or layout.frame_rate is not None:
+    # Current patterns in the file have already been read as part of the recording.
+    is_own_protocol_used = sensor_description.protocol_section is None or sensor_description.patterns_measured
+    frames = arrange_frames(recording.voltages, described_layout, path.name)
+    usable_mask = None if recording.usable is None or not is_own_protocol_used else recording.usable
+    measurement = scale_to_volts(
+        path, sensor_description, frames, recording.protocol if is_own_protocol_used else None, usable_mask
+    )
+    if recording.times is None or described_layout.averaged or described_layout.frame_rate is not None:
         return measurement
     if (np.diff(recording.times) <= 0).any():
-        note = "the times in the file do not rise, and are left out."
-        return replace(measurement, notes=(*measurement.notes, note))
+        time_note = "the times in the file do not rise, and are left out."
+        return replace(measurement, notes=(*measurement.notes, time_note))
     return replace(measurement, times=recording.times)
 
 
@@ -111,9 +113,14 @@ def adjacent_recording(
 ) -> Recording:
     """Recording of 208 positive voltages in the channel order of the systems of Göttingen, Dräger and Carefusion.
     Channels that are zero in every frame are marked as not measured."""
-    usable = (values != 0).any(axis=0)
-    if not usable.all() and usable.any():
-        notes = (*notes, f"{int((~usable).sum())} of {CHANNELS} channels were not measured (zero in every frame).")
+    usable_channels = (values != 0).any(axis=0)
+    if not usable_channels.all() and usable_channels.any():
+        notes = (
+            *notes,
+            f"{int((~usable_channels).sum())} of {CHANNELS} channels were not measured (zero in every frame).",
+        )
     with np.errstate(invalid="ignore"):  # a signalling NaN of single precision would warn
         voltages = -values.astype(float)
-    return Recording(voltages, adjacent(16, current=_ASSUMED_CURRENT), usable, times, notes=(*notes, _CURRENT_NOTE))
+    return Recording(
+        voltages, adjacent(16, current=_ASSUMED_CURRENT), usable_channels, times, notes=(*notes, _CURRENT_NOTE)
+    )

@@ -34,9 +34,11 @@ def separator_patterns(lines: Sequence[str], holds_numbers: Callable[[str], bool
     """Patterns of the lines without numbers that begin with a letter and occur about as often as the most frequent of
     them; none if no line holds numbers."""
     text_patterns = [line_pattern(line) for line in lines if not holds_numbers(line)]
-    counts = Counter(pattern for pattern in text_patterns if pattern[:1].isalpha())
-    min_count = max(_MIN_SEPARATOR_REPETITIONS, 0.5 * max(counts.values(), default=0))
-    repeated_patterns = {pattern for pattern, count in counts.items() if count >= min_count}
+    pattern_counts = Counter(text_pattern for text_pattern in text_patterns if text_pattern[:1].isalpha())
+    min_count = max(_MIN_SEPARATOR_REPETITIONS, 0.5 * max(pattern_counts.values(), default=0))
+    repeated_patterns = {
+        text_pattern for text_pattern, pattern_count in pattern_counts.items() if pattern_count >= min_count
+    }
     return repeated_patterns if len(text_patterns) < len(lines) else set()
 
 
@@ -52,20 +54,23 @@ class RepairedNumbers(NamedTuple):
 
 
 class _Partition(NamedTuple):
-    """Division of a file into parts. **Fields**: `parts`: separator before each part; `starts`: first line of each
-    part; `sizes`: number of numbers in each part; `size`: most frequent one."""
+    """Division of a file into parts. **Fields**: `part_separators`: separator before each part;
+    `part_starts`: first line of each part; `part_sizes`: number of numbers in each part; `usual_size`: most frequent
+    one."""
 
-    parts: list[Separator]
-    starts: list[int]
-    sizes: Int[np.ndarray, " parts"]
-    size: int
+    part_separators: list[Separator]
+    part_starts: list[int]
+    part_sizes: Int[np.ndarray, " parts"]
+    usual_size: int
 
     @classmethod
-    def create(cls, parts: list[Separator], number_ends: Int[np.ndarray, " lines"]) -> _Partition:
+    def create(cls, part_separators: list[Separator], number_ends: Int[np.ndarray, " lines"]) -> _Partition:
         """Divide a file; `number_ends`: number of numbers before each line, and in all."""
-        starts = [part.line for part in parts]
-        sizes = np.diff(number_ends[[*starts, len(number_ends) - 1]])
-        return cls(parts, starts, sizes, Counter(sizes[sizes > 0].tolist()).most_common(1)[0][0])
+        part_starts = [part_separator.line for part_separator in part_separators]
+        part_sizes = np.diff(number_ends[[*part_starts, len(number_ends) - 1]])
+        return cls(
+            part_separators, part_starts, part_sizes, Counter(part_sizes[part_sizes > 0].tolist()).most_common(1)[0][0]
+        )
 
 
 class Separator(NamedTuple):
@@ -90,7 +95,11 @@ class Separators:
     @property
     def examples(self) -> list[str]:
         """Text lines between the lines of numbers, shortened for messages."""
-        return [separator.text[:_MAX_SHOWN_SEPARATOR_LENGTH] for separator in self.found_separators if separator.line]
+        return [
+            found_separator.text[:_MAX_SHOWN_SEPARATOR_LENGTH]
+            for found_separator in self.found_separators
+            if found_separator.line
+        ]
 
     def complete(
         self, numbers: Inexact[np.ndarray, " n"], lengths: Int[np.ndarray, " lines"], counts: Sequence[int], name: str
@@ -103,53 +112,65 @@ class Separators:
         if too many parts are damaged.
         """
         number_ends = np.concatenate([[0], np.cumsum(lengths)])
-        partitions = [
-            _Partition.create(self._find_part_separators(kind), number_ends)
-            for kind in (None, *dict.fromkeys(line_pattern(separator.text) for separator in self.found_separators))
+        candidate_partitions = [
+            _Partition.create(self._find_part_separators(separator_kind), number_ends)
+            for separator_kind in (
+                None,
+                *dict.fromkeys(line_pattern(found_separator.text) for found_separator in self.found_separators),
+            )
         ]
-        parts_of_file, starts, sizes, size = next((part for part in partitions if part.size in counts), partitions[0])
-        line_ends = [*starts[1:], len(lengths)]
-        is_unreadable = np.zeros(len(sizes), bool)
-        is_unreadable[np.searchsorted(starts, self.unreadable, side="right") - 1] = True
-        is_damaged = (sizes % size != 0) | (sizes == 0) | is_unreadable
-        is_damaged[-1] &= sizes[-1] > size or is_unreadable[-1]
+        parts_of_file, part_starts, part_sizes, part_size = next(
+            (
+                candidate_partition
+                for candidate_partition in candidate_partitions
+                if candidate_partition.usual_size in counts
+            ),
+            candidate_partitions[0],
+        )
+        line_ends = [*part_starts[1:], len(lengths)]
+        is_unreadable = np.zeros(len(part_sizes), bool)
+        is_unreadable[np.searchsorted(part_starts, self.unreadable, side="right") - 1] = True
+        is_damaged = (part_sizes % part_size != 0) | (part_sizes == 0) | is_unreadable
+        is_damaged[-1] &= part_sizes[-1] > part_size or is_unreadable[-1]
         damaged_parts = np.flatnonzero(is_damaged)
         if not damaged_parts.size:
-            return RepairedNumbers(numbers, lengths, size)
-        complete_parts = np.flatnonzero((sizes == size) & ~is_damaged)
+            return RepairedNumbers(numbers, lengths, part_size)
+        complete_parts = np.flatnonzero((part_sizes == part_size) & ~is_damaged)
         damage_note = (
-            f"{len(damaged_parts)} of {counted(len(sizes), 'part')} between lines such as {self.examples[0]!r} lack "
-            f"numbers or contain something else, the first from line {parts_of_file[damaged_parts[0]].position} on"
+            f"{len(damaged_parts)} of {counted(len(part_sizes), 'part')} between lines such as {self.examples[0]!r} "
+            f"lack numbers or contain something else, the first from line {parts_of_file[damaged_parts[0]].position} on"
         )
         if len(complete_parts) < _MIN_COMPLETE_FRAMES or len(damaged_parts) > max(
-            1, _MAX_DAMAGED_FRAME_SHARE * len(sizes)
+            1, _MAX_DAMAGED_FRAME_SHARE * len(part_sizes)
         ):
             fault_hint = f" {self.fault}" if self.fault else ""
             raise ValueError(f"{name}: {damage_note}: too many to be left out.{fault_hint}")
-        complete_lengths = lengths[starts[complete_parts[0]] : line_ends[complete_parts[0]]]
+        complete_lengths = lengths[part_starts[complete_parts[0]] : line_ends[complete_parts[0]]]
         number_parts, length_parts = [], []
-        for start, end, is_part_damaged in zip(starts, line_ends, is_damaged, strict=True):
+        for part_start, part_end, is_part_damaged in zip(part_starts, line_ends, is_damaged, strict=True):
             number_parts.append(
-                np.full(size, np.nan) if is_part_damaged else numbers[number_ends[start] : number_ends[end]]
+                np.full(part_size, np.nan)
+                if is_part_damaged
+                else numbers[number_ends[part_start] : number_ends[part_end]]
             )
-            length_parts.append(complete_lengths if is_part_damaged else lengths[start:end])
+            length_parts.append(complete_lengths if is_part_damaged else lengths[part_start:part_end])
         damage_note = f"{damage_note}: they are left empty (NaN)."
-        return RepairedNumbers(np.concatenate(number_parts), np.concatenate(length_parts), size, damage_note)
+        return RepairedNumbers(np.concatenate(number_parts), np.concatenate(length_parts), part_size, damage_note)
 
-    def _find_part_separators(self, kind: str | None) -> list[Separator]:
+    def _find_part_separators(self, requested_kind: str | None) -> list[Separator]:
         """The separators that begin a part: those of one kind, or all. Different separators without numbers between
         them count as one; between equal ones, a part is empty."""
-        parts, previous_kind = [Separator(0, 1, "")], ""
-        for separator in self.found_separators:
-            separator_kind = line_pattern(separator.text)
-            if kind not in (None, separator_kind):
+        part_separators, previous_separator_kind = [Separator(0, 1, "")], ""
+        for found_separator in self.found_separators:
+            separator_kind = line_pattern(found_separator.text)
+            if requested_kind not in (None, separator_kind):
                 continue
-            is_on_later_line = separator.line > parts[-1].line
-            if is_on_later_line or (separator.line and separator_kind == previous_kind):
-                parts.append(separator)
-            if is_on_later_line or not separator.line or not previous_kind:
-                previous_kind = separator_kind
-        return parts
+            is_on_later_line = found_separator.line > part_separators[-1].line
+            if is_on_later_line or (found_separator.line and separator_kind == previous_separator_kind):
+                part_separators.append(found_separator)
+            if is_on_later_line or not found_separator.line or not previous_separator_kind:
+                previous_separator_kind = separator_kind
+        return part_separators
 
 
 class WrappedLines:
@@ -163,7 +184,7 @@ class WrappedLines:
         self.channels = channels
         self._separators: set[str] = set()
         self._last_text = ""
-        self._numbers: list[float] | None = None  # of the frame that arrives, None outside of frames
+        self._pending_numbers: list[float] | None = None  # of the frame that arrives, None outside of frames
         self._is_damaged = False  # the frame that arrives has been reported already
 
     def __call__(self, line: list[float] | str) -> list[float] | str | None:
@@ -173,24 +194,26 @@ class WrappedLines:
             return self._add_text(line)
         if self._is_damaged and len(line) < self.channels:
             return None
-        is_first_line = self._numbers == []
-        if self._numbers is None or len(line) >= self.channels or (is_first_line and self.channels % len(line)):
-            self._numbers = None
+        is_first_line = self._pending_numbers == []
+        if self._pending_numbers is None or len(line) >= self.channels or (is_first_line and self.channels % len(line)):
+            self._pending_numbers = None
             return line
-        self._numbers += line
-        if len(self._numbers) < self.channels:
+        self._pending_numbers += line
+        if len(self._pending_numbers) < self.channels:
             return None
-        numbers, self._numbers = self._numbers, None
-        if len(numbers) == self.channels:
+        pending_numbers, self._pending_numbers = self._pending_numbers, None
+        if len(pending_numbers) == self.channels:
             self._separators.add(self._last_text)
-        return numbers
+        return pending_numbers
 
     def _add_text(self, text: str) -> list[float] | str | None:
-        incomplete, pattern = self._numbers, line_pattern(text)
-        is_separator = pattern in self._separators
-        self._is_damaged = bool(self._separators) and not is_separator and (self._is_damaged or bool(incomplete))
+        incomplete_numbers, text_pattern = self._pending_numbers, line_pattern(text)
+        is_separator = text_pattern in self._separators
+        self._is_damaged = (
+            bool(self._separators) and not is_separator and (self._is_damaged or bool(incomplete_numbers))
+        )
         if self._is_damaged:
-            self._numbers = None
+            self._pending_numbers = None
             return text
-        self._last_text, self._numbers = pattern, []
-        return (incomplete or None) if is_separator else text
+        self._last_text, self._pending_numbers = text_pattern, []
+        return (incomplete_numbers or None) if is_separator else text

@@ -52,9 +52,9 @@ def find_description(path: Path) -> str | Path | None:
     If neither file exists, the bundled description "tank6cm" is used for a CSV table named like the files of the 6 cm
     tank, with current and frequency (`…_55uA_1000Hz.csv`). None if there is no description.
     """
-    for candidate in (path.with_suffix(".toml"), path.parent / "description.toml"):
-        if candidate.is_file():
-            return candidate
+    for candidate_path in (path.with_suffix(".toml"), path.parent / "description.toml"):
+        if candidate_path.is_file():
+            return candidate_path
     if path.suffix.lower() == ".csv" and re.search(r"_[0-9.]+uA_[0-9.]+Hz$", path.stem):
         return "tank6cm"
     return None
@@ -78,7 +78,7 @@ def read(
         sensor_description = description_like(like)
     else:
         # A damaged file raises its own error here, because a description would not help.
-        _ = _from_numpy(path, ()) if path.suffix.lower() in (".npz", ".npy") else read_text(path)
+        _ = _read_numpy_arrays(path, ()) if path.suffix.lower() in (".npz", ".npy") else read_text(path)
         raise ValueError(
             f"description: {path.name} is a table of numbers, and nothing says what they mean. Put a description "
             f"beside it, {path.with_suffix('.toml').name} (geometry, electrodes, protocol), or name one; "
@@ -88,26 +88,36 @@ def read(
         raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
     if key is not None:
         sensor_description = replace(sensor_description, layout=replace(sensor_description.layout, keys=(key,)))
-    protocols = sensor_description.protocols(path) or ([] if like is None else [(like.protocol, "")])
-    mask = stored_protocol = times = None
+    candidate_protocols = sensor_description.protocols(path) or ([] if like is None else [(like.protocol, "")])
+    stored_mask = stored_protocol = stored_times = None
     if path.suffix.lower() in (".npz", ".npy"):
-        arrays = _from_numpy(path, sensor_description.layout.keys)
-        table, mask = _voltages(arrays, sensor_description.layout, path), arrays.get("mask")
-        if table.ndim == 3 or sensor_description.patterns_measured:
-            table = frames_of(table, sensor_description.layout.axes, path.name)
+        stored_arrays = _read_numpy_arrays(path, sensor_description.layout.keys)
+        voltage_table, stored_mask = (
+            _voltages_of_arrays(stored_arrays, sensor_description.layout, path),
+            stored_arrays.get("mask"),
+        )
+        if voltage_table.ndim == 3 or sensor_description.patterns_measured:
+            voltage_table = frames_of(voltage_table, sensor_description.layout.axes, path.name)
         if sensor_description.protocol_section is None:
-            stored_protocol = _stored_protocol(arrays)
-        protocols = protocols if stored_protocol is None else [(stored_protocol, "")]
-        file_frames = frames_in_table(np.atleast_2d(table), channel_counts(protocols), sensor_description.layout)
-        sensor_description, times = _with_stored_texts(sensor_description, arrays), _times(arrays, path.name)
+            stored_protocol = _stored_protocol(stored_arrays)
+        candidate_protocols = candidate_protocols if stored_protocol is None else [(stored_protocol, "")]
+        file_frames = frames_in_table(
+            np.atleast_2d(voltage_table), channel_counts(candidate_protocols), sensor_description.layout
+        )
+        sensor_description, stored_times = (
+            _with_stored_texts(sensor_description, stored_arrays),
+            _stored_times(stored_arrays, path.name),
+        )
     else:
-        layout = sensor_description.layout
-        text = read_text(path, layout.delimiter, layout.skip_rows)
-        file_frames = frames_in_text(text, channel_counts(protocols), layout, path.name)
-    measurement = create_measurement_of_frames(path, sensor_description, file_frames, protocols, mask, like)
-    if times is None or sensor_description.layout.averaged or sensor_description.layout.frame_rate is not None:
+        described_layout = sensor_description.layout
+        text = read_text(path, described_layout.delimiter, described_layout.skip_rows)
+        file_frames = frames_in_text(text, channel_counts(candidate_protocols), described_layout, path.name)
+    measurement = create_measurement_of_frames(
+        path, sensor_description, file_frames, candidate_protocols, stored_mask, like
+    )
+    if stored_times is None or sensor_description.layout.averaged or sensor_description.layout.frame_rate is not None:
         return measurement
-    return replace(measurement, times=times)
+    return replace(measurement, times=stored_times)
 
 
 NamedProtocols = Sequence[tuple[Protocol, str]]
@@ -130,50 +140,61 @@ def create_measurement_of_frames(
 ) -> Measurement:
     """Create a measurement from the frames of a file, with notes on detected properties; see `scale_to_volts` and
     `read` for the arguments."""
-    layout = replace(sensor_description.layout, frames_in="rows")
-    frames = arrange_frames(file_frames.table, layout, path.name)
-    notes = (*sensor_description.notes, *file_frames.notes, *component_notes(file_frames.table, layout))
+    described_layout = replace(sensor_description.layout, frames_in="rows")
+    frames = arrange_frames(file_frames.table, described_layout, path.name)
+    measurement_notes = (
+        *sensor_description.notes,
+        *file_frames.notes,
+        *component_notes(file_frames.table, described_layout),
+    )
     protocol, protocol_notes = fitting_protocol(frames, protocols, like)
-    sensor_description = replace(sensor_description, layout=layout, notes=(*notes, *protocol_notes))
-    reason = ""
+    sensor_description = replace(
+        sensor_description, layout=described_layout, notes=(*measurement_notes, *protocol_notes)
+    )
+    exclusion_reason = ""
     if protocol is not None and frames.shape[-1] == protocol.num_measurements:
         unread_channels = unmeasured_driven_channels(frames, protocol)
         if unread_channels.any():
             mask = ~unread_channels if mask is None else np.asarray(mask) & ~unread_channels
-            reason = "they read driven electrodes, and are zero in every frame."
+            exclusion_reason = "they read driven electrodes, and are zero in every frame."
     measurement = scale_to_volts(path, sensor_description, frames, protocol, mask)
-    if reason:
-        notes = [note.replace("excluded by the mask given.", reason) for note in measurement.notes]
-        measurement = replace(measurement, notes=tuple(notes))
-    if layout.polarity is None:
+    if exclusion_reason:
+        measurement_notes = [
+            measurement_note.replace("excluded by the mask given.", exclusion_reason)
+            for measurement_note in measurement.notes
+        ]
+        measurement = replace(measurement, notes=tuple(measurement_notes))
+    if described_layout.polarity is None:
         measurement = correct_signs(measurement, like)
-    if file_frames.times is None or layout.averaged or layout.frame_rate is not None:
+    if file_frames.times is None or described_layout.averaged or described_layout.frame_rate is not None:
         return measurement
-    return replace(measurement, times=file_frames.times[:: 2 if layout.complex_pairs else 1])
+    return replace(measurement, times=file_frames.times[:: 2 if described_layout.complex_pairs else 1])
 
 
 def _divide_by_gains(frames: np.ndarray, protocol: Protocol, sensor_description: Description) -> np.ndarray:
     """Frames divided by the described gains of their measurement patterns. Raises `ValueError` unless there is one gain
     for each measurement pattern."""
-    gains, num_patterns = np.array(sensor_description.layout.gains), len(protocol.measurement)
-    if gains.size not in (0, num_patterns):
+    pattern_gains, num_patterns = np.array(sensor_description.layout.gains), len(protocol.measurement)
+    if pattern_gains.size not in (0, num_patterns):
         raise ValueError(
             f"{sensor_description.origin}: [data] gains must be one for each of the {num_patterns} measurement "
-            f"patterns of '{protocol.name}'; they are {gains.size}."
+            f"patterns of '{protocol.name}'; they are {pattern_gains.size}."
         )
-    if not gains.size or frames.shape[-1] != protocol.num_measurements:
+    if not pattern_gains.size or frames.shape[-1] != protocol.num_measurements:
         return frames
-    return frames / gains[np.asarray(protocol.measurement_index)]
+    return frames / pattern_gains[np.asarray(protocol.measurement_index)]
 
 
 def description_like(like: Measurement) -> Description:
     """Description that consists of the properties of `like`, a measurement of the same sensor, without the protocol and
     the frame names."""
-    source = Path(like.source)
+    source_path = Path(like.source)
     description_path = (
-        find_description(source) if like.source and (recognises(source) or source.suffix == ".mat") else None
+        find_description(source_path)
+        if like.source and (recognises(source_path) or source_path.suffix == ".mat")
+        else None
     )
-    layout = (
+    table_layout = (
         TableLayout()
         if description_path is None
         else replace(load_description(description_path).layout, frame_names=(), keys=())
@@ -183,7 +204,7 @@ def description_like(like: Measurement) -> Description:
         title="",
         domain=like.domain,
         electrodes=like.electrodes,
-        layout=layout,
+        layout=table_layout,
         notes=(f"described as '{like.name}' is, for it has no description of its own.",),
         protocol_section=None,
         uncertainty=like.uncertainty,
@@ -204,13 +225,13 @@ def scale_to_volts(
         raise ValueError(
             f'{sensor_description.origin}: no protocol: add a [protocol] section with kind = "adjacent" or another.'
         )
-    notes, frames = sensor_description.notes, _divide_by_gains(frames, protocol, sensor_description)
+    scale_notes, frames = sensor_description.notes, _divide_by_gains(frames, protocol, sensor_description)
     if sensor_description.mean_removed and frames.shape[-1] == protocol.num_measurements:
         frames, mean = subtract_mean(np.atleast_2d(frames), protocol.num_electrodes)
         mean_note = (
             f"the potentials had a mean, {mean * sensor_description.layout.scale:.3g} V at most; it is subtracted."
         )
-        notes = (*notes, mean_note) if mean else notes
+        scale_notes = (*scale_notes, mean_note) if mean else scale_notes
     frame_names, num_frames = sensor_description.layout.frame_names, len(np.atleast_2d(frames))
     if frame_names and len(frame_names) != num_frames:
         raise ValueError(
@@ -227,14 +248,14 @@ def scale_to_volts(
         name=path.stem,
         source=str(path),
         frame_names=frame_names,
-        notes=notes,
+        notes=scale_notes,
     )
     measurement = replace(measurement, uncertainty=sensor_description.uncertainty)
     if sensor_description.layout.averaged:
-        note = f"the mean of {measurement.num_frames} frames."
-        return replace(measurement.mean_frame(), notes=(*measurement.notes, note))
-    rate = sensor_description.layout.frame_rate
-    return measurement if rate is None else measurement.at_rate(rate)
+        frame_note = f"the mean of {measurement.num_frames} frames."
+        return replace(measurement.mean_frame(), notes=(*measurement.notes, frame_note))
+    frame_rate = sensor_description.layout.frame_rate
+    return measurement if frame_rate is None else measurement.at_rate(frame_rate)
 
 
 def numbers(path: Path, layout: TableLayout) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -244,7 +265,7 @@ def numbers(path: Path, layout: TableLayout) -> tuple[np.ndarray, tuple[str, ...
     Raises `ValueError` if the file contains anything but numbers.
     """
     if path.suffix.lower() == ".npy":
-        return _voltages(_from_numpy(path, ()), layout, path), ()
+        return _voltages_of_arrays(_read_numpy_arrays(path, ()), layout, path), ()
     text = remove_cut_line(read_text(path, layout.delimiter, layout.skip_rows))
     return rectangle(text, path.name), text.heading
 
@@ -277,67 +298,80 @@ def component_notes(values: np.ndarray, layout: TableLayout) -> tuple[str, ...]:
     return (f"of complex voltages this is the {layout.component} part; see [data] component.",)
 
 
-def _from_numpy(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Read from an NPZ file, by name, the arrays `keys` and the arrays that `write_table` stores; or from an NPY file
-    its array, as "voltages". Without `keys`, an array of another name is read as "voltages" if it is the only one."""
+def _read_numpy_arrays(path: Path, array_keys: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Read from an NPZ file, by name, the arrays `array_keys` and the arrays that `write_table` stores; or from an NPY
+    file its array, as "voltages". Without `array_keys`, an array of another name is read as "voltages" if it is the
+    only one."""
     try:
         if path.suffix.lower() == ".npy":
             return {"voltages": npy_array(path)}
-        names = keys or (_name_of_voltages(path),)
-        arrays = npz_arrays(path, *names, *_STORED_ARRAYS)
+        array_names = array_keys or (_name_of_voltages(path),)
+        stored_arrays = npz_arrays(path, *array_names, *_STORED_ARRAYS)
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from None
-    return arrays if keys or names[0] not in arrays else {**arrays, "voltages": arrays[names[0]]}
+    return (
+        stored_arrays
+        if array_keys or array_names[0] not in stored_arrays
+        else {**stored_arrays, "voltages": stored_arrays[array_names[0]]}
+    )
 
 
 def _name_of_voltages(path: Path) -> str:
     """Name of the array of voltages in an NPZ file: "voltages", unless another array is the only one of more than three
     numbers."""
-    shapes = npz_shapes(path)
-    names = [name for name, shape in shapes.items() if name not in _STORED_ARRAYS and math.prod(shape) > 3]
-    return names[0] if "voltages" not in shapes and len(names) == 1 else "voltages"
+    array_shapes = npz_shapes(path)
+    array_names = [
+        name for name, array_shape in array_shapes.items() if name not in _STORED_ARRAYS and math.prod(array_shape) > 3
+    ]
+    return array_names[0] if "voltages" not in array_shapes and len(array_names) == 1 else "voltages"
 
 
-def _voltages(arrays: dict[str, np.ndarray], layout: TableLayout, path: Path) -> np.ndarray:
-    keys = layout.keys if layout.keys and path.suffix.lower() == ".npz" else ("voltages",)
-    missing_keys = [key for key in keys if key not in arrays]
+def _voltages_of_arrays(stored_arrays: dict[str, np.ndarray], table_layout: TableLayout, path: Path) -> np.ndarray:
+    voltage_keys = table_layout.keys if table_layout.keys and path.suffix.lower() == ".npz" else ("voltages",)
+    missing_keys = [voltage_key for voltage_key in voltage_keys if voltage_key not in stored_arrays]
     if missing_keys:
-        array_names = names_text(sorted(arrays.get("", arrays)))
+        array_names = names_text(sorted(stored_arrays.get("", stored_arrays)))
         raise ValueError(
             f"{path.name}: there is no array '{missing_keys[0]}'; the file has {array_names}. Name the voltages with "
             "[data] keys in the description."
         )
-    for key in keys:
-        if arrays[key].dtype.kind not in "biufc":
-            raise ValueError(f"{path.name}: '{key}' holds {arrays[key].dtype}; give numbers, in volts.")
-    return arrays[keys[0]] if len(keys) == 1 else np.stack([arrays[key].ravel() for key in keys])
+    for voltage_key in voltage_keys:
+        if stored_arrays[voltage_key].dtype.kind not in "biufc":
+            raise ValueError(
+                f"{path.name}: '{voltage_key}' holds {stored_arrays[voltage_key].dtype}; give numbers, in volts."
+            )
+    return (
+        stored_arrays[voltage_keys[0]]
+        if len(voltage_keys) == 1
+        else np.stack([stored_arrays[voltage_key].ravel() for voltage_key in voltage_keys])
+    )
 
 
-def _stored_protocol(arrays: dict[str, np.ndarray]) -> Protocol | None:
+def _stored_protocol(stored_arrays: dict[str, np.ndarray]) -> Protocol | None:
     """The protocol in a file written by `write_table`; None if the file contains no protocol."""
-    if not all(array in arrays for array in PROTOCOL_ARRAYS):
+    if not all(array_name in stored_arrays for array_name in PROTOCOL_ARRAYS):
         return None
-    name = str(arrays.get("protocol_name", "custom"))
-    return Protocol(**{array: arrays[array] for array in PROTOCOL_ARRAYS}, name=name)
+    name = str(stored_arrays.get("protocol_name", "custom"))
+    return Protocol(**{array_name: stored_arrays[array_name] for array_name in PROTOCOL_ARRAYS}, name=name)
 
 
-def _with_stored_texts(description: Description, arrays: dict[str, np.ndarray]) -> Description:
+def _with_stored_texts(description: Description, stored_arrays: dict[str, np.ndarray]) -> Description:
     """The description with added frame names (if it has none) and notes from a file written by `write_table`."""
-    frame_names = description.layout.frame_names or _texts(arrays, "frame_names")
-    notes = (*description.notes, *_texts(arrays, "notes"))
-    return replace(description, layout=replace(description.layout, frame_names=frame_names), notes=notes)
+    frame_names = description.layout.frame_names or _stored_texts(stored_arrays, "frame_names")
+    combined_notes = (*description.notes, *_stored_texts(stored_arrays, "notes"))
+    return replace(description, layout=replace(description.layout, frame_names=frame_names), notes=combined_notes)
 
 
-def _times(arrays: dict[str, np.ndarray], name: str) -> np.ndarray | None:
+def _stored_times(stored_arrays: dict[str, np.ndarray], name: str) -> np.ndarray | None:
     """Times of the frames from a file written by `write_table`, or None."""
-    times = arrays.get("times")
-    if times is not None and times.dtype.kind not in "iuf":
-        raise ValueError(f"{name}: 'times' holds {times.dtype}; give seconds.")
-    return times
+    stored_times = stored_arrays.get("times")
+    if stored_times is not None and stored_times.dtype.kind not in "iuf":
+        raise ValueError(f"{name}: 'times' holds {stored_times.dtype}; give seconds.")
+    return stored_times
 
 
-def _texts(arrays: dict[str, np.ndarray], name: str) -> tuple[str, ...]:
-    return tuple(str(text) for text in np.ravel(arrays.get(name, np.zeros(0))))
+def _stored_texts(stored_arrays: dict[str, np.ndarray], name: str) -> tuple[str, ...]:
+    return tuple(str(text) for text in np.ravel(stored_arrays.get(name, np.zeros(0))))
 
 
 def frames_of(values: np.ndarray, axes: tuple[str, ...], name: str) -> Inexact[np.ndarray, "F M"]:
@@ -353,18 +387,20 @@ def frames_of(values: np.ndarray, axes: tuple[str, ...], name: str) -> Inexact[n
         raise ValueError(
             f"{name}: the voltages have shape {values.shape}; {', '.join(axis_names)} are {len(axis_names)} axes."
         )
-    transposed = np.transpose(values, [axis_names.index(axis) for axis in ("frames", "patterns", "electrodes")])
-    return transposed.reshape(len(transposed), -1)
+    transposed_values = np.transpose(
+        values, [axis_names.index(axis_name) for axis_name in ("frames", "patterns", "electrodes")]
+    )
+    return transposed_values.reshape(len(transposed_values), -1)
 
 
 def subtract_mean(frames: Inexact[np.ndarray, "F M"], num_electrodes: int) -> tuple[Inexact[np.ndarray, "F M"], float]:
     """Subtract from the potentials of each current pattern their mean over `num_electrodes` electrodes, if any mean
     exceeds noise, i.e. if potentials were measured against ground or against an electrode. Returns the frames and the
     largest mean, or 0 if nothing is subtracted. Patterns with NaN are not changed."""
-    potentials = frames.reshape(len(frames), -1, num_electrodes)
-    mean_potentials = potentials.mean(axis=2, keepdims=True)
+    pattern_potentials = frames.reshape(len(frames), -1, num_electrodes)
+    mean_potentials = pattern_potentials.mean(axis=2, keepdims=True)
     mean_potentials = np.where(np.isfinite(mean_potentials), mean_potentials, 0)
-    centred_potentials = potentials - mean_potentials
+    centred_potentials = pattern_potentials - mean_potentials
     if not (
         np.abs(mean_potentials) > _MAX_RELATIVE_MEAN_POTENTIAL * np.abs(centred_potentials).max(axis=2, keepdims=True)
     ).any():

@@ -63,12 +63,12 @@ class _NumberFormat(NamedTuple):
     points."""
 
     delimiter: str | None
-    decimal_comma: bool
+    has_decimal_comma: bool
 
     def cells(self, line: str) -> list[str]:
         """Cells of a line, without a word before the first cell and without a separator after the last cell."""
         line = _remove_label(line)
-        if self.decimal_comma:
+        if self.has_decimal_comma:
             line = line.replace(",", ".")
         line = line.strip(" \r\n").lstrip("[ ")
         line = line.rstrip(",; ]") if line.rstrip(",; ").endswith("]") else line
@@ -80,13 +80,13 @@ class _NumberFormat(NamedTuple):
     def numbers(self, line: str) -> list[complex] | None:
         """The numbers of a line, or None if the line contains anything else."""
         try:
-            return [_number(cell) for cell in self.cells(line)]
+            return [_parse_number(cell) for cell in self.cells(line)]
         except ValueError:
             return None
 
     def __str__(self) -> str:
         names = {None: "spaces", ",": "commas", ";": "semicolons", "\t": "tabs"}
-        return names.get(self.delimiter, repr(self.delimiter)) + (", decimal commas" if self.decimal_comma else "")
+        return names.get(self.delimiter, repr(self.delimiter)) + (", decimal commas" if self.has_decimal_comma else "")
 
 
 _CSV_FORMAT = _NumberFormat(",", False)
@@ -101,17 +101,17 @@ class LineNumbers:
     line that cannot be read with them."""
 
     def __init__(self):
-        self._format: _NumberFormat | None = None
+        self._number_format: _NumberFormat | None = None
 
     def __call__(self, line: str) -> list[float] | None:
         """The numbers of a line, with NaN for an empty cell between numbers; None if the line contains anything
         else."""
-        numbers = None if self._format is None else self._parse(self._format, line)
-        if numbers is None:
+        line_numbers = None if self._number_format is None else self._parse(self._number_format, line)
+        if line_numbers is None:
             number_format = _detect_format([line])
-            numbers = self._parse(number_format, line)
-            self._format = self._format if numbers is None else number_format
-        return numbers
+            line_numbers = self._parse(number_format, line)
+            self._number_format = self._number_format if line_numbers is None else number_format
+        return line_numbers
 
     @staticmethod
     def _parse(number_format: _NumberFormat, line: str) -> list[float] | None:
@@ -216,8 +216,8 @@ def rectangle(text: Text, name: str) -> Inexact[np.ndarray, "R C"]:
 
 def _remove_label(line: str) -> str:
     """A line without the word before its numbers."""
-    match = _LINE_LABEL_PATTERN.match(line)
-    return line if match is None else line[match.end() :]
+    label_match = _LINE_LABEL_PATTERN.match(line)
+    return line if label_match is None else line[label_match.end() :]
 
 
 def _delimiter_for_split(delimiter: str) -> str | None:
@@ -229,13 +229,13 @@ def _detect_format(lines: Sequence[str]) -> _NumberFormat:
     numbers."""
 
     def count_numbers(number_format: _NumberFormat) -> tuple[int, int]:
-        rows = [row for line in lines if (row := number_format.numbers(line))]
-        return len(rows), sum(map(len, rows))
+        number_rows = [line_numbers for line in lines if (line_numbers := number_format.numbers(line))]
+        return len(number_rows), sum(map(len, number_rows))
 
     number_formats = [
         number_format
         for number_format in _NUMBER_FORMATS
-        if not number_format.decimal_comma or _has_decimal_commas(number_format, lines)
+        if not number_format.has_decimal_comma or _has_decimal_commas(number_format, lines)
     ]
     return max(number_formats, key=count_numbers)
 
@@ -288,18 +288,18 @@ def _content_lines(path: Path, num_skipped: int) -> Iterator[tuple[int, str]]:
 def _not_a_number_message(cells: list[str], number_format: _NumberFormat, *, is_first_line: bool) -> str:
     """Error message for a line whose cells are not all numbers; `is_first_line`: no line of numbers precedes it."""
     wrong_columns = [k for k, cell in enumerate(cells) if not _is_number(cell)]
-    cell = cells[wrong_columns[0]]
+    wrong_cell = cells[wrong_columns[0]]
     if is_first_line and cells[0].startswith("{"):
         return ": this is JSON; write its numbers as CSV, a frame in each line."
-    problem = f"{cell[:40]!r} is no number" if cell else "nothing stands there"
+    problem_text = f"{wrong_cell[:40]!r} is no number" if wrong_cell else "nothing stands there"
     if len(cells) == 1:
-        return f": {problem}, nor numbers separated by {number_format}. {_DELIMITER_HINT}"
+        return f": {problem_text}, nor numbers separated by {number_format}. {_DELIMITER_HINT}"
     # A heading consists mostly of words.
     delimiter_hint = f" {_DELIMITER_HINT}" if is_first_line and 2 * len(wrong_columns) > len(cells) else ""
-    return f", column {wrong_columns[0] + 1}: {problem}; where a value is missing write nan.{delimiter_hint}"
+    return f", column {wrong_columns[0] + 1}: {problem_text}; where a value is missing write nan.{delimiter_hint}"
 
 
-def _number(cell: str) -> complex:
+def _parse_number(cell: str) -> complex:
     """The real or complex number in a cell. Raises `ValueError` for anything else."""
     if "_" in cell:  # Python's float accepts 1_0
         raise ValueError(cell)
@@ -314,14 +314,14 @@ def _number(cell: str) -> complex:
 def _numbers_until_a_fault(cells: list[str]) -> list[float | complex]:
     """The numbers in cells, up to the first cell that contains anything else."""
     try:
-        return [_number(cell) for cell in cells]
+        return [_parse_number(cell) for cell in cells]
     except ValueError:
-        return [_number(cell) for cell in takewhile(_is_number, cells)]
+        return [_parse_number(cell) for cell in takewhile(_is_number, cells)]
 
 
 def _is_number(cell: str) -> bool:
     try:
-        _number(cell)
+        _parse_number(cell)
     except ValueError:
         return False
     return True
@@ -366,31 +366,31 @@ def remove_cut_line(text: Text) -> Text:
     if len(text.lengths) < 2 or text.lengths[-1] >= text.lengths[0]:
         return text
     num_removed_numbers = int(text.lengths[-1])
-    values = text.values[: len(text.values) - num_removed_numbers]
+    kept_values = text.values[: len(text.values) - num_removed_numbers]
     return text._replace(
-        values=values, lengths=text.lengths[:-1], notes=(*text.notes, *_truncation_notes(num_removed_numbers))
+        values=kept_values, lengths=text.lengths[:-1], notes=(*text.notes, *_truncation_notes(num_removed_numbers))
     )
 
 
-def _wrapped_frames(text: Text, counts: Sequence[int]) -> tuple[int, int] | None:
+def _wrapped_frames(text: Text, channel_counts: Sequence[int]) -> tuple[int, int] | None:
     """For frames that are wrapped over several lines, return the number of values per frame, and the number of values
     after the last complete frame; None if each line or each column is a frame."""
     line_ends = np.cumsum(text.lengths)
     if (text.lengths == text.lengths[0]).all():
         shape = len(text.lengths), int(text.lengths[0])
-        if any(count in shape or count + 1 in shape for count in counts):
+        if any(count in shape or count + 1 in shape for count in channel_counts):
             return None
-    candidates = []
-    for count_index, count in enumerate(counts):
+    frame_candidates = []
+    for count_index, count in enumerate(channel_counts):
         num_frames, num_excess_numbers = divmod(int(line_ends[-1]), count)
         # For a number of channels other than the described number, values after the last complete frame mean that a
         # line is missing.
         if count_index and num_excess_numbers:
             continue
         if num_frames and text.lengths[0] < count and np.isin(count * np.arange(1, num_frames + 1), line_ends).all():
-            candidates.append((count, num_excess_numbers))
+            frame_candidates.append((count, num_excess_numbers))
     # Prefer a number of channels for which all frames are complete.
-    return min(candidates, key=lambda candidate: candidate[1] > 0, default=None)
+    return min(frame_candidates, key=lambda frame_candidate: frame_candidate[1] > 0, default=None)
 
 
 def _truncation_notes(num_values: int) -> tuple[str, ...]:
@@ -411,32 +411,34 @@ def frames_in_table(
     if described_axis is None and min(table.shape) > 1 and table.size in counts and not any_axis_fits:
         drive_rows = table if len(table) >= table.shape[1] else table.T
         return TableFrames(drive_rows.reshape(1, -1), None, ("its longer side is taken for the drives of one frame.",))
-    is_transposed = described_axis == "columns" if described_axis else _are_columns(table.shape, counts, default_axis)
+    is_transposed = (
+        described_axis == "columns" if described_axis else _are_columns_frames(table.shape, counts, default_axis)
+    )
     rows = table.T if is_transposed else table
     notes: tuple[str, ...] = ()
     if described_axis is None and is_transposed and default_axis == "rows":
         notes = ("frames are taken from its columns.",)
     if described_axis is None and not is_transposed and default_axis == "columns" and min(table.shape) > 1:
         notes = ("frames are taken from its rows.",)
-    times = None
+    frame_times = None
     if rows.shape[1] - 1 in counts and rows.shape[1] not in counts and layout.time_column is not False:
-        times, time_note = _times(np.real(rows[:, 0]), "" if is_transposed or not heading else heading[0])
+        frame_times, time_note = _frame_times(np.real(rows[:, 0]), "" if is_transposed or not heading else heading[0])
         rows, notes = (rows[:, 1:], (*notes, time_note)) if time_note else (rows, notes)
-    return TableFrames(rows, times, notes)
+    return TableFrames(rows, frame_times, notes)
 
 
-def _are_columns(shape: tuple[int, int], counts: Sequence[int], default_axis: str) -> bool:
-    """Whether columns, not rows, are frames: the first of the `counts` that equals the length of a column or row
-    decides."""
+def _are_columns_frames(shape: tuple[int, int], channel_counts: Sequence[int], default_axis: str) -> bool:
+    """Whether columns, not rows, are frames: the first of the `channel_counts` that equals the length of a column or
+    row decides."""
     for num_extra_columns in (0, 1):
-        for count in counts:
+        for count in channel_counts:
             is_frame_length = [shape[1] == count + num_extra_columns, shape[0] == count + num_extra_columns]
             if any(is_frame_length):
                 return is_frame_length[1] and (default_axis == "columns" or not is_frame_length[0])
     return default_axis == "columns"
 
 
-def _times(column: Float[np.ndarray, " F"], column_name: str) -> tuple[Float[np.ndarray, " F"] | None, str]:
+def _frame_times(column: Float[np.ndarray, " F"], column_name: str) -> tuple[Float[np.ndarray, " F"] | None, str]:
     """Times in seconds from the first number of each frame, or None if these numbers are not times, and a note. The
     note is empty if the numbers do not increase."""
     if not (np.isfinite(column).all() and (np.diff(column) > 0).all()):
@@ -448,14 +450,17 @@ def _times(column: Float[np.ndarray, " F"], column_name: str) -> tuple[Float[np.
         and (column == np.round(column)).all()
         and np.median(np.diff(column)) >= _MIN_AMBIGUOUS_TIME_STEP
     ):
-        step = float(np.median(np.diff(column)))
-        return None, f"the first number of each frame rises by {step:g}; its unit is not known, and it is left out."
-    unit = (
+        median_step = float(np.median(np.diff(column)))
+        return (
+            None,
+            f"the first number of each frame rises by {median_step:g}; its unit is not known, and it is left out.",
+        )
+    unit_note = (
         1e-3
         if "ms" in column_name.lower()
         else 1e-6
         if "us" in column_name.lower() or "µs" in column_name.lower()
         else 1.0
     )
-    unit_name = {1.0: "seconds", 1e-3: "milliseconds", 1e-6: "microseconds"}[unit]
-    return unit * column, f"the first number of each frame is taken for its time, in {unit_name}."
+    unit_name = {1.0: "seconds", 1e-3: "milliseconds", 1e-6: "microseconds"}[unit_note]
+    return unit_note * column, f"the first number of each frame is taken for its time, in {unit_name}."

@@ -120,7 +120,7 @@ def live(
 
     require_extra("live", "a page in the browser")
     check_positive({"--untouched": untouched} | ({} if rate is None else {"--rate": rate}))
-    options = {
+    setting_options = {
         "solver": method,
         "max_steps": steps,
         "hyperparameter": None if hyperparameter is None else convert_to_number_if_possible(hyperparameter),
@@ -129,56 +129,58 @@ def live(
         "num_points": num_points,
         "as_is": as_is or None,
     }
-    options = {name: value for name, value in options.items() if value is not None}
-    _check_unused_options(options, model, calibration, contacts)
+    setting_options = {name: option_value for name, option_value in setting_options.items() if option_value is not None}
+    _check_unused_options(setting_options, model, calibration, contacts)
     if source.partition(":")[0] == "demo" and steps is None:
-        options.setdefault("solver", "one-step")  # compiles in half the time
+        setting_options.setdefault("solver", "one-step")  # compiles in half the time
     with naming_options_in_errors(_OPTION_NAMES):
-        settings = StreamSettings(**options)
+        stream_settings = StreamSettings(**setting_options)
     console = plain_console()
     check_port(host, port)
     _check_folder(output)
-    with Steps(console, quiet=quiet) as step, naming_options_in_errors(_ARGUMENT_OPTIONS):
-        step("read")
+    with Steps(console, quiet=quiet) as report_step, naming_options_in_errors(_ARGUMENT_OPTIONS):
+        report_step("read")
         # With a model, the reference is a file of frames without a protocol, as `jeit touch predict` reads it.
         reference_input = reference
         if reference is not None and model is None:
             reference_input = read_file("--reference", reference, format, description, key=reference_key)
-        prepared = prepare(
+        prepared_stream = prepare(
             source,
             reference_input,
             description=description,
             model=model,
             calibration=calibration,
             contacts=contacts,
-            settings=settings,
+            settings=stream_settings,
             rate=rate,
             untouched=untouched,
-            progress=step,
+            progress=report_step,
         )
     if not quiet:
-        for _, note in prepared.source.messages.copy():
-            console.print(f"  note: {note}", soft_wrap=True)
+        for _, message_text in prepared_stream.source.messages.copy():
+            console.print(f"  note: {message_text}", soft_wrap=True)
     if until_end:
-        prepared.source.end_when_lost()
-    recorder = Recorder(output, reference=prepared.reference)
+        prepared_stream.source.end_when_lost()
+    frame_recorder = Recorder(output, reference=prepared_stream.reference)
     if record:
-        recorder.start()
+        frame_recorder.start()
     with _handle_sigterm() as received_signals:
-        with Session(prepared.source, prepared.view, recorder=recorder) as session:
+        with Session(prepared_stream.source, prepared_stream.view, recorder=frame_recorder) as session:
             serve(
                 session,
                 host=host,
                 port=port,
                 stay=not until_end,
-                opened=lambda address: _open_page(address, console, browser=not no_browser, quiet=quiet),
+                opened=lambda page_address: _open_page(
+                    page_address, console, is_browser_wanted=not no_browser, is_quiet=quiet
+                ),
             )
-        state = session.state()
+        session_state = session.state()
     if not quiet:
-        _print_counters(console, state)
-    if until_end and not state["imaged"]:
-        first_reason = next(iter(state["reasons"]), "the source ended before the first")
-        raise ValueError(f"{counted(state['read'], 'frame')}, and none could be imaged: {first_reason}")
+        _print_counters(console, session_state)
+    if until_end and not session_state["imaged"]:
+        first_reason = next(iter(session_state["reasons"]), "the source ended before the first")
+        raise ValueError(f"{counted(session_state['read'], 'frame')}, and none could be imaged: {first_reason}")
     if received_signals:
         raise typer.Exit(128 + signal.SIGTERM)
 
@@ -216,35 +218,41 @@ _ARGUMENT_OPTIONS = {
 }
 
 
-def _check_folder(output: Path) -> None:
-    """Raise `ValueError` if no folder can be created at `output`; the folder is created only when a recording
+def _check_folder(output_folder: Path) -> None:
+    """Raise `ValueError` if no folder can be created at `output_folder`; the folder is created only when a recording
     begins."""
-    existing_path = next(path for path in (output.absolute(), *output.absolute().parents) if path.exists())
+    existing_path = next(
+        path for path in (output_folder.absolute(), *output_folder.absolute().parents) if path.exists()
+    )
     if not (existing_path.is_dir() and os.access(existing_path, os.W_OK)):
-        raise ValueError(f"--output: no folder '{output}' can be made or written to; '{existing_path}' is in the way.")
+        raise ValueError(
+            f"--output: no folder '{output_folder}' can be made or written to; '{existing_path}' is in the way."
+        )
 
 
-def _check_unused_options(options: dict, model: Path | None, calibration: Path | None, contacts: bool) -> None:
+def _check_unused_options(
+    setting_options: dict, model: Path | None, calibration_path: Path | None, has_contacts: bool
+) -> None:
     """Raise `ValueError` if options of conductivity images are given together with a model or microphones, which do not
     use these options."""
-    used_options = [_OPTION_NAMES.get(name, f"--{name.replace('_', '-')}") for name in options] + [
+    used_options = [_OPTION_NAMES.get(name, f"--{name.replace('_', '-')}") for name in setting_options] + [
         "--contacts"
-    ] * contacts
-    for option, value in (("--model", model), ("--calibration", calibration)):
-        if value is not None and used_options:
-            raise ValueError(f"{used_options[0]} has no use with {option}; leave it out.")
+    ] * has_contacts
+    for option_name, option_value in (("--model", model), ("--calibration", calibration_path)):
+        if option_value is not None and used_options:
+            raise ValueError(f"{used_options[0]} has no use with {option_name}; leave it out.")
 
 
-def _open_page(address: str, console, *, browser: bool, quiet: bool) -> None:
+def _open_page(page_address: str, console, *, is_browser_wanted: bool, is_quiet: bool) -> None:
     """Print the address of the page, and open it in a browser if there is a display."""
-    opens_browser = browser and _has_display()
-    if not (quiet and opens_browser):
-        console.print(f"  {address}" + ("" if opens_browser else "  (open it in a browser)"), soft_wrap=True)
-    if opens_browser:
+    is_browser_opened = is_browser_wanted and _has_display()
+    if not (is_quiet and is_browser_opened):
+        console.print(f"  {page_address}" + ("" if is_browser_opened else "  (open it in a browser)"), soft_wrap=True)
+    if is_browser_opened:
         import webbrowser
 
         # Some browsers return only when their window is closed.
-        threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+        threading.Thread(target=webbrowser.open, args=(page_address,), daemon=True).start()
 
 
 def _has_display() -> bool:
@@ -254,20 +262,20 @@ def _has_display() -> bool:
     return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
 
 
-def _print_counters(console, state: dict) -> None:
+def _print_counters(console, session_state: dict) -> None:
     """Print the numbers of frames that a session received, imaged, refused and skipped."""
     from jeit.arguments import counted
 
-    counts = [f"{state[name]} {name}" for name in ("imaged", "dropped", "refused") if state[name]]
-    console.print(f"\n{counted(state['read'], 'frame')}: {', '.join(counts) or 'none imaged'}")
-    if state["latency_median"] is not None:
-        median, latency_99 = 1e3 * state["latency_median"], 1e3 * state["latency_99"]
-        console.print(f"latency to the picture: median {median:.1f} ms, 99 % within {latency_99:.1f} ms")
-    for status in ("partial", "unchanged", "step limit"):
-        if state["statuses"].get(status):
-            console.print(f"  {state['statuses'][status]} {status}")
-    reasons = sorted(state["reasons"].items(), key=lambda item: -item[1])
-    for reason, count in reasons[:_MAX_REASONS]:
-        console.print(f"  {count} × {reason}", soft_wrap=True)
-    if len(reasons) > _MAX_REASONS:
-        console.print(f"  {len(reasons) - _MAX_REASONS} more reasons")
+    count_texts = [f"{session_state[name]} {name}" for name in ("imaged", "dropped", "refused") if session_state[name]]
+    console.print(f"\n{counted(session_state['read'], 'frame')}: {', '.join(count_texts) or 'none imaged'}")
+    if session_state["latency_median"] is not None:
+        median_latency, latency_99 = 1e3 * session_state["latency_median"], 1e3 * session_state["latency_99"]
+        console.print(f"latency to the picture: median {median_latency:.1f} ms, 99 % within {latency_99:.1f} ms")
+    for image_status in ("partial", "unchanged", "step limit"):
+        if session_state["statuses"].get(image_status):
+            console.print(f"  {session_state['statuses'][image_status]} {image_status}")
+    counted_reasons = sorted(session_state["reasons"].items(), key=lambda reason_and_count: -reason_and_count[1])
+    for refusal_reason, reason_count in counted_reasons[:_MAX_REASONS]:
+        console.print(f"  {reason_count} × {refusal_reason}", soft_wrap=True)
+    if len(counted_reasons) > _MAX_REASONS:
+        console.print(f"  {len(counted_reasons) - _MAX_REASONS} more reasons")

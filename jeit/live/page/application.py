@@ -38,7 +38,7 @@ from jeit.live.page.wire import (
 _TOKEN_PATHS = ("/", "/socket")
 """Paths that require the token. The other files need no protection, since they are the same in every installation."""
 
-_HEADERS = {
+_SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
     "Referrer-Policy": "no-referrer",
@@ -60,16 +60,16 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def _is_address(host: str) -> bool:
+def _is_address(host_name: str) -> bool:
     try:
-        ipaddress.ip_address(host)
+        ipaddress.ip_address(host_name)
     except ValueError:
         return False
     return True
 
 
-def _is_unspecified(host: str) -> bool:
-    return _is_address(host) and ipaddress.ip_address(host).is_unspecified
+def _is_unspecified(host_name: str) -> bool:
+    return _is_address(host_name) and ipaddress.ip_address(host_name).is_unspecified
 
 
 def _host_name(host_header: str) -> str:
@@ -113,21 +113,24 @@ class RequestGuard:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
-        host = Headers(scope=scope).get("host", "")
-        problem = self._find_problem(scope, host)
-        if problem is None:
-            await self._app(scope, receive, self._with_security_headers(send, host))
+        requested_host = Headers(scope=scope).get("host", "")
+        refusal_reason = self._find_problem(scope, requested_host)
+        if refusal_reason is None:
+            await self._app(scope, receive, self._with_security_headers(send, requested_host))
         elif scope["type"] == "websocket":
             await receive()
-            await send({"type": "websocket.close", "code": 1008, "reason": problem})
+            await send({"type": "websocket.close", "code": 1008, "reason": refusal_reason})
         else:
-            await PlainTextResponse(problem + "\n", 403, headers=_HEADERS)(scope, receive, send)
+            await PlainTextResponse(refusal_reason + "\n", 403, headers=_SECURITY_HEADERS)(scope, receive, send)
 
-    def _find_problem(self, scope: Scope, host: str) -> str | None:
-        if not is_host_allowed(host, self._host):
+    def _find_problem(self, scope: Scope, requested_host: str) -> str | None:
+        if not is_host_allowed(requested_host, self._host):
             return "This host name is not one of this server: open the address that `jeit live` prints."
-        origin = Headers(scope=scope).get("origin")
-        if (origin is not None or scope["type"] == "websocket") and origin not in (f"http://{host}", f"https://{host}"):
+        page_origin = Headers(scope=scope).get("origin")
+        if (page_origin is not None or scope["type"] == "websocket") and page_origin not in (
+            f"http://{requested_host}",
+            f"https://{requested_host}",
+        ):
             return "Another site's page may not use this server."
         if self._token is not None and scope["path"] in _TOKEN_PATHS:
             request_token = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
@@ -136,18 +139,19 @@ class RequestGuard:
         return None
 
     @staticmethod
-    def _with_security_headers(send: Send, host: str) -> Send:
+    def _with_security_headers(send: Send, requested_host: str) -> Send:
         """Add headers to a response that make the browser run only the page's own files, and not show the page in a
         frame of another site."""
         content_security_policy = (
             "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; media-src blob:; "
-            f"connect-src 'self' ws://{host} wss://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+            f"connect-src 'self' ws://{requested_host} wss://{requested_host}; base-uri 'none'; form-action 'none'; "
+            "frame-ancestors 'none'"
         )
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                headers = MutableHeaders(scope=message)
-                headers.update({**_HEADERS, "Content-Security-Policy": content_security_policy})
+                response_headers = MutableHeaders(scope=message)
+                response_headers.update({**_SECURITY_HEADERS, "Content-Security-Policy": content_security_policy})
             await send(message)
 
         return send_with_headers
@@ -162,19 +166,19 @@ def page_files() -> dict[str, bytes]:
 
 def make_application(hub: PageHub, *, host: str, token: str | None) -> Starlette:
     """Return the web application that shows a session's pictures; `host`, `token`: as in `RequestGuard`."""
-    files = page_files()
+    allowed_files = page_files()
 
     def file(request: Request) -> Response:
         name = request.path_params.get("name", "index.html")
-        if name not in files:
+        if name not in allowed_files:
             return Response("There is no such page.\n", 404, media_type="text/plain")
-        return Response(files[name], media_type=_MEDIA_TYPES[name.rpartition(".")[2]])
+        return Response(allowed_files[name], media_type=_MEDIA_TYPES[name.rpartition(".")[2]])
 
     async def serve_socket(websocket: WebSocket) -> None:
         await _serve_viewer(hub, websocket)
 
     @contextlib.asynccontextmanager
-    async def lifespan(_app: Starlette) -> AsyncIterator[None]:
+    async def application_lifespan(_app: Starlette) -> AsyncIterator[None]:
         hub.start()
         try:
             yield
@@ -184,7 +188,7 @@ def make_application(hub: PageHub, *, host: str, token: str | None) -> Starlette
     return Starlette(
         routes=[Route("/", file), WebSocketRoute("/socket", serve_socket), Route("/{name}", file)],
         middleware=[Middleware(RequestGuard, host=host, token=token)],
-        lifespan=lifespan,
+        lifespan=application_lifespan,
     )
 
 
@@ -194,85 +198,85 @@ async def _serve_viewer(hub: PageHub, websocket: WebSocket) -> None:
     if len(hub.viewers) >= MAX_VIEWERS:
         await websocket.close(1013, f"{MAX_VIEWERS} pages are open already")
         return
-    viewer = Viewer()
-    hub.viewers.add(viewer)
-    viewer.wake_event.set()
-    send_task = asyncio.create_task(_send_pictures(hub, viewer, websocket))
+    page_viewer = Viewer()
+    hub.viewers.add(page_viewer)
+    page_viewer.wake_event.set()
+    send_task = asyncio.create_task(_send_pictures(hub, page_viewer, websocket))
     try:
-        await _receive_commands(hub, viewer, websocket)
+        await _receive_commands(hub, page_viewer, websocket)
     finally:
-        hub.viewers.discard(viewer)
+        hub.viewers.discard(page_viewer)
         send_task.cancel()
         with contextlib.suppress(asyncio.CancelledError, WebSocketDisconnect, RuntimeError):
             await send_task
 
 
-async def _send_pictures(hub: PageHub, viewer: Viewer, websocket: WebSocket) -> None:
+async def _send_pictures(hub: PageHub, page_viewer: Viewer, websocket: WebSocket) -> None:
     await websocket.send_text(hub.scene)
     while True:
-        await viewer.wake_event.wait()
-        viewer.wake_event.clear()
-        if viewer.is_state_due():
-            await websocket.send_text(hub.state_message(viewer))
+        await page_viewer.wake_event.wait()
+        page_viewer.wake_event.clear()
+        if page_viewer.is_state_due():
+            await websocket.send_text(hub.state_message(page_viewer))
         newest_picture = hub.newest_picture()
-        if newest_picture is not None and viewer.is_ready_for(newest_picture[0].frame.number):
-            viewer.record_sent(newest_picture[0].frame.number, newest_picture[0].frame.arrived)
+        if newest_picture is not None and page_viewer.is_ready_for(newest_picture[0].frame.number):
+            page_viewer.record_sent(newest_picture[0].frame.number, newest_picture[0].frame.arrived)
             await websocket.send_bytes(newest_picture[1])
 
 
-async def _receive_commands(hub: PageHub, viewer: Viewer, websocket: WebSocket) -> None:
-    faults = 0
+async def _receive_commands(hub: PageHub, page_viewer: Viewer, websocket: WebSocket) -> None:
+    num_invalid_messages = 0
     while True:
         message = await websocket.receive()
         if message["type"] == "websocket.disconnect":
             return
         try:
-            command = read_command(message.get("text") or message.get("bytes") or "")
+            page_command = read_command(message.get("text") or message.get("bytes") or "")
         except ValueError as error:
-            faults += 1
-            if faults > _MAX_INVALID_MESSAGES:
+            num_invalid_messages += 1
+            if num_invalid_messages > _MAX_INVALID_MESSAGES:
                 await websocket.close(1008, "too many messages that are no commands")
                 return
             await websocket.send_text(to_json("answer", {"to": "message", "problem": str(error)}))
             continue
-        await _execute_command(command, hub, viewer, websocket)
+        await _execute_command(page_command, hub, page_viewer, websocket)
 
 
-async def _execute_command(command: Command, hub: PageHub, viewer: Viewer, websocket: WebSocket) -> None:
-    match command:
-        case Drawn(number=number, hidden=hidden):
-            viewer.record_drawn(number, hidden=hidden)
+async def _execute_command(page_command: Command, hub: PageHub, page_viewer: Viewer, websocket: WebSocket) -> None:
+    match page_command:
+        case Drawn(number=frame_number, hidden=is_page_hidden):
+            page_viewer.record_drawn(frame_number, hidden=is_page_hidden)
             return
         case Seen():
-            viewer.read_state()
+            page_viewer.read_state()
             return
         case Follow(on=on):
-            viewer.following = on
-            viewer.wake_event.set()
+            page_viewer.following = on
+            page_viewer.wake_event.set()
             return
-        case Show(number=number, direction=direction):
-            past_picture_message = hub.past_picture_message(number, direction)
+        case Show(number=frame_number, direction=search_direction):
+            past_picture_message = hub.past_picture_message(frame_number, search_direction)
             if past_picture_message is not None:
                 await websocket.send_bytes(past_picture_message)
                 return
-            reply = ("show", "that picture is no longer kept: the last minute is")
+            reply_message = ("show", "that picture is no longer kept: the last minute is")
         case _:
-            reply = await _execute_session_command(command, hub)
-    await websocket.send_text(to_json("answer", {"to": reply[0], "problem": reply[1]}))
+            reply_message = await _execute_session_command(page_command, hub)
+    await websocket.send_text(to_json("answer", {"to": reply_message[0], "problem": reply_message[1]}))
 
 
-async def _execute_session_command(command: Command, hub: PageHub) -> tuple[str, str | None]:
+async def _execute_session_command(page_command: Command, hub: PageHub) -> tuple[str, str | None]:
     """Execute a command of the page that changes the session, in another thread, because the command may write to disk.
     Returns the name of the command, and the error message or None."""
-    session = hub.session
+    live_session = hub.session
     try:
-        match command:
-            case Reference(count=count):
-                await asyncio.to_thread(session.take_reference, count)
-            case Mark(label=label):
-                await asyncio.to_thread(session.mark, label)
+        match page_command:
+            case Reference(count=num_reference_frames):
+                await asyncio.to_thread(live_session.take_reference, num_reference_frames)
+            case Mark(label=event_label):
+                await asyncio.to_thread(live_session.mark, event_label)
             case Record(on=on):
-                await asyncio.to_thread(session.record, on)
+                await asyncio.to_thread(live_session.record, on)
     except (ValueError, OSError, RuntimeError) as error:
-        return type(command).__name__.lower(), str(error)
-    return type(command).__name__.lower(), None
+        return type(page_command).__name__.lower(), str(error)
+    return type(page_command).__name__.lower(), None

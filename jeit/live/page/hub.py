@@ -53,8 +53,8 @@ class Viewer:
         and not reported as drawn were skipped."""
         current_time = time.monotonic()
         while self._undrawn_pictures and self._undrawn_pictures[0][0] <= number:
-            sent_number, arrival_time = self._undrawn_pictures.popleft()
-            if sent_number == number and not hidden:
+            sent_frame_number, arrival_time = self._undrawn_pictures.popleft()
+            if sent_frame_number == number and not hidden:
                 self._drawn_latencies.append((current_time, current_time - arrival_time))
         self.wake_event.set()
 
@@ -77,14 +77,20 @@ class Viewer:
         The latency includes the transmission of the report, so that all times are from the same clock.
         """
         current_time = time.monotonic()
-        latencies = [
-            latency for draw_time, latency in self._drawn_latencies if current_time - draw_time <= _LATENCY_TIME_SPAN
+        recent_latencies = [
+            drawing_latency
+            for draw_time, drawing_latency in self._drawn_latencies
+            if current_time - draw_time <= _LATENCY_TIME_SPAN
         ]
         num_recent_pictures = sum(current_time - draw_time <= 2.0 for draw_time, _ in self._drawn_latencies)
-        if not latencies:
+        if not recent_latencies:
             return {"rate": 0.0, "latency_median": None, "latency_99": None}
-        median, latency_99 = np.percentile(latencies, [50, 99])
-        return {"rate": num_recent_pictures / 2.0, "latency_median": float(median), "latency_99": float(latency_99)}
+        median_latency, latency_99 = np.percentile(recent_latencies, [50, 99])
+        return {
+            "rate": num_recent_pictures / 2.0,
+            "latency_median": float(median_latency),
+            "latency_99": float(latency_99),
+        }
 
 
 class PageHub:
@@ -95,35 +101,35 @@ class PageHub:
         self.scene = scene_message(session.scene)
         self.viewers: set[Viewer] = set()
         self.ended = threading.Event()
-        self._closing = threading.Event()
+        self._is_closing = threading.Event()
         self._newest_result: Result | None = None
         self._encoded_picture: tuple[int, bytes] | None = None
         self._state: dict[str, Any] = {}
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._event_loop: asyncio.AbstractEventLoop | None = None
         self._is_woken = False
-        self._thread = threading.Thread(target=self._watch_session, name="jeit-live-pages", daemon=True)
+        self._watch_thread = threading.Thread(target=self._watch_session, name="jeit-live-pages", daemon=True)
 
     def start(self) -> None:
         """Start the thread; must be called in the event loop that serves the pages."""
-        self._loop = asyncio.get_running_loop()
+        self._event_loop = asyncio.get_running_loop()
         self._state = self.session.state()
-        self._thread.start()
+        self._watch_thread.start()
 
     def close(self) -> None:
         """End the thread that waits for pictures."""
-        self._closing.set()
-        self._thread.join(5.0)
+        self._is_closing.set()
+        self._watch_thread.join(5.0)
 
     def newest_picture(self) -> tuple[Result, bytes] | None:
         """Return the newest picture and the bytes of its message to pages; the message is computed once for all
         pages."""
-        result = self._newest_result
-        if result is None:
+        newest_result = self._newest_result
+        if newest_result is None:
             return None
-        if self._encoded_picture is None or self._encoded_picture[0] != result.frame.number:
-            message = picture_message(result.frame, result.picture, latency=result.latency)
-            self._encoded_picture = (result.frame.number, message)
-        return result, self._encoded_picture[1]
+        if self._encoded_picture is None or self._encoded_picture[0] != newest_result.frame.number:
+            message = picture_message(newest_result.frame, newest_result.picture, latency=newest_result.latency)
+            self._encoded_picture = (newest_result.frame.number, message)
+        return newest_result, self._encoded_picture[1]
 
     def state_message(self, viewer: Viewer) -> str:
         """Return the state of the session and of a page as JSON text."""
@@ -132,42 +138,44 @@ class PageHub:
     def past_picture_message(self, number: int, direction: int) -> bytes | None:
         """Return the message with a past picture as bytes: the picture of the frame `number`, or else of the nearest
         frame in the `direction` (-1: earlier, 1: later) that has a picture."""
-        for candidate in range(number, max(-1, number + 600 * direction), direction):
-            result = self.session.result(candidate)
-            if result is not None and (result.frame.number - number) * direction >= 0:
-                return picture_message(result.frame, result.picture, latency=result.latency, is_past=True)
+        for candidate_number in range(number, max(-1, number + 600 * direction), direction):
+            past_result = self.session.result(candidate_number)
+            if past_result is not None and (past_result.frame.number - number) * direction >= 0:
+                return picture_message(
+                    past_result.frame, past_result.picture, latency=past_result.latency, is_past=True
+                )
         return None
 
     def _watch_session(self) -> None:
-        last_number, state_time = -1, 0.0
-        while not self._closing.is_set():
-            result = self.session.newest(last_number, 0.1)
+        last_frame_number, state_time = -1, 0.0
+        while not self._is_closing.is_set():
+            newest_result = self.session.newest(last_frame_number, 0.1)
             current_time = time.monotonic()
-            if result is not None:
-                last_number = result.frame.number
-                self._newest_result = result
+            if newest_result is not None:
+                last_frame_number = newest_result.frame.number
+                self._newest_result = newest_result
                 self._wake_pages()
             if current_time - state_time >= _STATE_MESSAGE_PERIOD:
                 state_time = current_time
                 self._state = self.session.state()
                 if self._state.get("connection") == "ended":
                     self.ended.set()
-                self._wake_pages(state=True)
-            if result is None and self.ended.is_set():
-                self._closing.wait(0.1)
+                self._wake_pages(session_state=True)
+            if newest_result is None and self.ended.is_set():
+                self._is_closing.wait(0.1)
 
-    def _wake_pages(self, *, state: bool = False) -> None:
+    def _wake_pages(self, *, session_state: bool = False) -> None:
         """Wake the pages in the event loop, only once for several pictures that arrive before the pages are awake."""
-        if self._loop is None or (self._is_woken and not state):
+        if self._event_loop is None or (self._is_woken and not session_state):
             return
         self._is_woken = True
         try:
-            self._loop.call_soon_threadsafe(self._notify_viewers, state)
+            self._event_loop.call_soon_threadsafe(self._notify_viewers, session_state)
         except RuntimeError:  # the event loop has been closed
-            self._closing.set()
+            self._is_closing.set()
 
-    def _notify_viewers(self, state: bool) -> None:
+    def _notify_viewers(self, session_state: bool) -> None:
         self._is_woken = False
-        for viewer in self.viewers:
-            viewer.state_due = viewer.state_due or state
-            viewer.wake_event.set()
+        for page_viewer in self.viewers:
+            page_viewer.state_due = page_viewer.state_due or session_state
+            page_viewer.wake_event.set()

@@ -88,7 +88,7 @@ class Record(Command):
     on: bool
 
 
-_COMMANDS: TypeAdapter[Any] = TypeAdapter(
+_COMMAND_ADAPTER: TypeAdapter[Any] = TypeAdapter(
     Annotated[
         Drawn | Seen | Follow | Show | Reference | Mark | Record,
         Field(discriminator="do"),
@@ -101,11 +101,11 @@ def read_command(text: str | bytes) -> Command:
     if len(text) > MAX_COMMAND_LENGTH:
         raise ValueError(f"a message of {len(text)} characters: at most {MAX_COMMAND_LENGTH}")
     try:
-        return _COMMANDS.validate_json(text)
+        return _COMMAND_ADAPTER.validate_json(text)
     except ValidationError as error:
         first_error = error.errors(include_url=False, include_input=False, include_context=False)[0]
-        location = ".".join(str(location_part) for location_part in first_error["loc"])
-        raise ValueError(f"{location or 'message'}: {first_error['msg']}") from None
+        fault_location = ".".join(str(location_part) for location_part in first_error["loc"])
+        raise ValueError(f"{fault_location or 'message'}: {first_error['msg']}") from None
 
 
 def to_json_types(value: Any) -> Any:
@@ -115,9 +115,9 @@ def to_json_types(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {str(key): to_json_types(item) for key, item in value.items()}
+        return {str(table_key): to_json_types(table_value) for table_key, table_value in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
-        return [to_json_types(item) for item in value]
+        return [to_json_types(table_value) for table_value in value]
     return value if value is None or isinstance(value, bool | int | str) else str(value)
 
 
@@ -126,42 +126,44 @@ def to_json(kind: str, fields: Mapping[str, Any]) -> str:
     return json.dumps({"kind": kind, **to_json_types(fields)}, allow_nan=False, separators=(",", ":"))
 
 
-def _curve_lists(curves: Sequence[np.ndarray]) -> list[list[list[float]]]:
+def _curve_lists(point_curves: Sequence[np.ndarray]) -> list[list[list[float]]]:
     """Convert curves to lists of at most 2,000 points each, with coordinates rounded to tenths of a micrometre."""
-    thinned_curves = [np.asarray(curve, float)[:: 1 + len(curve) // _MAX_CURVE_POINTS] for curve in curves]
-    return [np.round(curve, 7).tolist() for curve in thinned_curves]
+    thinned_curves = [
+        np.asarray(curve_points, float)[:: 1 + len(curve_points) // _MAX_CURVE_POINTS] for curve_points in point_curves
+    ]
+    return [np.round(curve_points, 7).tolist() for curve_points in thinned_curves]
 
 
 def scene_message(scene: Scene) -> str:
     """Return the scene of a view (outline, electrodes, names), which is sent to a page once, as JSON text."""
-    fields = {
+    message_fields = {
         "title": scene.title,
         "quantity": scene.quantity,
         "unit": scene.unit,
         "diverging": bool(scene.diverging),
-        "extent": [float(edge) for edge in scene.extent],
+        "extent": [float(extent_edge) for extent_edge in scene.extent],
         "outline": _curve_lists(scene.outline),
         "electrodes": _curve_lists(scene.electrodes),
         "names": list(scene.names),
         "channels": list(scene.channels),
         "notes": list(scene.notes),
     }
-    return to_json("scene", fields)
+    return to_json("scene", message_fields)
 
 
 @dataclass(frozen=True)
 class _EncodedArray:
     """An array as bytes, with the part of the message header that describes the array."""
 
-    header: dict[str, Any]
-    body: bytes
+    header_fields: dict[str, Any]
+    body_bytes: bytes
 
 
 def _encode_values(frame: LiveFrame) -> _EncodedArray:
     if isinstance(frame.values, str):
         return _EncodedArray({"channels": 0}, b"")
-    values = np.asarray(frame.values, "<f4").ravel()
-    return _EncodedArray({"channels": values.size}, values.tobytes())
+    value_array = np.asarray(frame.values, "<f4").ravel()
+    return _EncodedArray({"channels": value_array.size}, value_array.tobytes())
 
 
 def _encode_pixels(picture: Picture) -> _EncodedArray:
@@ -169,13 +171,13 @@ def _encode_pixels(picture: Picture) -> _EncodedArray:
     resolution is finer than that of the page's colours."""
     if picture.pixels is None or picture.pixels.ndim != 2 or not picture.pixels.size:
         return _EncodedArray({"shape": None, "scale": 0.0}, b"")
-    pixels = np.asarray(picture.pixels, np.float32)
-    is_valid = np.isfinite(pixels)
-    largest_magnitude = float(np.abs(pixels, where=is_valid, out=np.zeros_like(pixels)).max())
-    scale = largest_magnitude / 32767 if largest_magnitude > 0 else 1.0
-    pixel_integers = np.full(pixels.shape, OUTSIDE_PIXEL_VALUE, "<i2")
-    pixel_integers[is_valid] = np.rint(pixels[is_valid] / scale)
-    return _EncodedArray({"shape": list(pixels.shape), "scale": scale}, pixel_integers.tobytes())
+    pixel_array = np.asarray(picture.pixels, np.float32)
+    is_valid = np.isfinite(pixel_array)
+    largest_magnitude = float(np.abs(pixel_array, where=is_valid, out=np.zeros_like(pixel_array)).max())
+    pixel_unit = largest_magnitude / 32767 if largest_magnitude > 0 else 1.0
+    pixel_integers = np.full(pixel_array.shape, OUTSIDE_PIXEL_VALUE, "<i2")
+    pixel_integers[is_valid] = np.rint(pixel_array[is_valid] / pixel_unit)
+    return _EncodedArray({"shape": list(pixel_array.shape), "scale": pixel_unit}, pixel_integers.tobytes())
 
 
 def picture_message(frame: LiveFrame, picture: Picture, *, latency: float, is_past: bool = False) -> bytes:
@@ -185,19 +187,19 @@ def picture_message(frame: LiveFrame, picture: Picture, *, latency: float, is_pa
     multiple of four bytes; the channels, float32; and the pixels, row of the largest y first, int16, to be multiplied
     by `scale` of the header.
     """
-    values, pixels = _encode_values(frame), _encode_pixels(picture)
-    markers = [[marker.x, marker.y, marker.label, marker.radius, marker.track] for marker in picture.markers]
-    header = {
+    encoded_values, encoded_pixels = _encode_values(frame), _encode_pixels(picture)
+    marker_fields = [[marker.x, marker.y, marker.label, marker.radius, marker.track] for marker in picture.markers]
+    header_fields = {
         "number": int(frame.number),
         "second": float(frame.second),
         "status": str(picture.status.value),
         "reason": picture.reason,
         "latency": float(latency),
         "past": is_past,
-        "markers": markers,
-        **values.header,
-        **pixels.header,
+        "markers": marker_fields,
+        **encoded_values.header_fields,
+        **encoded_pixels.header_fields,
     }
-    text = json.dumps(to_json_types(header), allow_nan=False, separators=(",", ":")).encode()
+    text = json.dumps(to_json_types(header_fields), allow_nan=False, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    return struct.pack("<I", len(text)) + text + values.body + pixels.body
+    return struct.pack("<I", len(text)) + text + encoded_values.body_bytes + encoded_pixels.body_bytes

@@ -71,39 +71,45 @@ class LearntSkinView(AbstractView):
                 raise ValueError("reference is missing: the skin was learnt from frames with one; give --reference.")
             self.set_reference(still)
         self.scene = _skin_scene(skin, description)
-        self._label, self._keys = _SteadyText(NO_TOUCH), _SteadyText("")
+        self._steady_label, self._steady_keys = _SteadyText(NO_TOUCH), _SteadyText("")
 
     def picture(self, frame: LiveFrame) -> Picture:
         """Estimate the touch in a frame; see `AbstractView.picture`."""
         try:
-            touches = self.skin.predict(frame.values, self.reference)
+            predicted_touches = self.skin.predict(frame.values, self.reference)
         except (ValueError, TypeError) as error:
-            reason = "The frame is text, not numbers." if isinstance(frame.values, str) else str(error)
-            return Picture(None, status=FrameStatus.REFUSED, reason=reason)
-        if touches.unlike[0]:
+            refusal_reason = "The frame is text, not numbers." if isinstance(frame.values, str) else str(error)
+            return Picture(None, status=FrameStatus.REFUSED, reason=refusal_reason)
+        if predicted_touches.unlike[0]:
             return Picture(None, status=FrameStatus.REFUSED, reason="It is unlike any touch that was learnt from.")
-        events = [
-            sentence for sentence in (self._label(_label_text(touches)), self._keys(_key_text(touches))) if sentence
+        touch_events = [
+            event_sentence
+            for event_sentence in (
+                self._steady_label(_label_text(predicted_touches)),
+                self._steady_keys(_key_text(predicted_touches)),
+            )
+            if event_sentence
         ]
-        markers = () if touches.position is None else _touch_markers(touches)
+        position_markers = () if predicted_touches.position is None else _touch_markers(predicted_touches)
         is_touched = (
-            bool(markers)
-            or _label_text(touches) not in (NO_TOUCH, "")
-            or bool(_key_text(touches))
-            or _has_force(touches)
+            bool(position_markers)
+            or _label_text(predicted_touches) not in (NO_TOUCH, "")
+            or bool(_key_text(predicted_touches))
+            or _has_force(predicted_touches)
         )
         return Picture(
             None,
-            markers=markers,
+            markers=position_markers,
             status=FrameStatus.IMAGED if is_touched else FrameStatus.UNCHANGED,
-            events=tuple(events),
+            events=tuple(touch_events),
         )
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
         """Take the mean of `frames` (frames, channels) as the new reference."""
-        reference = mean_frame(frames)
-        self.skin.predict(reference, reference)  # raises ValueError if the reference is unlike the training data
-        self.reference = reference
+        mean_reference = mean_frame(frames)
+        # Raises ValueError if the reference is unlike the training data.
+        self.skin.predict(mean_reference, mean_reference)
+        self.reference = mean_reference
 
 
 class DepthView(AbstractView):
@@ -132,17 +138,17 @@ class DepthView(AbstractView):
         self._pixel_positions = pixel_places(network.extent, network.shape)
         self.set_reference(still)
         x_min, x_max, y_min, y_max = network.extent
-        corners = np.array([(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max), (x_min, y_min)])
-        positions = 1e-3 * np.asarray(network.made_for["electrodes_mm"], float)
+        outline_corners = np.array([(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max), (x_min, y_min)])
+        electrode_positions = 1e-3 * np.asarray(network.made_for["electrodes_mm"], float)
         self.scene = Scene(
             title=title,
             quantity="depth",
             unit="mm",
             diverging=False,
             extent=network.extent,
-            outline=[corners],
-            electrodes=[position[None, :2] for position in positions],
-            names=_numbers_from_one(len(positions)),
+            outline=[outline_corners],
+            electrodes=[electrode_position[None, :2] for electrode_position in electrode_positions],
+            names=_numbers_from_one(len(electrode_positions)),
             channels=_numbers_from_one(network.made_for["channels"]),
             notes=(f"Depths below {1e3 * network.floor:.2g} mm are noise.",),
         )
@@ -154,12 +160,12 @@ class DepthView(AbstractView):
         frame_depth = self._estimate_depth(frame.values)
         if frame_depth.depth is None:
             return Picture(None, status=FrameStatus.REFUSED, reason=frame_depth.reason)
-        pixels = (1e3 * frame_depth.depth[::-1]).astype(np.float32)
+        depth_pixels = (1e3 * frame_depth.depth[::-1]).astype(np.float32)
         max_depth = float(frame_depth.depth.max())
         if max_depth <= self.network.floor:
-            return Picture(pixels, status=FrameStatus.UNCHANGED)
+            return Picture(depth_pixels, status=FrameStatus.UNCHANGED)
         x, y = depth_centroids(frame_depth.depth[None], self._pixel_positions)[0].tolist()
-        return Picture(pixels, (Marker(x, y, f"{1e3 * max_depth:.2f} mm"),))
+        return Picture(depth_pixels, (Marker(x, y, f"{1e3 * max_depth:.2f} mm"),))
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
         """Take the mean of `frames` (frames, channels) as the new reference."""
@@ -177,81 +183,94 @@ class _SteadyText:
 
     def __init__(self, text: str):
         self._reported_text = self._last_text = text
-        self._num_equal = 0
+        self._num_equal_texts = 0
 
     def __call__(self, text: str) -> str:
         """Return the text if it has now been the same for enough frames and differs from the last reported text;
         otherwise an empty string."""
-        self._num_equal = self._num_equal + 1 if text == self._last_text else 1
+        self._num_equal_texts = self._num_equal_texts + 1 if text == self._last_text else 1
         self._last_text = text
-        if self._num_equal < _MIN_STEADY_FRAMES or text == self._reported_text:
+        if self._num_equal_texts < _MIN_STEADY_FRAMES or text == self._reported_text:
             return ""
         self._reported_text = text
         return text
 
 
-def _touch_markers(touches: Touches) -> tuple[Marker, ...]:
+def _touch_markers(predicted_touches: Touches) -> tuple[Marker, ...]:
     """Return the marker of a touch with its force and label; an empty tuple if no position is estimated."""
-    position, deviation = np.asarray(touches.position)[0, :2], np.asarray(touches.position_std)[0, :2]
-    if not np.isfinite(position).all():
+    touch_position, position_deviation = (
+        np.asarray(predicted_touches.position)[0, :2],
+        np.asarray(predicted_touches.position_std)[0, :2],
+    )
+    if not np.isfinite(touch_position).all():
         return ()
-    texts = [] if _label_text(touches) in (NO_TOUCH, "") else [_label_text(touches)]
-    if touches.force is not None and np.isfinite(touches.force[0]):
-        deviation_text = "" if touches.force_std is None else f" ± {touches.force_std[0]:.2g}"
-        texts.insert(0, f"{touches.force[0]:.2g}{deviation_text} N")
-    x, y = position.tolist()
-    return (Marker(x, y, ", ".join(texts), _RADIUS_OF_68_PERCENT * float(np.sqrt(np.mean(deviation**2)))),)
+    marker_texts = [] if _label_text(predicted_touches) in (NO_TOUCH, "") else [_label_text(predicted_touches)]
+    if predicted_touches.force is not None and np.isfinite(predicted_touches.force[0]):
+        deviation_text = "" if predicted_touches.force_std is None else f" ± {predicted_touches.force_std[0]:.2g}"
+        marker_texts.insert(0, f"{predicted_touches.force[0]:.2g}{deviation_text} N")
+    x, y = touch_position.tolist()
+    return (
+        Marker(x, y, ", ".join(marker_texts), _RADIUS_OF_68_PERCENT * float(np.sqrt(np.mean(position_deviation**2)))),
+    )
 
 
-def _has_force(touches: Touches) -> bool:
-    return touches.force is not None and touches.force[0] > 0
+def _has_force(predicted_touches: Touches) -> bool:
+    return predicted_touches.force is not None and predicted_touches.force[0] > 0
 
 
-def _label_text(touches: Touches) -> str:
-    if touches.label is None:
+def _label_text(predicted_touches: Touches) -> str:
+    if predicted_touches.label is None:
         return ""
-    probability = np.nan if touches.probability is None else touches.probability[0]
-    label = str(touches.label[0])
-    return label if label == NO_TOUCH or not np.isfinite(probability) else f"{label} {100 * probability:.0f} %"
+    label_probability = np.nan if predicted_touches.probability is None else predicted_touches.probability[0]
+    touch_label = str(predicted_touches.label[0])
+    return (
+        touch_label
+        if touch_label == NO_TOUCH or not np.isfinite(label_probability)
+        else f"{touch_label} {100 * label_probability:.0f} %"
+    )
 
 
-def _key_text(touches: Touches) -> str:
-    key_numbers = [] if touches.touched is None else (np.flatnonzero(touches.touched[0]) + 1).tolist()
+def _key_text(predicted_touches: Touches) -> str:
+    key_numbers = (
+        [] if predicted_touches.touched is None else (np.flatnonzero(predicted_touches.touched[0]) + 1).tolist()
+    )
     return f"key{'s' if len(key_numbers) > 1 else ''} {', '.join(map(str, key_numbers))}" if key_numbers else ""
 
 
-def _numbers_from_one(count: int) -> list[str]:
-    return [str(number) for number in range(1, count + 1)]
+def _numbers_from_one(num_electrodes: int) -> list[str]:
+    return [str(electrode_number) for electrode_number in range(1, num_electrodes + 1)]
 
 
-def _skin_scene(skin: LearntSkin, description: Description | None) -> Scene:
+def _skin_scene(learnt_skin: LearntSkin, description: Description | None) -> Scene:
     """Create the scene of a learnt skin. The outline is taken from the description, or else is the bounding box of the
     touch positions in the training data."""
     electrodes: Sequence[np.ndarray] = ()
-    notes = []
+    scene_notes = []
     if description is not None and description.domain is not None and description.electrodes is not None:
         mesh = imaging_mesh(description.domain, description.electrodes, None, usual=_NUM_NODES)
-        outline = closed_outline(mesh)
+        outline_curves = closed_outline(mesh)
         electrodes = electrode_curves(mesh, description.electrodes)
     else:
-        low, high = np.full(2, -_HALF_SKIN_SIDE), np.full(2, _HALF_SKIN_SIDE)
-        if "place" in skin.standing:
-            positions = np.asarray(skin.standing["place"].right)[:, :2]
-            low, high = np.nanmin(positions, axis=0), np.nanmax(positions, axis=0)
-            notes.append("The box is around the places that were learnt from; a description says where the edge is.")
-        (x_min, y_min), (x_max, y_max) = low, high
-        outline = [np.array([(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max), (x_min, y_min)])]
-    corners = np.concatenate(outline)
-    (x_min, y_min), (x_max, y_max) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
+        lower_corner, upper_corner = np.full(2, -_HALF_SKIN_SIDE), np.full(2, _HALF_SKIN_SIDE)
+        if "place" in learnt_skin.standing:
+            electrode_positions = np.asarray(learnt_skin.standing["place"].right)[:, :2]
+            lower_corner, upper_corner = np.nanmin(electrode_positions, axis=0), np.nanmax(electrode_positions, axis=0)
+            scene_notes.append(
+                "The box is around the places that were learnt from; a description says where the edge is."
+            )
+        (x_min, y_min), (x_max, y_max) = lower_corner, upper_corner
+        outline_curves = [np.array([(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max), (x_min, y_min)])]
+    outline_points = np.concatenate(outline_curves)
+    (x_min, y_min), (x_max, y_max) = outline_points.min(axis=0).tolist(), outline_points.max(axis=0).tolist()
     return Scene(
-        title=f"Learnt skin, {skin.name}",
+        title=f"Learnt skin, {learnt_skin.name}",
         quantity="touch",
         unit="",
         diverging=False,
         extent=(x_min, x_max, y_min, y_max),
-        outline=outline,
+        outline=outline_curves,
         electrodes=electrodes,
         names=_numbers_from_one(len(electrodes)),
-        channels=_numbers_from_one(len(skin.channels.used)),
-        notes=(*notes, "A ring holds the place with a probability of 68 %.", *skin.notes),
+        channels=_numbers_from_one(len(learnt_skin.channels.used)),
+        notes=(*scene_notes, "A ring holds the place with a probability of 68 %.", *learnt_skin.notes),
     )

@@ -49,19 +49,19 @@ class GeneratorState:
     def points(self) -> np.ndarray:
         """All nodes (n, 2): the nodes of the first curve, of the second curve and so on, then fixed nodes, then free
         nodes."""
-        on_curves = [
+        points_on_curves = [
             curve.points_at(arc_lengths) for curve, arc_lengths in zip(self.curves, self.node_arc_lengths, strict=True)
         ]
-        return np.concatenate([*on_curves, self.fixed_nodes, self.free_nodes])
+        return np.concatenate([*points_on_curves, self.fixed_nodes, self.free_nodes])
 
     def segments(self) -> np.ndarray:
         """Outline segments as pairs of nodes (s, 2), in the order of their first nodes."""
-        segments, offset = [], 0
+        segment_arrays, first_node = [], 0
         for arc_lengths in self.node_arc_lengths:
-            node_indices = np.arange(offset, offset + len(arc_lengths))
-            segments.append(np.stack([node_indices, np.roll(node_indices, -1)], axis=1))
-            offset += len(arc_lengths)
-        return np.concatenate(segments)
+            node_indices = np.arange(first_node, first_node + len(arc_lengths))
+            segment_arrays.append(np.stack([node_indices, np.roll(node_indices, -1)], axis=1))
+            first_node += len(arc_lengths)
+        return np.concatenate(segment_arrays)
 
     def is_sharp_corner(self) -> np.ndarray:
         """Whether each node on the outline is a sharp corner (num_outline,)."""
@@ -77,10 +77,10 @@ class GeneratorState:
         offset = 0
         for k, arc_lengths in enumerate(self.node_arc_lengths):
             segments_of_curve = segments[(segments >= offset) & (segments < offset + len(arc_lengths))] - offset
-            length = self.curves[k].length
-            next_stops = np.append(arc_lengths[1:], arc_lengths[0] + length)
+            curve_length = self.curves[k].length
+            next_stops = np.append(arc_lengths[1:], arc_lengths[0] + curve_length)
             self.node_arc_lengths[k] = np.sort(
-                np.concatenate([arc_lengths, (0.5 * (arc_lengths + next_stops))[segments_of_curve] % length])
+                np.concatenate([arc_lengths, (0.5 * (arc_lengths + next_stops))[segments_of_curve] % curve_length])
             )
             offset += len(arc_lengths)
 
@@ -91,8 +91,8 @@ def triangulate(state: GeneratorState, points: np.ndarray) -> np.ndarray:
     # With distant auxiliary nodes, the outline is not part of the convex hull, where collinear nodes would produce
     # slivers.
     largest_side = np.ptp(outline, axis=0).max()
-    angle = 2 * np.pi * (np.arange(16) + 0.37) / 16
-    auxiliary_nodes = outline.mean(axis=0) + 4 * largest_side * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    angles = 2 * np.pi * (np.arange(16) + 0.37) / 16
+    auxiliary_nodes = outline.mean(axis=0) + 4 * largest_side * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     cells = Delaunay(np.concatenate([points, auxiliary_nodes])).simplices
     cells = cells[(cells < len(points)).all(axis=1)]
     # A cell with a node in the interior lies inside; only cells whose nodes are all on the outline need a test.
@@ -112,43 +112,43 @@ def cross_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def doubled_areas(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Twice the signed area (m,) of the triangles."""
-    corners = points[cells]
-    return cross_product(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cell_corners = points[cells]
+    return cross_product(cell_corners[:, 1] - cell_corners[:, 0], cell_corners[:, 2] - cell_corners[:, 0])
 
 
 def circumcircles(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Centres (m, 2) and radii (m,) of the circumscribed circles."""
     a = points[cells[:, 0]]
     b, c = points[cells[:, 1]] - a, points[cells[:, 2]] - a
-    area = 2 * cross_product(b, c)
-    area = np.where(np.abs(area) < 1e-300, 1e-300, area)
+    scaled_areas = 2 * cross_product(b, c)
+    scaled_areas = np.where(np.abs(scaled_areas) < 1e-300, 1e-300, scaled_areas)
     bb, cc = (b**2).sum(1), (c**2).sum(1)
-    centre = np.stack([c[:, 1] * bb - b[:, 1] * cc, b[:, 0] * cc - c[:, 0] * bb], axis=1) / area[:, None]
-    return a + centre, np.linalg.norm(centre, axis=1)
+    centres = np.stack([c[:, 1] * bb - b[:, 1] * cc, b[:, 0] * cc - c[:, 0] * bb], axis=1) / scaled_areas[:, None]
+    return a + centres, np.linalg.norm(centres, axis=1)
 
 
 def smallest_angles(corners: np.ndarray) -> np.ndarray:
     """Smallest angle (…) of triangles (…, 3, 2), in degrees; negative for clockwise triangles."""
-    edges = np.roll(corners, -1, axis=-2) - corners
-    length = np.sort(np.sqrt((edges**2).sum(-1)), axis=-1)
-    area = cross_product(edges[..., 0, :], edges[..., 1, :])
+    edge_vectors = np.roll(corners, -1, axis=-2) - corners
+    sorted_lengths = np.sort(np.sqrt((edge_vectors**2).sum(-1)), axis=-1)
+    doubled_area = cross_product(edge_vectors[..., 0, :], edge_vectors[..., 1, :])
     # Sine of the angle opposite to the shortest side, which is below 90°, so that its arcsine is the angle.
-    sine = area / np.maximum(length[..., 1] * length[..., 2], 1e-300)
-    return np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0)))
+    sine_of_smallest = doubled_area / np.maximum(sorted_lengths[..., 1] * sorted_lengths[..., 2], 1e-300)
+    return np.degrees(np.arcsin(np.clip(sine_of_smallest, -1.0, 1.0)))
 
 
 def select_spaced_points(points: np.ndarray, radius: np.ndarray, priority: np.ndarray) -> np.ndarray:
     """Select points greedily in order of decreasing `priority`, skipping points within `radius` of a selected point.
     Returns the indices of the selected points."""
     priority_order = np.argsort(-priority, kind="stable")
-    neighbours = KDTree(points[priority_order]).query_ball_point(
+    neighbour_lists = KDTree(points[priority_order]).query_ball_point(
         points[priority_order], radius[priority_order], return_sorted=False
     )
     is_selected = np.zeros(len(points), bool)
     is_blocked = np.zeros(len(points), bool)
-    for rank, neighbour_indices in enumerate(neighbours):
-        if not is_blocked[rank]:
-            is_selected[rank] = True
+    for priority_rank, neighbour_indices in enumerate(neighbour_lists):
+        if not is_blocked[priority_rank]:
+            is_selected[priority_rank] = True
             is_blocked[neighbour_indices] = True
     return priority_order[is_selected]
 
@@ -159,14 +159,14 @@ def is_away_from_outline(state: GeneratorState, nodes: np.ndarray, points: np.nd
     if not len(points):
         return np.zeros(0, bool)
     segments = state.segments()
-    start, end = nodes[segments[:, 0]], nodes[segments[:, 1]]
-    tree = KDTree(0.5 * (start + end))
-    _, nearest_segments = tree.query(points, k=min(3, len(segments)))
+    start_points, end_points = nodes[segments[:, 0]], nodes[segments[:, 1]]
+    midpoint_tree = KDTree(0.5 * (start_points + end_points))
+    _, nearest_segments = midpoint_tree.query(points, k=min(3, len(segments)))
     distances = np.full(len(points), np.inf)
-    for column in nearest_segments.reshape(len(points), -1).T:
-        direction, offset = end[column] - start[column], points - start[column]
-        fraction = np.clip((offset * direction).sum(1) / (direction**2).sum(1), 0.0, 1.0)
-        distances = np.minimum(distances, np.linalg.norm(offset - fraction[:, None] * direction, axis=1))
+    for nearest in nearest_segments.reshape(len(points), -1).T:
+        directions, offsets = end_points[nearest] - start_points[nearest], points - start_points[nearest]
+        fractions = np.clip((offsets * directions).sum(1) / (directions**2).sum(1), 0.0, 1.0)
+        distances = np.minimum(distances, np.linalg.norm(offsets - fractions[:, None] * directions, axis=1))
     is_away = distances > gap
     is_away[is_away] = is_inside_curves(state.curves, points[is_away])
     return is_away
@@ -179,9 +179,9 @@ _MIN_ANGLE_OF_REPAIR = 25.5
 _IMPROVEMENT_ANGLE = 31.0
 _MAX_REPAIR_ROUNDS = 120
 
-_STEP_ANGLES = 2 * np.pi * np.arange(8) / 8
-_STEP_DIRECTIONS = np.stack([np.cos(_STEP_ANGLES), np.sin(_STEP_ANGLES)], axis=1)
-_TRIAL_DISPLACEMENTS = np.concatenate([length * _STEP_DIRECTIONS for length in (0.02, 0.06, 0.15, 0.3)])
+_TRIAL_ANGLES = 2 * np.pi * np.arange(8) / 8
+_TRIAL_DIRECTIONS = np.stack([np.cos(_TRIAL_ANGLES), np.sin(_TRIAL_ANGLES)], axis=1)
+_TRIAL_DISPLACEMENTS = np.concatenate([length * _TRIAL_DIRECTIONS for length in (0.02, 0.06, 0.15, 0.3)])
 
 
 def is_improvable(state: GeneratorState, cells: np.ndarray) -> np.ndarray:
@@ -209,36 +209,36 @@ def improve_worst_cells(state: GeneratorState, num_passes: int = 4) -> None:
     for _ in range(num_passes):
         points = state.points()
         cells = triangulate(state, points)
-        angle = smallest_angles(points[cells])
-        bad_cells = np.flatnonzero((angle < _IMPROVEMENT_ANGLE) & is_improvable(state, cells))
+        cell_angles = smallest_angles(points[cells])
+        bad_cells = np.flatnonzero((cell_angles < _IMPROVEMENT_ANGLE) & is_improvable(state, cells))
         movable_nodes = np.unique(cells[bad_cells])
         movable_nodes = movable_nodes[movable_nodes >= num_immovable_nodes]
         if not movable_nodes.size:
             return
         sort_order = np.argsort(cells.ravel(), kind="stable")
-        bounds = np.searchsorted(cells.ravel()[sort_order], np.arange(len(points) + 1))
+        star_bounds = np.searchsorted(cells.ravel()[sort_order], np.arange(len(points) + 1))
         has_moved = False
-        for node in movable_nodes.tolist():
-            star_corners = sort_order[bounds[node] : bounds[node + 1]]
-            corner = star_corners % 3
+        for moved_node in movable_nodes.tolist():
+            star_corners = sort_order[star_bounds[moved_node] : star_bounds[moved_node + 1]]
+            corner_of_star = star_corners % 3
             star_cells = cells[star_corners // 3]
-            second_corners = points[star_cells[np.arange(len(star_corners)), (corner + 1) % 3]]
-            third_corners = points[star_cells[np.arange(len(star_corners)), (corner + 2) % 3]]
-            mean_length = np.linalg.norm(second_corners - points[node], axis=1).mean()
-            trial_points = points[node] + np.concatenate([np.zeros((1, 2)), mean_length * _TRIAL_DISPLACEMENTS])
-            shape = (len(trial_points), len(star_corners), 2)
-            corners = np.stack(
+            second_corners = points[star_cells[np.arange(len(star_corners)), (corner_of_star + 1) % 3]]
+            third_corners = points[star_cells[np.arange(len(star_corners)), (corner_of_star + 2) % 3]]
+            mean_length = np.linalg.norm(second_corners - points[moved_node], axis=1).mean()
+            trial_points = points[moved_node] + np.concatenate([np.zeros((1, 2)), mean_length * _TRIAL_DISPLACEMENTS])
+            corner_shape = (len(trial_points), len(star_corners), 2)
+            trial_corners = np.stack(
                 [
-                    np.broadcast_to(trial_points[:, None], shape),
-                    np.broadcast_to(second_corners, shape),
-                    np.broadcast_to(third_corners, shape),
+                    np.broadcast_to(trial_points[:, None], corner_shape),
+                    np.broadcast_to(second_corners, corner_shape),
+                    np.broadcast_to(third_corners, corner_shape),
                 ],
                 axis=2,
             )
-            min_angles = smallest_angles(corners).min(axis=1)
+            min_angles = smallest_angles(trial_corners).min(axis=1)
             best_index = int(np.argmax(min_angles))
             if min_angles[best_index] > min_angles[0] + 1e-3:
-                points[node] = trial_points[best_index]
+                points[moved_node] = trial_points[best_index]
                 has_moved = True
         state.free_nodes = points[num_immovable_nodes:]
         if not has_moved:
@@ -258,35 +258,35 @@ def repair(state: GeneratorState) -> bool:
         cells = triangulate(state, points)
         missing_indices = missing_segments(state, cells, len(points))
         if missing_indices.size:
-            _recover(state, points, missing_indices, removes_nodes=round_number < 10)
+            _fix_edges(state, points, missing_indices, removes_nodes=round_number < 10)
             continue
-        angle = smallest_angles(points[cells])
-        bad_cells = np.flatnonzero((angle < _MIN_ANGLE_OF_REPAIR) & is_improvable(state, cells))
+        min_angles = smallest_angles(points[cells])
+        bad_cells = np.flatnonzero((min_angles < _MIN_ANGLE_OF_REPAIR) & is_improvable(state, cells))
         if not bad_cells.size:
             return True
-        _insert_circumcentres(state, points, cells[bad_cells], angle[bad_cells])
+        _insert_circumcentres(state, points, cells[bad_cells], min_angles[bad_cells])
         if round_number % 3 == 2:
             improve_worst_cells(state, num_passes=2)
     return False
 
 
-def _diametral_circles(state: GeneratorState, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    end_points = points[state.segments()]
+def _diametral_circles(generator_state: GeneratorState, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    end_points = points[generator_state.segments()]
     return end_points.mean(axis=1), 0.5 * np.linalg.norm(end_points[:, 1] - end_points[:, 0], axis=1)
 
 
-def _is_divisible(state: GeneratorState) -> np.ndarray:
+def _is_divisible(generator_state: GeneratorState) -> np.ndarray:
     """Whether each outline segment may be divided: neither of its ends is a sharp corner."""
-    return np.logical_not(state.is_sharp_corner()[state.segments()].any(axis=1))
+    return np.logical_not(generator_state.is_sharp_corner()[generator_state.segments()].any(axis=1))
 
 
-def _recover(state: GeneratorState, points: np.ndarray, missing_indices: np.ndarray, *, removes_nodes: bool) -> None:
+def _fix_edges(state: GeneratorState, points: np.ndarray, missing_indices: np.ndarray, *, removes_nodes: bool) -> None:
     """Make missing outline segments appear as edges of cells: remove the free nodes close to them or, if there are
     none, halve the segments."""
     centres, radii = _diametral_circles(state, points)
     if removes_nodes and len(state.free_nodes):
-        neighbours = KDTree(state.free_nodes).query_ball_point(centres[missing_indices], radii[missing_indices])
-        removed_nodes = np.unique(np.concatenate([np.asarray(indices, dtype=int) for indices in neighbours]))
+        close_nodes = KDTree(state.free_nodes).query_ball_point(centres[missing_indices], radii[missing_indices])
+        removed_nodes = np.unique(np.concatenate([np.asarray(indices, dtype=int) for indices in close_nodes]))
         if removed_nodes.size:
             state.free_nodes = np.delete(state.free_nodes, removed_nodes, axis=0)
             return
@@ -294,23 +294,23 @@ def _recover(state: GeneratorState, points: np.ndarray, missing_indices: np.ndar
     state.divide(missing_indices[is_divisible])
 
 
-def _insert_circumcentres(state: GeneratorState, points: np.ndarray, bad_cells: np.ndarray, angle: np.ndarray) -> None:
-    centre, radius = circumcircles(points, bad_cells)
-    selected = select_spaced_points(centre, radius, -angle)
-    centre = centre[selected]
-    centres, radii = _diametral_circles(state, points)
+def _insert_circumcentres(state: GeneratorState, points: np.ndarray, bad_cells: np.ndarray, angles: np.ndarray) -> None:
+    centres, radii = circumcircles(points, bad_cells)
+    spaced_indices = select_spaced_points(centres, radii, -angles)
+    centres = centres[spaced_indices]
+    segment_middles, segment_radii = _diametral_circles(state, points)
     is_divisible = _is_divisible(state)
     # A segment is encroached upon if a new node lies in the circle whose diameter is the segment.
-    neighbours = KDTree(centre).query_ball_point(centres, radii * (1 - 1e-9))
-    is_encroached = np.array([len(indices) > 0 for indices in neighbours])
-    is_affected = np.zeros(len(centre), bool)
+    encroaching_centres = KDTree(centres).query_ball_point(segment_middles, segment_radii * (1 - 1e-9))
+    is_encroached = np.array([len(centre_indices) > 0 for centre_indices in encroaching_centres])
+    is_affected = np.zeros(len(centres), bool)
     for cell_index in np.flatnonzero(is_encroached):
-        is_affected[neighbours[cell_index]] = True
-    is_outside = ~is_inside_curves(state.curves, centre)
+        is_affected[encroaching_centres[cell_index]] = True
+    is_outside = ~is_inside_curves(state.curves, centres)
     outside_centres = np.flatnonzero(is_outside & ~is_affected)
     if outside_centres.size:
-        is_encroached[KDTree(centres).query(centre[outside_centres])[1]] = True
-    accepted = centre[~is_affected & ~is_outside]
+        is_encroached[KDTree(segment_middles).query(centres[outside_centres])[1]] = True
+    accepted = centres[~is_affected & ~is_outside]
     if len(accepted):
         accepted = accepted[is_away_from_outline(state, points, accepted, np.zeros(len(accepted)))]
     halved_segments = np.flatnonzero(is_encroached & is_divisible)
@@ -335,8 +335,8 @@ def outline_nodes(
         stop_lengths = np.unique(np.concatenate([curve.corners, required_stops % curve.length]))
         sharp_corners = np.flatnonzero(curve.angles < _MAX_SHARP_CORNER_ANGLE)
         added_stops = []
-        for corner in sharp_corners:
-            corner_length = curve.corners[corner]
+        for sharp_corner in sharp_corners:
+            corner_length = curve.corners[sharp_corner]
             gap_to_next = np.min((stop_lengths - corner_length - 1e-12 * curve.length) % curve.length)
             gap_to_previous = np.min((corner_length - stop_lengths - 1e-12 * curve.length) % curve.length)
             cut_length = min(
@@ -355,10 +355,10 @@ def insert_nodes(state: GeneratorState, size: SizeFunction) -> None:
     for _ in range(200):
         points = state.points()
         cells = triangulate(state, points)
-        centre, radius = circumcircles(points, cells)
+        centre, radii = circumcircles(points, cells)
         sizes = size(centre)
-        is_large = radius > _MAX_CIRCUMRADIUS_RATIO * sizes
-        centre, ratio, sizes = centre[is_large], (radius / sizes)[is_large], sizes[is_large]
+        is_large = radii > _MAX_CIRCUMRADIUS_RATIO * sizes
+        centre, ratio, sizes = centre[is_large], (radii / sizes)[is_large], sizes[is_large]
         is_away = is_away_from_outline(state, points, centre, 0.5 * sizes)
         if not is_away.any():
             return
@@ -374,14 +374,14 @@ def smooth_nodes(state: GeneratorState, size: SizeFunction, steps: int = _SMOOTH
     for _ in range(steps):
         points = state.points()
         cells = triangulate(state, points)
-        corners = points[cells]
-        centroids = corners.mean(axis=1)
-        offset = circumcircles(points, cells)[0] - centroids
+        cell_corners = points[cells]
+        centroids = cell_corners.mean(axis=1)
+        shifts = circumcircles(points, cells)[0] - centroids
         # The circumcentre of an obtuse cell lies far outside it and would displace nodes too far.
-        radii = np.linalg.norm(corners - centroids[:, None], axis=2).max(axis=1)
-        offset *= np.minimum(1.0, radii / np.maximum(np.linalg.norm(offset, axis=1), 1e-300))[:, None]
-        weight = doubled_areas(points, cells) / size(centroids) ** 3
-        weighted_centres = weight[:, None] * np.concatenate([centroids + offset, np.ones((len(cells), 1))], axis=1)
+        radii = np.linalg.norm(cell_corners - centroids[:, None], axis=2).max(axis=1)
+        shifts *= np.minimum(1.0, radii / np.maximum(np.linalg.norm(shifts, axis=1), 1e-300))[:, None]
+        weights = doubled_areas(points, cells) / size(centroids) ** 3
+        weighted_centres = weights[:, None] * np.concatenate([centroids + shifts, np.ones((len(cells), 1))], axis=1)
         node_sums = np.stack(
             [
                 np.bincount(cells.ravel(), np.repeat(weight_column, 3), minlength=len(points))
@@ -390,11 +390,11 @@ def smooth_nodes(state: GeneratorState, size: SizeFunction, steps: int = _SMOOTH
             axis=1,
         )[num_immovable_nodes:]
         has_cells = node_sums[:, 2] > 0
-        target = np.where(
+        target_points = np.where(
             has_cells[:, None], node_sums[:, :2] / np.where(has_cells, node_sums[:, 2], 1.0)[:, None], state.free_nodes
         )
-        is_away = is_away_from_outline(state, points, target, 0.45 * size(target))
-        state.free_nodes = np.where(is_away[:, None], target, state.free_nodes)
+        is_away = is_away_from_outline(state, points, target_points, 0.45 * size(target_points))
+        state.free_nodes = np.where(is_away[:, None], target_points, state.free_nodes)
 
 
 def generate(
@@ -422,8 +422,8 @@ def generate(
         improve_worst_cells(state, num_passes=1)
         points = state.points()
         cells = triangulate(state, points)
-        angle = smallest_angles(points[cells])
-        if is_repaired and angle[is_improvable(state, cells)].min(initial=90.0) >= GUARANTEED_MIN_ANGLE:
+        min_angles = smallest_angles(points[cells])
+        if is_repaired and min_angles[is_improvable(state, cells)].min(initial=90.0) >= GUARANTEED_MIN_ANGLE:
             return order_nodes(points, cells)
         state = None
     raise ValueError(
@@ -439,11 +439,11 @@ def order_nodes(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.n
     new_index = np.full(len(points), -1)
     new_index[used_nodes] = np.arange(len(used_nodes))
     points, cells = points[used_nodes], new_index[cells]
-    edges = np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]])
-    graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(points),) * 2)
-    node_order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
+    cell_edges = np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]])
+    node_graph = coo_array((np.ones(len(cell_edges)), (cell_edges[:, 0], cell_edges[:, 1])), shape=(len(points),) * 2)
+    node_order = reverse_cuthill_mckee((node_graph + node_graph.T).tocsr(), symmetric_mode=True)
     node_order = np.concatenate([[0], node_order[node_order != 0]])
-    rank = np.empty(len(points), dtype=np.int64)
-    rank[node_order] = np.arange(len(points))
-    cells = rank[cells]
+    node_ranks = np.empty(len(points), dtype=np.int64)
+    node_ranks[node_order] = np.arange(len(points))
+    cells = node_ranks[cells]
     return points[node_order], cells[np.argsort(cells.min(axis=1), kind="stable")]

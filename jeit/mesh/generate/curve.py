@@ -35,8 +35,8 @@ def circle(radius: float, centre: np.ndarray) -> Curve:
     """A circle; arc length runs counter-clockwise from angle 0."""
 
     def points_at(arc_length: np.ndarray) -> np.ndarray:
-        angle = np.asarray(arc_length) / radius
-        return centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        polar_angle = np.asarray(arc_length) / radius
+        return centre + radius * np.stack([np.cos(polar_angle), np.sin(polar_angle)], axis=-1)
 
     def from_centre(points: np.ndarray) -> np.ndarray:
         return np.linalg.norm(points - centre, axis=1)
@@ -68,36 +68,38 @@ def closed_line(vertices: np.ndarray) -> Curve:
     arc_lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed_vertices, axis=0), axis=1))])
 
     def points_at(arc_length: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(arc_length, arc_lengths, closed_vertices[:, axis]) for axis in range(2)], axis=-1)
+        return np.stack(
+            [np.interp(arc_length, arc_lengths, closed_vertices[:, axis_number]) for axis_number in range(2)], axis=-1
+        )
 
-    def distance(points: np.ndarray) -> np.ndarray:
-        result = np.full(len(points), np.inf)
-        for start, end in pairwise(closed_vertices):
-            result = np.minimum(result, topology.distance(points, start[None], end[None])[:, 0])
-        return result
+    def distances_to_sides(points: np.ndarray) -> np.ndarray:
+        min_distances = np.full(len(points), np.inf)
+        for side_start, side_end in pairwise(closed_vertices):
+            min_distances = np.minimum(min_distances, topology.distance(points, side_start[None], side_end[None])[:, 0])
+        return min_distances
 
-    forward = np.roll(vertices, -1, axis=0) - vertices
+    side_vectors = np.roll(vertices, -1, axis=0) - vertices
     previous_sides = np.roll(vertices, 1, axis=0) - vertices
-    angles = np.arctan2(
-        forward[:, 0] * previous_sides[:, 1] - forward[:, 1] * previous_sides[:, 0],
-        (forward * previous_sides).sum(axis=1),
+    turning_angles = np.arctan2(
+        side_vectors[:, 0] * previous_sides[:, 1] - side_vectors[:, 1] * previous_sides[:, 0],
+        (side_vectors * previous_sides).sum(axis=1),
     )
     return Curve(
         length=float(arc_lengths[-1]),
         points_at=points_at,
         contains=lambda points: topology.is_inside_loops(points, [vertices]),
-        distance=distance,
+        distance=distances_to_sides,
         corners=arc_lengths[:-1],
-        angles=np.mod(angles, 2 * np.pi),
+        angles=np.mod(turning_angles, 2 * np.pi),
     )
 
 
 def is_inside_curves(curves: list[Curve], points: np.ndarray) -> np.ndarray:
     """Whether points lie inside the first curve and outside all other curves, which are holes."""
-    result = np.zeros(len(points), bool)
+    is_inside = np.zeros(len(points), bool)
     for curve in curves:
-        result ^= curve.contains(points)
-    return result
+        is_inside ^= curve.contains(points)
+    return is_inside
 
 
 def divide(curve: Curve, arc_lengths: np.ndarray, size: SizeFunction) -> np.ndarray:
@@ -106,28 +108,28 @@ def divide(curve: Curve, arc_lengths: np.ndarray, size: SizeFunction) -> np.ndar
     arc_lengths = np.unique(arc_lengths)
     if not len(arc_lengths):
         arc_lengths = np.zeros(1)
-    samples = np.append(arc_lengths, arc_lengths[0] + curve.length)
+    sampled_lengths = np.append(arc_lengths, arc_lengths[0] + curve.length)
     while True:
-        midpoints, widths = 0.5 * (samples[1:] + samples[:-1]), np.diff(samples)
-        is_long = widths > 0.5 * size(curve.points_at(midpoints % curve.length))
+        sample_midpoints, sample_widths = 0.5 * (sampled_lengths[1:] + sampled_lengths[:-1]), np.diff(sampled_lengths)
+        is_long = sample_widths > 0.5 * size(curve.points_at(sample_midpoints % curve.length))
         if not is_long.any():
             break
-        samples = np.sort(np.concatenate([samples, midpoints[is_long]]))
-    density = 1.0 / size(curve.points_at(0.5 * (samples[1:] + samples[:-1]) % curve.length))
-    cumulative_count = np.concatenate([[0.0], np.cumsum(np.diff(samples) * density)])
+        sampled_lengths = np.sort(np.concatenate([sampled_lengths, sample_midpoints[is_long]]))
+    node_density = 1.0 / size(curve.points_at(0.5 * (sampled_lengths[1:] + sampled_lengths[:-1]) % curve.length))
+    cumulative_count = np.concatenate([[0.0], np.cumsum(np.diff(sampled_lengths) * node_density)])
     cumulative_counts_at_stops = np.interp(
-        np.append(arc_lengths, arc_lengths[0] + curve.length), samples, cumulative_count
+        np.append(arc_lengths, arc_lengths[0] + curve.length), sampled_lengths, cumulative_count
     )
     min_pieces = max(1, -(-3 // len(arc_lengths)))
     node_lengths = []
-    for start, start_count, count_at_end in zip(
+    for stop_length, count_at_start, count_at_end in zip(
         arc_lengths, cumulative_counts_at_stops[:-1], cumulative_counts_at_stops[1:], strict=True
     ):
-        num_pieces = max(min_pieces, round(count_at_end - start_count))
+        num_pieces = max(min_pieces, round(count_at_end - count_at_start))
         stops_between_ends = np.interp(
-            start_count + (count_at_end - start_count) * np.arange(1, num_pieces) / num_pieces,
+            count_at_start + (count_at_end - count_at_start) * np.arange(1, num_pieces) / num_pieces,
             cumulative_count,
-            samples,
+            sampled_lengths,
         )
-        node_lengths.append(np.append(start, stops_between_ends))
+        node_lengths.append(np.append(stop_length, stops_between_ends))
     return np.sort(np.concatenate(node_lengths) % curve.length)

@@ -143,17 +143,17 @@ class SizeField:
 
         Raises `ValueError` if `refine` contains anything but `Refine` objects.
         """
-        self._terms: list[tuple[Callable[[np.ndarray], np.ndarray], Refine]] = []
+        self._refinement_terms: list[tuple[Callable[[np.ndarray], np.ndarray], Refine]] = []
         self._user_size: SizeFunction | None = None
         if callable(refine):
             self._user_size = limit_growth(curves, refine)
         elif refine is not None:
-            for term in (refine,) if isinstance(refine, Refine) else tuple(refine):
-                if not isinstance(term, Refine):
+            for refinement_term in (refine,) if isinstance(refine, Refine) else tuple(refine):
+                if not isinstance(refinement_term, Refine):
                     raise ValueError(
-                        f"refine: expected a Refine, several of them, or a function of points, got {term!r}."
+                        f"refine: expected a Refine, several of them, or a function of points, got {refinement_term!r}."
                     )
-                self._terms.append((_distance_function(curves, term.points), term))
+                self._refinement_terms.append((_distance_function(curves, refinement_term.points), refinement_term))
         self._required_size = _size_at_close_nodes(required_nodes, spacing)
         self._min_spacing = float(spacing.min()) if len(spacing) else np.inf
 
@@ -167,48 +167,60 @@ class SizeField:
         If `refine` is a user's size function, the argument is instead the factor by which its sizes are multiplied."""
         if self._user_size is not None:
             user_sizes, required_sizes = self._user_size(points), self._required_size(points)
-            return lambda factor: np.minimum(factor * user_sizes, required_sizes)
-        distances = [np.maximum(distance(points) - term.distance, 0.0) for distance, term in self._terms]
+            return lambda size_factor: np.minimum(size_factor * user_sizes, required_sizes)
+        distances_to_targets = [
+            np.maximum(distance_function(points) - refinement_term.distance, 0.0)
+            for distance_function, refinement_term in self._refinement_terms
+        ]
 
-        def size(background: float) -> np.ndarray:
-            result = np.full(len(points), background)
-            for distance_beyond, (_, term) in zip(distances, self._terms, strict=True):
-                result = np.minimum(result, term.smallest(background) + term.growth * distance_beyond)
+        def size_for_background(background_size: float) -> np.ndarray:
+            edge_lengths = np.full(len(points), background_size)
+            for distance_beyond_target, (_, refinement_term) in zip(
+                distances_to_targets, self._refinement_terms, strict=True
+            ):
+                edge_lengths = np.minimum(
+                    edge_lengths,
+                    refinement_term.smallest(background_size) + refinement_term.growth * distance_beyond_target,
+                )
             # Required nodes that are farther apart than the background cell size need no refinement.
-            return result if background <= self._min_spacing else np.minimum(result, self._required_size(points))
+            return (
+                edge_lengths
+                if background_size <= self._min_spacing
+                else np.minimum(edge_lengths, self._required_size(points))
+            )
 
-        return size
+        return size_for_background
 
 
 def _distance_function(curves: list[Curve], points: np.ndarray | None) -> Callable[[np.ndarray], np.ndarray]:
     if points is None:
-        return lambda positions: np.min([curve.distance(positions) for curve in curves], axis=0)
-    tree = KDTree(points)
-    return lambda positions: tree.query(positions)[0]
+        return lambda query_positions: np.min([curve.distance(query_positions) for curve in curves], axis=0)
+    point_tree = KDTree(points)
+    return lambda query_positions: point_tree.query(query_positions)[0]
 
 
-def _size_at_close_nodes(required_nodes: np.ndarray, spacing: np.ndarray) -> SizeFunction:
-    """Size function that limits the edge length at each required node to its `spacing` and lets it grow away from the
-    node."""
+def _size_at_close_nodes(required_nodes: np.ndarray, node_spacing: np.ndarray) -> SizeFunction:
+    """Size function that limits the edge length at each required node to its `node_spacing` and lets it grow away from
+    the node."""
     if not len(required_nodes):
         return lambda points: np.full(len(points), np.inf)
-    tree = KDTree(required_nodes)
+    node_tree = KDTree(required_nodes)
     num_neighbours = min(8, len(required_nodes))
     if num_neighbours > 1:
         # Propagate the spacing of distant nodes, so that the nearest few nodes suffice to evaluate the size.
         for _ in range(4):
-            distances, neighbours = tree.query(required_nodes, k=num_neighbours)
-            spacing = np.min(spacing[neighbours] + _MAX_EDGE_LENGTH_GROWTH * distances, axis=1)
+            node_distances, neighbour_nodes = node_tree.query(required_nodes, k=num_neighbours)
+            node_spacing = np.min(node_spacing[neighbour_nodes] + _MAX_EDGE_LENGTH_GROWTH * node_distances, axis=1)
 
-    def size(points: np.ndarray) -> np.ndarray:
-        distances, neighbours = tree.query(points, k=num_neighbours)
-        distances, neighbours = (
-            distances.reshape(len(points), num_neighbours),
-            neighbours.reshape(len(points), num_neighbours),
+    def size_at_points(points: np.ndarray) -> np.ndarray:
+        node_distances, neighbour_nodes = node_tree.query(points, k=num_neighbours)
+        node_distances, neighbour_nodes = (
+            node_distances.reshape(len(points), num_neighbours),
+            neighbour_nodes.reshape(len(points), num_neighbours),
         )
-        return np.min(spacing[neighbours] + _MAX_EDGE_LENGTH_GROWTH * distances, axis=1)
+        return np.min(node_spacing[neighbour_nodes] + _MAX_EDGE_LENGTH_GROWTH * node_distances, axis=1)
 
-    return size
+    return size_at_points
 
 
 def limit_growth(curves: list[Curve], function: Callable[[np.ndarray], Any], resolution: int = 128) -> SizeFunction:
@@ -218,47 +230,55 @@ def limit_growth(curves: list[Curve], function: Callable[[np.ndarray], Any], res
     The minimum is computed on a grid by Dijkstra's algorithm; where f(x) itself is smaller than the minimum on the
     grid, f(x) is used. Raises `ValueError` if the function does not return one positive, finite size per point.
     """
-    outline = curves[0].points_at(np.linspace(0, curves[0].length, 721))
-    lower, upper = outline.min(axis=0), outline.max(axis=0)
-    step = float((upper - lower).max()) / resolution
-    axes = [np.arange(lower[k] - step, upper[k] + 2 * step, step) for k in (0, 1)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    shape, grid_points = grid.shape[:2], grid.reshape(-1, 2)
-    inside_nodes = np.flatnonzero(is_inside_curves(curves, grid_points))
-    values = np.asarray(function(grid_points[inside_nodes]), dtype=float)
-    if values.shape != (len(inside_nodes),):
+    outline_points = curves[0].points_at(np.linspace(0, curves[0].length, 721))
+    lower_corner_of_grid, upper_corner_of_grid = outline_points.min(axis=0), outline_points.max(axis=0)
+    grid_step = float((upper_corner_of_grid - lower_corner_of_grid).max()) / resolution
+    grid_axes = [
+        np.arange(lower_corner_of_grid[k] - grid_step, upper_corner_of_grid[k] + 2 * grid_step, grid_step)
+        for k in (0, 1)
+    ]
+    grid_array = np.stack(np.meshgrid(*grid_axes, indexing="ij"), axis=-1)
+    grid_shape, grid_points = grid_array.shape[:2], grid_array.reshape(-1, 2)
+    inside_grid_nodes = np.flatnonzero(is_inside_curves(curves, grid_points))
+    user_sizes_inside = np.asarray(function(grid_points[inside_grid_nodes]), dtype=float)
+    if user_sizes_inside.shape != (len(inside_grid_nodes),):
         raise ValueError(
-            f"refine: the size function must return one size per point: for points of shape ({len(inside_nodes)}, 2) "
-            f"it returned shape {values.shape}."
+            f"refine: the size function must return one size per point: for points of shape ({len(inside_grid_nodes)}, "
+            f"2) it returned shape {user_sizes_inside.shape}."
         )
-    if not (np.isfinite(values).all() and (values > 0).all()):
-        invalid_node = inside_nodes[int(np.flatnonzero(~(np.isfinite(values) & (values > 0)))[0])]
+    if not (np.isfinite(user_sizes_inside).all() and (user_sizes_inside > 0).all()):
+        invalid_node = inside_grid_nodes[
+            int(np.flatnonzero(~(np.isfinite(user_sizes_inside) & (user_sizes_inside > 0)))[0])
+        ]
         raise ValueError(
             f"refine: the size function must be positive and finite inside the domain; "
             f"at {grid_points[invalid_node].tolist()} it is not."
         )
-    node_index = np.arange(len(grid_points)).reshape(shape)
+    grid_node_index = np.arange(len(grid_points)).reshape(grid_shape)
     grid_links = [
-        (node_index[1:], node_index[:-1], step),
-        (node_index[:, 1:], node_index[:, :-1], step),
-        (node_index[1:, 1:], node_index[:-1, :-1], step * np.sqrt(2)),
-        (node_index[1:, :-1], node_index[:-1, 1:], step * np.sqrt(2)),
+        (grid_node_index[1:], grid_node_index[:-1], grid_step),
+        (grid_node_index[:, 1:], grid_node_index[:, :-1], grid_step),
+        (grid_node_index[1:, 1:], grid_node_index[:-1, :-1], grid_step * np.sqrt(2)),
+        (grid_node_index[1:, :-1], grid_node_index[:-1, 1:], grid_step * np.sqrt(2)),
     ]
-    start = np.concatenate([a.ravel() for a, _, _ in grid_links] + [np.full(len(inside_nodes), len(grid_points))])
-    end = np.concatenate([b.ravel() for _, b, _ in grid_links] + [inside_nodes])
-    weight = np.concatenate(
-        [np.full(a.size, _MAX_EDGE_LENGTH_GROWTH * length) for a, _, length in grid_links] + [values]
+    link_starts = np.concatenate(
+        [a.ravel() for a, _, _ in grid_links] + [np.full(len(inside_grid_nodes), len(grid_points))]
     )
-    graph = coo_array((weight, (start, end)), shape=(len(grid_points) + 1,) * 2).tocsr()
-    field = dijkstra(graph, directed=False, indices=len(grid_points))[:-1].reshape(shape)
-    interpolate = scipy.interpolate.RegularGridInterpolator(axes, field)
-    lower_corner, upper_corner = grid[0, 0], grid[-1, -1]
+    link_ends = np.concatenate([b.ravel() for _, b, _ in grid_links] + [inside_grid_nodes])
+    link_weights = np.concatenate(
+        [np.full(a.size, _MAX_EDGE_LENGTH_GROWTH * link_length) for a, _, link_length in grid_links]
+        + [user_sizes_inside]
+    )
+    growth_graph = coo_array((link_weights, (link_starts, link_ends)), shape=(len(grid_points) + 1,) * 2).tocsr()
+    limited_sizes = dijkstra(growth_graph, directed=False, indices=len(grid_points))[:-1].reshape(grid_shape)
+    interpolate_sizes = scipy.interpolate.RegularGridInterpolator(grid_axes, limited_sizes)
+    lower_corner, upper_corner = grid_array[0, 0], grid_array[-1, -1]
 
-    def size(points: np.ndarray) -> np.ndarray:
+    def limited_size_at(points: np.ndarray) -> np.ndarray:
         # Trial nodes may lie outside the domain, where the user's function may be invalid.
         with np.errstate(all="ignore"):
             user_sizes = np.asarray(function(points), dtype=float)
         user_sizes = np.where(np.isfinite(user_sizes) & (user_sizes > 0), user_sizes, np.inf)
-        return np.minimum(user_sizes, interpolate(np.clip(points, lower_corner, upper_corner)))
+        return np.minimum(user_sizes, interpolate_sizes(np.clip(points, lower_corner, upper_corner)))
 
-    return size
+    return limited_size_at

@@ -58,44 +58,50 @@ def triangulate_between_chains(outer_chain: np.ndarray, inner_chain: np.ndarray,
 
 def ring_counts(num_rings: int, num_boundary: int) -> np.ndarray:
     """Number of nodes on each ring, outermost first, for rings of equal thickness with about equal node spacing."""
-    ring = np.arange(num_rings, 0, -1)
-    return np.maximum(np.rint(num_boundary * ring / num_rings).astype(int), 3)
+    ring_numbers = np.arange(num_rings, 0, -1)
+    return np.maximum(np.rint(num_boundary * ring_numbers / num_rings).astype(int), 3)
 
 
 def choose_rings(num_points: int) -> tuple[int, int]:
     """Number of rings and number of boundary nodes such that the disk has close to `num_points` nodes."""
     guessed_rings = np.sqrt(num_points / 3.0)
-    best_choice = None
+    best_choice_and_cost = None
     for num_rings in range(max(1, int(guessed_rings) - 1), int(guessed_rings) + 3):
         for num_boundary in range(max(5, int(4.9 * num_rings)), int(7.3 * num_rings) + 2):
             num_nodes = 1 + int(ring_counts(num_rings, num_boundary).sum())
             # Triangles are most regular with six times as many boundary nodes as rings. The ratio differs from six only
             # as far as the number of nodes requires.
-            deviation = abs(num_nodes / num_points - 1.0)
-            cost = (
-                deviation > 0.03,
-                deviation if deviation > 0.03 else 0.0,
+            relative_deviation = abs(num_nodes / num_points - 1.0)
+            choice_cost = (
+                relative_deviation > 0.03,
+                relative_deviation if relative_deviation > 0.03 else 0.0,
                 abs(num_boundary / num_rings - 6.0),
-                deviation,
+                relative_deviation,
             )
-            if best_choice is None or cost < best_choice[0]:
-                best_choice = (cost, num_rings, num_boundary)
-    assert best_choice is not None
-    return best_choice[1], best_choice[2]
+            if best_choice_and_cost is None or choice_cost < best_choice_and_cost[0]:
+                best_choice_and_cost = (choice_cost, num_rings, num_boundary)
+    assert best_choice_and_cost is not None
+    return best_choice_and_cost[1], best_choice_and_cost[2]
 
 
 def ring_disk(num_rings: int, num_boundary: int) -> tuple[np.ndarray, np.ndarray]:
     """Mesh of the unit disk in concentric rings: points (n, 2), with node 0 at angle 0 on the circle, and cells (m,
     3)."""
-    counts = ring_counts(num_rings, num_boundary)
-    offsets = np.concatenate([[0], np.cumsum(counts)])
-    radius = np.repeat(np.arange(num_rings, 0, -1) / num_rings, counts)
-    angle = np.concatenate([2 * np.pi * np.arange(count) / count for count in counts])
-    points = np.concatenate([radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1), np.zeros((1, 2))])
-    nodes_of_rings = [np.arange(offsets[k], offsets[k + 1]) for k in range(num_rings)]
+    nodes_per_ring = ring_counts(num_rings, num_boundary)
+    ring_offsets = np.concatenate([[0], np.cumsum(nodes_per_ring)])
+    node_radii = np.repeat(np.arange(num_rings, 0, -1) / num_rings, nodes_per_ring)
+    node_angles = np.concatenate(
+        [2 * np.pi * np.arange(nodes_on_ring) / nodes_on_ring for nodes_on_ring in nodes_per_ring]
+    )
+    points = np.concatenate(
+        [node_radii[:, None] * np.stack([np.cos(node_angles), np.sin(node_angles)], 1), np.zeros((1, 2))]
+    )
+    nodes_of_rings = [np.arange(ring_offsets[k], ring_offsets[k + 1]) for k in range(num_rings)]
     cells = [triangulate_between_chains(a, b, is_closed=True) for a, b in pairwise(nodes_of_rings)]
-    innermost = nodes_of_rings[-1]
-    cells.append(np.stack([innermost, np.roll(innermost, -1), np.full(len(innermost), offsets[-1])], axis=1))
+    innermost_ring = nodes_of_rings[-1]
+    cells.append(
+        np.stack([innermost_ring, np.roll(innermost_ring, -1), np.full(len(innermost_ring), ring_offsets[-1])], axis=1)
+    )
     return points, np.concatenate(cells)
 
 
@@ -108,11 +114,11 @@ def choose_rows(width: float, height: float, num_points: int, cell_size: float |
         # A cell with base b and height 0.93 b has the area of an equilateral triangle with edge 1.036 b.
         cell_size = min(cell_size, width, height) / 1.036
         return max(1, round(width / cell_size - 0.5)), max(1, round(height / (_RELATIVE_ROW_HEIGHT * cell_size)))
-    edge = np.sqrt(width * height / (_RELATIVE_ROW_HEIGHT * num_points))
-    guessed_rows = height / (_RELATIVE_ROW_HEIGHT * edge)
+    edge_length = np.sqrt(width * height / (_RELATIVE_ROW_HEIGHT * num_points))
+    guessed_rows = height / (_RELATIVE_ROW_HEIGHT * edge_length)
     # With few nodes, accept a larger deviation from the requested number rather than stretched cells.
     max_deviation = 0.03 if num_points > 200 else 0.1
-    best_choice = None
+    best_choice_and_cost = None
     for num_rows in range(max(1, int(0.6 * guessed_rows)), int(1.5 * guessed_rows) + 3):
         num_wide_rows = (num_rows + 1) // 2
         for num_columns in {
@@ -122,12 +128,12 @@ def choose_rows(width: float, height: float, num_points: int, cell_size: float |
             if num_columns < 1:
                 continue
             num_nodes = (num_rows + 1) * (num_columns + 1) + num_wide_rows
-            deviation = abs(num_nodes / num_points - 1.0)
+            relative_deviation = abs(num_nodes / num_points - 1.0)
             row_stretch = abs(np.log(height / num_rows / (_RELATIVE_ROW_HEIGHT * width / (num_columns + 0.5))))
-            cost = (row_stretch > 0.6, max(0.0, deviation - max_deviation), row_stretch)
-            if best_choice is None or cost < best_choice[0]:
-                best_choice = (cost, num_columns, num_rows)
-    if best_choice is None or best_choice[0][0]:
+            choice_cost = (row_stretch > 0.6, max(0.0, relative_deviation - max_deviation), row_stretch)
+            if best_choice_and_cost is None or choice_cost < best_choice_and_cost[0]:
+                best_choice_and_cost = (choice_cost, num_columns, num_rows)
+    if best_choice_and_cost is None or best_choice_and_cost[0][0]:
         min_points = 2 * max(width / height, height / width) + 3
         raise TooFewNodesError(
             f"num_points: {num_points} nodes in a rectangle of {width:g} by {height:g} m make flat cells. Ask for at "
@@ -136,18 +142,18 @@ def choose_rows(width: float, height: float, num_points: int, cell_size: float |
             f"{{asked}} nodes in a solid on {width:g} by {height:g} m make flat cells. Ask for at least about "
             "{least}.",
         )
-    return best_choice[1], best_choice[2]
+    return best_choice_and_cost[1], best_choice_and_cost[2]
 
 
 def row_rectangle(width: float, height: float, num_columns: int, num_rows: int) -> tuple[np.ndarray, np.ndarray]:
     """Mesh of the rectangle [0, width] × [0, height] in rows of alternately `num_columns` and `num_columns` + 1
     segments: points (n, 2), with node 0 at the lower left corner, and cells (m, 3)."""
-    points, rows, offset = [], [], 0
-    for row in range(num_rows + 1):
-        columns = num_columns + row % 2
-        x = np.linspace(0.0, width, columns + 1)
-        points.append(np.stack([x, np.full_like(x, height * row / num_rows)], axis=1))
-        rows.append(np.arange(offset, offset + columns + 1))
-        offset += columns + 1
-    cells = [triangulate_between_chains(a, b, is_closed=False) for a, b in pairwise(rows)]
+    points, node_rows, first_node = [], [], 0
+    for row_number in range(num_rows + 1):
+        num_row_columns = num_columns + row_number % 2
+        x = np.linspace(0.0, width, num_row_columns + 1)
+        points.append(np.stack([x, np.full_like(x, height * row_number / num_rows)], axis=1))
+        node_rows.append(np.arange(first_node, first_node + num_row_columns + 1))
+        first_node += num_row_columns + 1
+    cells = [triangulate_between_chains(a, b, is_closed=False) for a, b in pairwise(node_rows)]
     return np.concatenate(points), np.concatenate(cells)

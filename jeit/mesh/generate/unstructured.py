@@ -74,13 +74,13 @@ def check_total(num_points: float, name: str) -> None:
 def check_positions(name: str, positions: ArrayLike) -> np.ndarray:
     """Convert `positions` along an outline to an array (k,). Raises `ValueError` for a different shape, no positions,
     NaN or infinity."""
-    array = np.asarray(positions, dtype=float)
-    if array.ndim != 1 or not len(array) or not np.isfinite(array).all():
+    position_array = np.asarray(positions, dtype=float)
+    if position_array.ndim != 1 or not len(position_array) or not np.isfinite(position_array).all():
         raise ValueError(
             f"{name}: expected finite positions along the outline, shape (k,), got {positions!r}. A disk takes angles "
             "in radians, other outlines arc lengths in metres."
         )
-    return array
+    return position_array
 
 
 def mesh_within(
@@ -101,17 +101,21 @@ def mesh_within(
         for curve, required_stops in zip(curves, _required_positions(curves, boundary_points), strict=True)
     ]
     fixed_nodes = _check_interior(interior_points, curves)
-    field = SizeField(curves, refine, *_required_spacing(curves, arc_lengths, fixed_nodes))
-    state = None
+    size_field = SizeField(curves, refine, *_required_spacing(curves, arc_lengths, fixed_nodes))
+    generator_state = None
     if target.cell_size is not None:
-        size = partial(_capped_size_at if field.is_user_function else _size_at, field, target.cell_size)
-        check_total(_estimate_num_nodes(curves, size, area), "cell_size")
-    elif field.is_user_function and not target.is_requested:
-        size = partial(_size_at, field, 1.0)
-        check_total(_estimate_num_nodes(curves, size, area), "refine")
+        size_function = partial(
+            _capped_size_at if size_field.is_user_function else _size_at, size_field, target.cell_size
+        )
+        check_total(_estimate_num_nodes(curves, size_function, area), "cell_size")
+    elif size_field.is_user_function and not target.is_requested:
+        size_function = partial(_size_at, size_field, 1.0)
+        check_total(_estimate_num_nodes(curves, size_function, area), "refine")
     else:
-        size, state = _fit_cell_size(curves, arc_lengths, fixed_nodes, field, target.num_points, area)
-    return Mesh.create(*_triangulate.generate(curves, arc_lengths, fixed_nodes, size, state))
+        size_function, generator_state = _fit_cell_size(
+            curves, arc_lengths, fixed_nodes, size_field, target.num_points, area
+        )
+    return Mesh.create(*_triangulate.generate(curves, arc_lengths, fixed_nodes, size_function, generator_state))
 
 
 def _required_positions(curves: list[Curve], boundary_points: ArrayLike | None) -> list[np.ndarray]:
@@ -123,30 +127,33 @@ def _required_positions(curves: list[Curve], boundary_points: ArrayLike | None) 
     return arc_lengths
 
 
-def _size_at(field: SizeField, background: float, points: np.ndarray) -> np.ndarray:
-    return field.at(points)(background)
+def _size_at(size_field: SizeField, background_size: float, points: np.ndarray) -> np.ndarray:
+    return size_field.at(points)(background_size)
 
 
-def _capped_size_at(field: SizeField, max_size: float, points: np.ndarray) -> np.ndarray:
-    return np.minimum(field.at(points)(1.0), max_size)
+def _capped_size_at(size_field: SizeField, max_size: float, points: np.ndarray) -> np.ndarray:
+    return np.minimum(size_field.at(points)(1.0), max_size)
 
 
-def _merge_with_corners(curve: Curve, positions: np.ndarray) -> np.ndarray:
+def _merge_with_corners(curve: Curve, required_positions: np.ndarray) -> np.ndarray:
     """Merge required positions on a curve with its corners. Raises `ValueError` if two positions are too close to each
     other."""
-    arc_lengths = np.sort(np.concatenate([curve.corners, np.mod(positions, curve.length)]))
+    arc_lengths = np.sort(np.concatenate([curve.corners, np.mod(required_positions, curve.length)]))
     if len(arc_lengths) < 2:
         return arc_lengths
-    gaps = np.diff(np.append(arc_lengths, arc_lengths[0] + curve.length)) / curve.length
-    is_too_close = (gaps > 1e-9) & (gaps < _MIN_NODE_DISTANCE)
+    relative_gaps = np.diff(np.append(arc_lengths, arc_lengths[0] + curve.length)) / curve.length
+    is_too_close = (relative_gaps > 1e-9) & (relative_gaps < _MIN_NODE_DISTANCE)
     if is_too_close.any():
-        first_index = int(np.flatnonzero(is_too_close)[0])
-        first_length, next_length = arc_lengths[first_index], arc_lengths[(first_index + 1) % len(arc_lengths)]
+        first_close_index = int(np.flatnonzero(is_too_close)[0])
+        first_length, next_length = (
+            arc_lengths[first_close_index],
+            arc_lengths[(first_close_index + 1) % len(arc_lengths)],
+        )
         raise ValueError(
             f"boundary_points: two nodes at arc lengths {first_length:g} and {next_length:g} m are closer than a "
             "millionth of the outline (a corner counts). Make them equal or move one."
         )
-    is_distinct = gaps > 1e-9
+    is_distinct = relative_gaps > 1e-9
     # Replace a position that coincides with a corner by the corner, so that corners are not moved.
     distinct_arc_lengths = arc_lengths[is_distinct]
     if len(curve.corners):
@@ -167,9 +174,9 @@ def _check_interior(interior_points: ArrayLike | None, curves: list[Curve]) -> n
         raise ValueError(
             f"interior_points: expected finite coordinates of shape (k, 2), got shape {fixed_nodes.shape}."
         )
-    distances = np.min([curve.distance(fixed_nodes) for curve in curves], axis=0)
+    curve_distances = np.min([curve.distance(fixed_nodes) for curve in curves], axis=0)
     outside_points = np.flatnonzero(
-        ~is_inside_curves(curves, fixed_nodes) | (distances < _MIN_NODE_DISTANCE * curves[0].length)
+        ~is_inside_curves(curves, fixed_nodes) | (curve_distances < _MIN_NODE_DISTANCE * curves[0].length)
     )
     if outside_points.size:
         raise ValueError(
@@ -194,39 +201,41 @@ def _required_spacing(
     ]
     required_positions = np.concatenate([*node_chains, fixed_nodes])
     if len(required_positions) < 2:
-        distances = np.array([curves[0].distance(point[None])[0] for point in fixed_nodes])
-        return (required_positions, distances) if len(fixed_nodes) else (np.zeros((0, 2)), np.zeros(0))
-    spacing = KDTree(required_positions).query(required_positions, k=2)[0][:, 1]
-    offset = 0
-    for chain in node_chains:
-        num_nodes = len(chain)
-        for k, (start, end) in enumerate(pairwise(np.concatenate([chain, chain[:1]]))):
-            if num_nodes < 2 or (start == end).all():
+        outline_distances = np.array([curves[0].distance(interior_node[None])[0] for interior_node in fixed_nodes])
+        return (required_positions, outline_distances) if len(fixed_nodes) else (np.zeros((0, 2)), np.zeros(0))
+    node_spacing = KDTree(required_positions).query(required_positions, k=2)[0][:, 1]
+    first_position = 0
+    for node_chain in node_chains:
+        num_nodes = len(node_chain)
+        for k, (chain_node, next_chain_node) in enumerate(pairwise(np.concatenate([node_chain, node_chain[:1]]))):
+            if num_nodes < 2 or (chain_node == next_chain_node).all():
                 continue
-            distances = topology.distance(required_positions, start[None], end[None])[:, 0]
-            distances[[offset + k, offset + (k + 1) % num_nodes]] = np.inf
-            spacing = np.minimum(spacing, np.where(distances > 0, distances, np.inf))
-        offset += num_nodes
+            outline_distances = topology.distance(required_positions, chain_node[None], next_chain_node[None])[:, 0]
+            outline_distances[[first_position + k, first_position + (k + 1) % num_nodes]] = np.inf
+            node_spacing = np.minimum(node_spacing, np.where(outline_distances > 0, outline_distances, np.inf))
+        first_position += num_nodes
     for curve in curves:
         if len(fixed_nodes):
-            spacing[offset:] = np.minimum(spacing[offset:], curve.distance(fixed_nodes))
-    return required_positions, spacing
+            node_spacing[first_position:] = np.minimum(node_spacing[first_position:], curve.distance(fixed_nodes))
+    return required_positions, node_spacing
 
 
 def _interior_samples(curves: list[Curve]) -> np.ndarray:
     """Points of a regular grid that lie inside the domain."""
-    outline = curves[0].points_at(np.linspace(0, curves[0].length, 400))
-    axes = [np.linspace(outline[:, k].min(), outline[:, k].max(), 60) for k in (0, 1)]
-    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    return grid[is_inside_curves(curves, grid)]
+    outline_points = curves[0].points_at(np.linspace(0, curves[0].length, 400))
+    grid_axes = [np.linspace(outline_points[:, k].min(), outline_points[:, k].max(), 60) for k in (0, 1)]
+    grid_points = np.stack(np.meshgrid(*grid_axes), axis=-1).reshape(-1, 2)
+    return grid_points[is_inside_curves(curves, grid_points)]
 
 
-def _estimate_num_nodes(curves: list[Curve], size: SizeFunction, area: float) -> float:
-    """Estimate the number of nodes of a mesh whose cell sizes are the values of the function `size`, from samples
-    inside the domain and along its outline."""
-    num_nodes = area * float(np.mean(1.0 / size(_interior_samples(curves)) ** 2))
+def _estimate_num_nodes(curves: list[Curve], size_function: SizeFunction, domain_area: float) -> float:
+    """Estimate the number of nodes of a mesh whose cell sizes are the values of the function `size_function`, from
+    samples inside the domain and along its outline."""
+    num_nodes = domain_area * float(np.mean(1.0 / size_function(_interior_samples(curves)) ** 2))
     for curve in curves:
-        num_nodes += curve.length * float(np.mean(1.0 / size(curve.points_at(np.linspace(0, curve.length, 400)))))
+        num_nodes += curve.length * float(
+            np.mean(1.0 / size_function(curve.points_at(np.linspace(0, curve.length, 400))))
+        )
     return num_nodes
 
 
@@ -234,9 +243,9 @@ def _fit_cell_size(
     curves: list[Curve],
     arc_lengths: list[np.ndarray],
     fixed_nodes: np.ndarray,
-    field: SizeField,
+    size_field: SizeField,
     num_points: int,
-    area: float,
+    domain_area: float,
 ) -> tuple[SizeFunction, GeneratorState]:
     """Scale the background cell size, or the user's size function, so that the mesh has about `num_points` nodes.
     Returns the size function and the outline filled with nodes.
@@ -245,55 +254,64 @@ def _fit_cell_size(
     and the sample points, and further meshes correct the cell size.
     """
     first_num_points = num_points / 4 if num_points > 4000 else num_points
-    background = float(np.sqrt(1.1 * area / first_num_points))
-    if field.is_user_function:
-        background *= float(np.sqrt(np.mean(1.0 / field.at(_interior_samples(curves))(1.0) ** 2)))
-    best_fit: tuple[float, SizeFunction, GeneratorState] | None = None
+    background_size = float(np.sqrt(1.1 * domain_area / first_num_points))
+    if size_field.is_user_function:
+        background_size *= float(np.sqrt(np.mean(1.0 / size_field.at(_interior_samples(curves))(1.0) ** 2)))
+    best_state_with_size: tuple[float, SizeFunction, GeneratorState] | None = None
     for _ in range(6):
-        size = partial(_size_at, field, background)
-        state = _triangulate.outline_nodes(curves, arc_lengths, fixed_nodes, size, 1.0)
-        _triangulate.insert_nodes(state, size)
-        points = state.points()
+        size_function = partial(_size_at, size_field, background_size)
+        generator_state = _triangulate.outline_nodes(curves, arc_lengths, fixed_nodes, size_function, 1.0)
+        _triangulate.insert_nodes(generator_state, size_function)
+        points = generator_state.points()
         relative_excess = len(points) / num_points - 1.0
-        if best_fit is None or abs(relative_excess) < best_fit[0]:
-            best_fit = (abs(relative_excess), size, state)
+        if best_state_with_size is None or abs(relative_excess) < best_state_with_size[0]:
+            best_state_with_size = (abs(relative_excess), size_function, generator_state)
         if abs(relative_excess) < _NODE_COUNT_TOLERANCE:
             break
-        cells = triangulate(state, points)
-        background = _correct_background(
-            field.at(points[cells].mean(axis=1)), doubled_areas(points, cells), background, relative_excess, num_points
+        cells = triangulate(generator_state, points)
+        background_size = _correct_background(
+            size_field.at(points[cells].mean(axis=1)),
+            doubled_areas(points, cells),
+            background_size,
+            relative_excess,
+            num_points,
         )
-    assert best_fit is not None
-    return best_fit[1], best_fit[2]
+    assert best_state_with_size is not None
+    return best_state_with_size[1], best_state_with_size[2]
 
 
 def _correct_background(
-    size: Callable[[float], np.ndarray], weight: np.ndarray, background: float, relative_excess: float, num_points: int
+    sizes_at_samples: Callable[[float], np.ndarray],
+    sample_weights: np.ndarray,
+    background_size: float,
+    relative_excess: float,
+    num_points: int,
 ) -> float:
     """Background cell size for which ∫ 1/h², h being the cell size at a point, is smaller by the factor 1 +
-    `relative_excess` than for the background cell size `background`; `relative_excess` is the relative surplus of
+    `relative_excess` than for the background cell size `background_size`; `relative_excess` is the relative surplus of
     nodes."""
 
     def density_integral(trial_size: float) -> float:
-        return float(np.sum(weight / size(trial_size) ** 2))
+        return float(np.sum(sample_weights / sizes_at_samples(trial_size) ** 2))
 
-    target_total = density_integral(background) / (1.0 + relative_excess)
-    if density_integral(1e3 * background) > 1.1 * target_total:
-        min_points = round(num_points * density_integral(1e3 * background) / target_total)
+    target_integral = density_integral(background_size) / (1.0 + relative_excess)
+    if density_integral(1e3 * background_size) > 1.1 * target_integral:
+        min_num_nodes = round(num_points * density_integral(1e3 * background_size) / target_integral)
         raise TooFewNodesError(
-            f"num_points: the outline and refinement alone need about {min_points} nodes, more than the {num_points} "
-            "asked. Ask for more nodes, less refinement (larger cell_size, smaller factor) or faster growth.",
-            min_points,
+            f"num_points: the outline and refinement alone need about {min_num_nodes} nodes, more than the "
+            f"{num_points} asked. Ask for more nodes, less refinement (larger cell_size, smaller factor) or faster "
+            "growth.",
+            min_num_nodes,
             "the surface alone, as fine as electrodes or refine want it, needs about {least} nodes, more than the "
             "{asked} asked. Ask for more.",
         )
-    # Search for a factor of `background`, so that the mesh of a body twice as large is exactly twice as large.
-    lower_bound, upper_bound = -np.log(1e3), np.log(1e3)
+    # Search for a factor of `background_size`, so that the mesh of a body twice as large is exactly twice as large.
+    lower_log_factor, upper_log_factor = -np.log(1e3), np.log(1e3)
     for _ in range(30):
-        midpoint = 0.5 * (lower_bound + upper_bound)
-        lower_bound, upper_bound = (
-            (midpoint, upper_bound)
-            if density_integral(background * float(np.exp(midpoint))) > target_total
-            else (lower_bound, midpoint)
+        middle_log_factor = 0.5 * (lower_log_factor + upper_log_factor)
+        lower_log_factor, upper_log_factor = (
+            (middle_log_factor, upper_log_factor)
+            if density_integral(background_size * float(np.exp(middle_log_factor))) > target_integral
+            else (lower_log_factor, middle_log_factor)
         )
-    return background * float(np.exp(0.5 * (lower_bound + upper_bound)))
+    return background_size * float(np.exp(0.5 * (lower_log_factor + upper_log_factor)))

@@ -56,8 +56,11 @@ class Unfolding(NamedTuple):
         xp = namespace(self.corners, self.turn)
         cell_index = xp.arange(len(self.corners))[:, None]
         points = xp.einsum("pi,mid->mpd", weights, self.corners)[:, None]
-        turn, shift = self.turn[which, cell_index][:, :, None], (self.shift - self.place[:, None])[which, cell_index]
-        unfolded_points = _rotate(turn, points) + shift[:, :, None]
+        point_turns, point_shifts = (
+            self.turn[which, cell_index][:, :, None],
+            (self.shift - self.place[:, None])[which, cell_index],
+        )
+        unfolded_points = _rotate_points(point_turns, points) + point_shifts[:, :, None]
         return (unfolded_points**2).sum(axis=-1)
 
 
@@ -78,123 +81,147 @@ def unfold(mesh: Mesh, places: Float[Array, "L 3"], max_distance: Float[Array, "
     ```
     """
     xp = namespace(mesh, places)
-    corners = xp.asarray(mesh.points[mesh.cells])
-    first_sides, second_sides = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    triangle_corners = xp.asarray(mesh.points[mesh.cells])
+    first_sides, second_sides = (
+        triangle_corners[:, 1] - triangle_corners[:, 0],
+        triangle_corners[:, 2] - triangle_corners[:, 0],
+    )
     first_axis = first_sides / xp.sqrt((first_sides**2).sum(axis=1, keepdims=True))
-    normal = xp.cross(first_sides, second_sides)
-    normal = normal / xp.sqrt((normal**2).sum(axis=1, keepdims=True))
-    axes = xp.stack([first_axis, xp.cross(normal, first_axis)], axis=1)
-    plane_corners = xp.einsum("mid,mad->mia", corners - corners[:, :1], axes)
-    frames = corners[:, 0], axes, normal
+    triangle_normals = xp.cross(first_sides, second_sides)
+    triangle_normals = triangle_normals / xp.sqrt((triangle_normals**2).sum(axis=1, keepdims=True))
+    plane_axes = xp.stack([first_axis, xp.cross(triangle_normals, first_axis)], axis=1)
+    plane_corners = xp.einsum("mid,mad->mia", triangle_corners - triangle_corners[:, :1], plane_axes)
+    frames = triangle_corners[:, 0], plane_axes, triangle_normals
     root_triangles = _containing_triangles(undifferentiated(places), *undifferentiated((frames, plane_corners)))
-    squared_distance = undifferentiated(((places[:, None] - corners.mean(axis=1)) ** 2).sum(axis=-1))
+    squared_distance = undifferentiated(((places[:, None] - triangle_corners.mean(axis=1)) ** 2).sum(axis=-1))
     # If the values are known, compute on the host: XLA would take seconds to evaluate a sort of constants.
-    opposite_side_indices, cell = xp.asarray(_opposite_sides(on_host(mesh.cells))), xp.arange(len(corners))
-    reached, side = _find_connected_triangles(
+    opposite_side_indices, triangle_indices = (
+        xp.asarray(_opposite_sides(on_host(mesh.cells))),
+        xp.arange(len(triangle_corners)),
+    )
+    is_reached, side_to_root = _find_connected_triangles(
         opposite_side_indices // 3, squared_distance <= undifferentiated(max_distance) ** 2, root_triangles
     )
-    side_index = 3 * cell + side
-    previous_cells = xp.where(side < 0, cell, opposite_side_indices[side_index] // 3)
-    turn, shift = (
-        transform[side_index] for transform in _transforms_across_sides(plane_corners, opposite_side_indices)
+    side_index = 3 * triangle_indices + side_to_root
+    previous_cells = xp.where(side_to_root < 0, triangle_indices, opposite_side_indices[side_index] // 3)
+    path_turns, path_shifts = (
+        side_transform[side_index] for side_transform in _transforms_across_sides(plane_corners, opposite_side_indices)
     )
-    has_previous = (side >= 0)[..., None]
-    turn, shift = xp.where(has_previous, turn, xp.array([1.0, 0.0])), xp.where(has_previous, shift, 0.0)
-    turn, shift, end_triangle = _compose_transforms(previous_cells, turn, shift)
-    place = xp.einsum("ld,lad->la", places - corners[root_triangles, 0], axes[root_triangles])
+    has_previous = (side_to_root >= 0)[..., None]
+    path_turns, path_shifts = (
+        xp.where(has_previous, path_turns, xp.array([1.0, 0.0])),
+        xp.where(has_previous, path_shifts, 0.0),
+    )
+    path_turns, path_shifts, end_triangle = _compose_transforms(previous_cells, path_turns, path_shifts)
+    plane_places = xp.einsum("ld,lad->la", places - triangle_corners[root_triangles, 0], plane_axes[root_triangles])
     is_curved = _is_curved(undifferentiated(plane_corners), mesh.cells, opposite_side_indices, mesh.num_points)
-    is_invalid = reached & (is_curved | (end_triangle != root_triangles[:, None]))
-    return Unfolding(plane_corners, turn, shift, place, reached, ~is_invalid.any(axis=1))
+    is_invalid = is_reached & (is_curved | (end_triangle != root_triangles[:, None]))
+    return Unfolding(plane_corners, path_turns, path_shifts, plane_places, is_reached, ~is_invalid.any(axis=1))
 
 
-def _rotate(turn, points):
-    """Rotate points (…, 2) in the plane. `turn` (…, 2): cosine and sine of each angle."""
-    cos, sin = turn[..., 0], turn[..., 1]
+def _rotate_points(cosine_and_sine, points):
+    """Rotate points (…, 2) in the plane. `cosine_and_sine` (…, 2): cosine and sine of each angle."""
+    cosine, sine = cosine_and_sine[..., 0], cosine_and_sine[..., 1]
     x, y = points[..., 0], points[..., 1]
-    return namespace(turn, points).stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+    return namespace(cosine_and_sine, points).stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
 
 
-def _containing_triangles(positions, frames, plane_corners) -> Int[Array, " L"]:
+def _containing_triangles(query_positions, triangle_frames, plane_corners) -> Int[Array, " L"]:
     """Index of the triangle that contains each point: the triangle with the smallest sum of squares of the point's
     height above its plane and the point's distance outside it."""
-    xp = namespace(positions, plane_corners)
-    origin, axes, normal = frames
-    offset = positions[:, None] - origin
-    x, y = xp.moveaxis(xp.einsum("lmd,mad->lma", offset, axes), -1, 0)
+    xp = namespace(query_positions, plane_corners)
+    plane_origins, plane_axes, plane_normals = triangle_frames
+    position_offsets = query_positions[:, None] - plane_origins
+    x, y = xp.moveaxis(xp.einsum("lmd,mad->lma", position_offsets, plane_axes), -1, 0)
     third_weights = y / plane_corners[:, 2, 1]
     second_weights = (x - third_weights * plane_corners[:, 2, 0]) / plane_corners[:, 1, 0]
     distance_outside = (
         xp.maximum(-xp.minimum(xp.minimum(second_weights, third_weights), 1 - second_weights - third_weights), 0)
         * plane_corners[:, 1, 0]
     )
-    return ((offset * normal).sum(axis=-1) ** 2 + distance_outside**2).argmin(axis=1)
+    return ((position_offsets * plane_normals).sum(axis=-1) ** 2 + distance_outside**2).argmin(axis=1)
 
 
 def _opposite_sides(cells) -> Int[Array, " h"]:
     """For each side of each triangle, the index of the same side in the neighbouring triangle; at the border, the
     side's own index. The index of side k (0, 1, 2) of triangle c is 3 c + k."""
     xp = namespace(cells)
-    start, end = cells.reshape(-1), xp.roll(cells, -1, axis=1).reshape(-1)
-    smaller_nodes, larger_nodes = xp.minimum(start, end), xp.maximum(start, end)
+    side_starts, side_ends = cells.reshape(-1), xp.roll(cells, -1, axis=1).reshape(-1)
+    smaller_nodes, larger_nodes = xp.minimum(side_starts, side_ends), xp.maximum(side_starts, side_ends)
     sort_order = xp.lexsort((larger_nodes, smaller_nodes))
     is_same_as_next = (xp.diff(smaller_nodes[sort_order]) == 0) & (xp.diff(larger_nodes[sort_order]) == 0)
     false_element = xp.zeros(1, bool)
-    step = xp.where(xp.concatenate([is_same_as_next, false_element]), 1, 0) - xp.where(
+    step_to_opposite = xp.where(xp.concatenate([is_same_as_next, false_element]), 1, 0) - xp.where(
         xp.concatenate([false_element, is_same_as_next]), 1, 0
     )
-    opposite_sides = sort_order[xp.arange(len(sort_order)) + step]
+    opposite_sides = sort_order[xp.arange(len(sort_order)) + step_to_opposite]
     return opposite_sides[xp.argsort(sort_order)]
 
 
-def _find_connected_triangles(neighbour, is_near: Bool[Array, "L m"], root_triangles):
+def _find_connected_triangles(neighbour_triangles, is_near: Bool[Array, "L m"], root_triangles):
     """Find the triangles near each point (`is_near`) that are connected to the triangles `root_triangles` (L,) across
     sides. Returns whether each triangle (L, m) is connected, and the number (L, m) of the side across which the path to
     the root leads; −1 for the root itself and for triangles that are not connected."""
-    xp = namespace(neighbour, is_near)
-    cell = xp.arange(is_near.shape[1])
-    neighbour = neighbour.reshape(-1, 3)
-    is_root_triangle = cell == root_triangles[:, None]
+    xp = namespace(neighbour_triangles, is_near)
+    triangle_indices = xp.arange(is_near.shape[1])
+    neighbour_triangles = neighbour_triangles.reshape(-1, 3)
+    is_root_triangle = triangle_indices == root_triangles[:, None]
 
-    def add_neighbours(state):
-        reached, side, _ = state
-        is_reached_across = reached[:, neighbour]
-        is_new = is_near & ~reached & is_reached_across.any(axis=-1)
-        return reached | is_new, xp.where(is_new, is_reached_across.argmax(axis=-1).astype(int), side), is_new.any()
+    def add_neighbours(search_state):
+        is_reached, side_to_root, _ = search_state
+        is_reached_across = is_reached[:, neighbour_triangles]
+        is_new = is_near & ~is_reached & is_reached_across.any(axis=-1)
+        return (
+            is_reached | is_new,
+            xp.where(is_new, is_reached_across.argmax(axis=-1).astype(int), side_to_root),
+            is_new.any(),
+        )
 
     has_changed = xp.ones((), bool)
-    reached, side, _ = while_loop(
-        lambda state: state[2], add_neighbours, (is_root_triangle, xp.full(is_near.shape, -1, int), has_changed)
+    is_reached, side_to_root, _ = while_loop(
+        lambda search_state: search_state[2],
+        add_neighbours,
+        (is_root_triangle, xp.full(is_near.shape, -1, int), has_changed),
     )
-    return reached, side
+    return is_reached, side_to_root
 
 
 def _transforms_across_sides(plane_corners, opposite_side_indices):
     """Rotation (h, 2), as cosine and sine, and translation (h, 2) for each half-edge (a side of one triangle), from the
     plane of its triangle into the plane of the neighbouring triangle."""
     xp = namespace(plane_corners)
-    start, end = plane_corners.reshape(-1, 2), xp.roll(plane_corners, -1, axis=1).reshape(-1, 2)
-    side, opposite_side = end - start, start[opposite_side_indices] - end[opposite_side_indices]
-    turn = xp.stack(
-        [(side * opposite_side).sum(axis=1), side[:, 0] * opposite_side[:, 1] - side[:, 1] * opposite_side[:, 0]],
+    side_starts, side_ends = plane_corners.reshape(-1, 2), xp.roll(plane_corners, -1, axis=1).reshape(-1, 2)
+    side_vectors, opposite_side_vectors = (
+        side_ends - side_starts,
+        side_starts[opposite_side_indices] - side_ends[opposite_side_indices],
+    )
+    side_turns = xp.stack(
+        [
+            (side_vectors * opposite_side_vectors).sum(axis=1),
+            side_vectors[:, 0] * opposite_side_vectors[:, 1] - side_vectors[:, 1] * opposite_side_vectors[:, 0],
+        ],
         axis=1,
     )
-    turn = turn / xp.sqrt((turn**2).sum(axis=1, keepdims=True))
-    return turn, end[opposite_side_indices] - _rotate(turn, start)
+    side_turns = side_turns / xp.sqrt((side_turns**2).sum(axis=1, keepdims=True))
+    return side_turns, side_ends[opposite_side_indices] - _rotate_points(side_turns, side_starts)
 
 
-def _compose_transforms(previous, turn, shift):
-    """Compose the rotations and translations along the path from each triangle to the root. `previous` (L, m): next
+def _compose_transforms(next_on_path, path_turns, path_shifts):
+    """Compose the rotations and translations along the path from each triangle to the root. `next_on_path` (L, m): next
     triangle on the path from each triangle. Returns the rotation and translation for the whole path, and the triangle
     where it ends."""
-    xp = namespace(previous, turn)
-    row = xp.arange(len(previous))[:, None]
+    xp = namespace(next_on_path, path_turns)
+    point_rows = xp.arange(len(next_on_path))[:, None]
     for _ in range(_MAX_PATH_DOUBLINGS):
-        next_turn, next_shift = turn[row, previous], shift[row, previous]
-        turn, shift = _rotate(next_turn, turn), _rotate(next_turn, shift) + next_shift
-        previous = previous[row, previous]
-        if has_values(previous) and (previous[row, previous] == previous).all():
+        next_turn, next_shift = path_turns[point_rows, next_on_path], path_shifts[point_rows, next_on_path]
+        path_turns, path_shifts = (
+            _rotate_points(next_turn, path_turns),
+            _rotate_points(next_turn, path_shifts) + next_shift,
+        )
+        next_on_path = next_on_path[point_rows, next_on_path]
+        if has_values(next_on_path) and (next_on_path[point_rows, next_on_path] == next_on_path).all():
             break
-    return turn, shift, previous
+    return path_turns, path_shifts, next_on_path
 
 
 def _is_curved(plane_corners, cells, opposite_side_indices, num_nodes: int) -> Bool[Array, " m"]:
@@ -204,11 +231,11 @@ def _is_curved(plane_corners, cells, opposite_side_indices, num_nodes: int) -> B
         xp.roll(plane_corners, -1, axis=1) - plane_corners,
         xp.roll(plane_corners, 1, axis=1) - plane_corners,
     )
-    angle = xp.arctan2(
+    corner_angles = xp.arctan2(
         next_edges[..., 0] * previous_edges[..., 1] - next_edges[..., 1] * previous_edges[..., 0],
         (next_edges * previous_edges).sum(axis=-1),
     )
-    angle_sums = sum_into((num_nodes,), (cells,), angle)
+    angle_sums = sum_into((num_nodes,), (cells,), corner_angles)
     is_border_side = (opposite_side_indices == xp.arange(len(opposite_side_indices))).reshape(-1, 3)
     num_border_sides = sum_into((num_nodes,), (cells,), 1.0 * (is_border_side | xp.roll(is_border_side, 1, axis=1)))
     is_curved_node = (abs(angle_sums - 2 * np.pi) > _ANGLE_TOLERANCE) & (num_border_sides == 0)

@@ -64,8 +64,10 @@ class Disk(Domain):
     def boundary(self, arc_length: ArrayLike) -> Float[Array, "... 2"]:
         """Points (…, 2) on the circle at `arc_length` (…) in metres, counter-clockwise from angle 0."""
         xp = array_module(self, arc_length)
-        angle = xp.asarray(arc_length) / self.radius
-        return as_array(xp.asarray(self.centre) + self.radius * xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1))
+        polar_angle = xp.asarray(arc_length) / self.radius
+        return as_array(
+            xp.asarray(self.centre) + self.radius * xp.stack([xp.cos(polar_angle), xp.sin(polar_angle)], axis=-1)
+        )
 
     def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
         """Vertices of the polygon with `num_chords` sides that is inscribed in the circle."""
@@ -74,8 +76,8 @@ class Disk(Domain):
     def contains(self, points: ArrayLike) -> Bool[Array, "..."]:
         """Whether each of `points` (…, 2), in metres, lies in the disk or on its edge."""
         xp = array_module(self, points)
-        offset = xp.asarray(points) - xp.asarray(self.centre)
-        return as_array((offset**2).sum(axis=-1) <= self.radius**2 * (1 + 1e-12))
+        centre_offset = xp.asarray(points) - xp.asarray(self.centre)
+        return as_array((centre_offset**2).sum(axis=-1) <= self.radius**2 * (1 + 1e-12))
 
     def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
         """Distance (p,) of `points` (p, 2) from the circle, metres, negative outside: R minus the distance from the
@@ -84,15 +86,15 @@ class Disk(Domain):
 
     def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
         """Move the `points` (p, 2), metres, that lie outside the disk radially onto the circle."""
-        offset, distance = self._from_centre(points)
+        centre_offset, centre_distance = self._from_centre(points)
         xp = array_module(self, points)
-        return as_array(xp.asarray(self.centre) + offset * xp.minimum(1, self.radius / distance[:, None]))
+        return as_array(xp.asarray(self.centre) + centre_offset * xp.minimum(1, self.radius / centre_distance[:, None]))
 
     def _from_centre(self, points: ArrayLike) -> tuple[Any, Any]:
         """Offsets (p, 2) and distances (p,) from the centre; the distances are differentiable at the centre, too."""
         xp = array_module(self, points)
-        offset = xp.asarray(points) - xp.asarray(self.centre)
-        return offset, xp.sqrt((offset**2).sum(axis=1) + 1e-24)
+        centre_offset = xp.asarray(points) - xp.asarray(self.centre)
+        return centre_offset, xp.sqrt((centre_offset**2).sum(axis=1) + 1e-24)
 
     def describe(self) -> dict:
         """Name of the shape, radius and centre, in metres."""
@@ -114,18 +116,18 @@ class Disk(Domain):
         interior_points: ArrayLike | None = None,
     ) -> Mesh:
         """Mesh the disk. The arguments and the errors raised are those of `jeit.mesh.disk`."""
-        centre = np.asarray(self.centre)
+        disk_centre = np.asarray(self.centre)
         if num_boundary is not None:
             refine = self._refine_rim(num_boundary, refine)
         if refine is None and boundary_points is None and interior_points is None:
             points, cells = structured.ring_disk(*self._choose_rings(num_points, cell_size))
-            return Mesh.create(centre + self.radius * points, cells)
+            return Mesh.create(disk_centre + self.radius * points, cells)
         boundary_arc_lengths = None
         if boundary_points is not None:
             boundary_arc_lengths = self.radius * np.mod(check_positions("boundary_points", boundary_points), 2 * np.pi)
-        target = MeshTarget.create(num_points, cell_size)
+        mesh_target = MeshTarget.create(num_points, cell_size)
         mesh = mesh_within(
-            [circle(self.radius, centre)], self.area, target, refine, boundary_arc_lengths, interior_points
+            [circle(self.radius, disk_centre)], self.area, mesh_target, refine, boundary_arc_lengths, interior_points
         )
         max_deviation = (
             0
@@ -147,13 +149,13 @@ class Disk(Domain):
         return (rim_refinement, *(() if refine is None else (refine,) if isinstance(refine, Refine) else tuple(refine)))
 
     def _choose_rings(self, num_points: int | None, cell_size: float | None) -> tuple[int, int]:
-        target = MeshTarget.create(num_points, cell_size)
-        if target.cell_size is None:
-            ring_numbers = structured.choose_rings(target.num_points)
+        mesh_target = MeshTarget.create(num_points, cell_size)
+        if mesh_target.cell_size is None:
+            ring_numbers = structured.choose_rings(mesh_target.num_points)
         else:
             # With six nodes more on each ring, cells with legs t and π/3 t have the area of equilateral triangles with
             # edge 1.1 t.
-            num_rings = max(1, round(1.1 * self.radius / target.cell_size))
+            num_rings = max(1, round(1.1 * self.radius / mesh_target.cell_size))
             ring_numbers = (num_rings, 6 * num_rings)
         check_total(ring_numbers[0] * ring_numbers[1] // 2, "cell_size")
         return ring_numbers

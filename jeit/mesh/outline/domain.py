@@ -158,13 +158,13 @@ def check_length(name: str, value: Any, size_factor: float = 1.0) -> Any:
     if not has_values(value):
         return value
     try:
-        length = np.nan if isinstance(value, str) else float(value)
+        checked_length = np.nan if isinstance(value, str) else float(value)
     except (TypeError, ValueError):
         raise ValueError(f"{name}: expected one length in metres, got {value!r}.") from None
-    if not np.isfinite(length) or length <= 0:
+    if not np.isfinite(checked_length) or checked_length <= 0:
         raise ValueError(f"{name}: expected a positive length in metres, got {describe(value)}.")
-    warn_large(length, name, size_factor)
-    return length
+    warn_large(checked_length, name, size_factor)
+    return checked_length
 
 
 def check_near_origin(name: str, coordinates: Any, size: Any) -> None:
@@ -172,11 +172,11 @@ def check_near_origin(name: str, coordinates: Any, size: Any) -> None:
     far from the origin that the coordinates lose accuracy. Traced values are not checked."""
     if not has_values(coordinates, size):
         return
-    distance = float(np.max(np.abs(np.asarray(coordinates))))
-    if distance > _MAX_DISTANCE_FROM_ORIGIN * float(size):
+    origin_distance = float(np.max(np.abs(np.asarray(coordinates))))
+    if origin_distance > _MAX_DISTANCE_FROM_ORIGIN * float(size):
         raise ValueError(
-            f"{name}: {distance:.3g} m from the origin, and only {float(size):.3g} m across; give its coordinates "
-            "about a point of its own."
+            f"{name}: {origin_distance:.3g} m from the origin, and only {float(size):.3g} m across; give its "
+            "coordinates about a point of its own."
         )
 
 
@@ -185,7 +185,7 @@ def check_position(name: str, value: Any) -> Any:
     Raises `ValueError` for anything but two finite numbers."""
     if not has_values(value):
         return jnp.asarray(value)
-    array = np.asarray(value, dtype=float)
-    if array.shape != (2,) or not np.isfinite(array).all():
+    position_array = np.asarray(value, dtype=float)
+    if position_array.shape != (2,) or not np.isfinite(position_array).all():
         raise ValueError(f"{name}: expected two finite coordinates (x, y) in metres, got {value!r}.")
-    return (float(array[0]), float(array[1]))
+    return (float(position_array[0]), float(position_array[1]))

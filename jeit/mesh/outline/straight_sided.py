@@ -62,12 +62,12 @@ class Polygon(Domain):
             self.holes = tuple(jnp.asarray(hole) for hole in holes)
             return
         outer_loop = topology.check_loop(vertices, "vertices", clockwise=False)
-        inner = [topology.check_loop(hole, f"holes[{k}]", clockwise=True) for k, hole in enumerate(holes)]
-        topology.check_holes(outer_loop, inner)
+        checked_holes = [topology.check_loop(hole, f"holes[{k}]", clockwise=True) for k, hole in enumerate(holes)]
+        topology.check_holes(outer_loop, checked_holes)
         check_near_origin("vertices", outer_loop, np.ptp(outer_loop, axis=0).max())
         warn_large(float(np.ptp(outer_loop, axis=0).max()), "vertices")
         self.vertices = as_array(outer_loop)
-        self.holes = tuple(as_array(hole) for hole in inner)
+        self.holes = tuple(as_array(hole) for hole in checked_holes)
 
     @property
     def area(self) -> Float[Array, ""]:
@@ -110,8 +110,8 @@ class Polygon(Domain):
 
     def describe(self) -> dict:
         """Name of the shape, vertices, and vertices of the holes if there are any."""
-        holes = {"holes": [np.asarray(hole).tolist() for hole in self.holes]} if self.holes else {}
-        return {"shape": "polygon", "vertices": np.asarray(self.vertices).tolist(), **holes}
+        hole_vertices = {"holes": [np.asarray(hole).tolist() for hole in self.holes]} if self.holes else {}
+        return {"shape": "polygon", "vertices": np.asarray(self.vertices).tolist(), **hole_vertices}
 
     def draw(self, pen: Pen) -> None:
         """Draw the outline and each hole as a loop."""
@@ -129,9 +129,9 @@ class Polygon(Domain):
         interior_points: ArrayLike | None = None,
     ) -> Mesh:
         """Mesh the polygon. The arguments and the errors raised are those of `jeit.mesh.polygon`."""
-        curves = [closed_line(np.asarray(loop)) for loop in self.loops()]
-        target = MeshTarget.create(num_points, cell_size)
-        return mesh_within(curves, float(self.area), target, refine, boundary_points, interior_points)
+        outline_curves = [closed_line(np.asarray(loop)) for loop in self.loops()]
+        mesh_target = MeshTarget.create(num_points, cell_size)
+        return mesh_within(outline_curves, float(self.area), mesh_target, refine, boundary_points, interior_points)
 
 
 class Rectangle(Domain):
@@ -197,9 +197,9 @@ class Rectangle(Domain):
     def contains(self, points: ArrayLike) -> Bool[Array, "..."]:
         """Whether each of `points` (…, 2), in metres, lies in the rectangle or on its edge."""
         xp = namespace(self, points)
-        offset = abs(xp.asarray(points) - xp.asarray(self.centre))
+        centre_offset = abs(xp.asarray(points) - xp.asarray(self.centre))
         half_side_lengths = 0.5 * xp.asarray([self.width, self.height])
-        return (offset <= half_side_lengths * (1 + 1e-12)).all(axis=-1)
+        return (centre_offset <= half_side_lengths * (1 + 1e-12)).all(axis=-1)
 
     def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
         """Distance (p,) of `points` (p, 2) from the nearest side in metres, negative outside."""
@@ -211,8 +211,8 @@ class Rectangle(Domain):
 
     def describe(self) -> dict:
         """Name of the shape, width, height and centre."""
-        sides = {"width": float(self.width), "height": float(self.height)}
-        return {"shape": "rectangle", **sides, "centre": [float(x) for x in self.centre]}
+        side_lengths = {"width": float(self.width), "height": float(self.height)}
+        return {"shape": "rectangle", **side_lengths, "centre": [float(x) for x in self.centre]}
 
     def draw(self, pen: Pen) -> None:
         """Draw the rectangle as one loop of four sides."""
@@ -230,34 +230,39 @@ class Rectangle(Domain):
     ) -> Mesh:
         """Mesh the rectangle and tag its sides. The arguments and the errors raised are those of
         `jeit.mesh.rectangle`."""
-        target = MeshTarget.create(num_points, cell_size)
+        mesh_target = MeshTarget.create(num_points, cell_size)
         if refine is None and boundary_points is None and interior_points is None:
-            mesh = self._mesh_rows(target)
+            mesh = self._mesh_rows(mesh_target)
         else:
-            curve = closed_line(np.asarray(self.vertices))
-            mesh = mesh_within([curve], self.area, target, refine, boundary_points, interior_points)
+            outline_curve = closed_line(np.asarray(self.vertices))
+            mesh = mesh_within([outline_curve], self.area, mesh_target, refine, boundary_points, interior_points)
         return self.tagged(mesh)
 
     def tagged(self, mesh: Mesh) -> Mesh:
         """Add tags for the sides of the rectangle to a mesh of the rectangle."""
         return Mesh(mesh.points, mesh.cells, mesh.facets, self._side_facets(mesh))
 
-    def _mesh_rows(self, target: MeshTarget) -> Mesh:
+    def _mesh_rows(self, mesh_target: MeshTarget) -> Mesh:
         x_min, _, y_min, _ = self.extent
-        rows = structured.choose_rows(self.width, self.height, target.num_points, target.cell_size)
-        check_total(rows[0] * rows[1], "cell_size")
-        points, cells = structured.row_rectangle(self.width, self.height, *rows)
+        row_and_column_counts = structured.choose_rows(
+            self.width, self.height, mesh_target.num_points, mesh_target.cell_size
+        )
+        check_total(row_and_column_counts[0] * row_and_column_counts[1], "cell_size")
+        points, cells = structured.row_rectangle(self.width, self.height, *row_and_column_counts)
         return Mesh.create(points + np.array([x_min, y_min]), cells)
 
     def _side_facets(self, mesh: Mesh) -> dict:
         """Indices of the facets on each side, by the name of the side."""
-        left, right, bottom, top = self.extent
+        x_left, x_right, y_bottom, y_top = self.extent
         end_points = np.asarray(mesh.points)[np.asarray(mesh.facets)]
-        tolerance = 1e-9 * max(self.width, self.height)
-        sides = {"left": (0, left), "right": (0, right), "bottom": (1, bottom), "top": (1, top)}
+        side_tolerance = 1e-9 * max(self.width, self.height)
+        axis_and_position = {"left": (0, x_left), "right": (0, x_right), "bottom": (1, y_bottom), "top": (1, y_top)}
         return {
-            name: as_array(np.flatnonzero((np.abs(end_points[:, :, axis] - value) < tolerance).all(axis=1)), np.int32)
-            for name, (axis, value) in sides.items()
+            name: as_array(
+                np.flatnonzero((np.abs(end_points[:, :, normal_axis] - side_position) < side_tolerance).all(axis=1)),
+                np.int32,
+            )
+            for name, (normal_axis, side_position) in axis_and_position.items()
         }
 
 
@@ -268,8 +273,8 @@ def loop_length(loop: Loop) -> Float[Array, ""]:
 
 def area_of_loops(loops: Sequence[Loop]) -> Float[Array, ""]:
     """Area inside the first loop minus the area of the holes, m² (shoelace formula)."""
-    outer_loop, *holes = (_shoelace(loop) for loop in on_host(loops))
-    return as_array(sum(holes, outer_loop))
+    outer_area, *hole_areas = (_signed_loop_area(loop) for loop in on_host(loops))
+    return as_array(sum(hole_areas, outer_area))
 
 
 @numpy_or_compiled
@@ -281,7 +286,8 @@ def points_on_loop(loop: Loop, arc_length: ArrayLike) -> Float[Array, "... 2"]:
     cumulative_lengths = xp.concatenate([xp.zeros(1), xp.cumsum(_side_lengths(loop))])
     wrapped_arc_length = xp.mod(xp.asarray(arc_length, dtype=cumulative_lengths.dtype), cumulative_lengths[-1])
     return xp.stack(
-        [xp.interp(wrapped_arc_length, cumulative_lengths, closed_loop[:, axis]) for axis in range(2)], axis=-1
+        [xp.interp(wrapped_arc_length, cumulative_lengths, closed_loop[:, axis_number]) for axis_number in range(2)],
+        axis=-1,
     )
 
 
@@ -302,8 +308,8 @@ def distance_from_loops(loops: Sequence[Loop], points: ArrayLike) -> Float[Array
     """Distance (p,) of `points` (p, 2) from the nearest side in metres, negative outside."""
     xp = array_module(loops, points)
     point_array, is_inside, nearest_points = _project_onto_loops(xp, loops, points)
-    distances = xp.sqrt(((point_array - nearest_points) ** 2).sum(axis=1) + 1e-24)  # differentiable at zero, too
-    return as_array(xp.where(is_inside, distances, -distances))
+    side_distances = xp.sqrt(((point_array - nearest_points) ** 2).sum(axis=1) + 1e-24)  # differentiable at zero, too
+    return as_array(xp.where(is_inside, side_distances, -side_distances))
 
 
 def nearest_in_loops(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, "p 2"]:
@@ -318,11 +324,11 @@ def _project_onto_loops(xp: Any, loops: Sequence[Loop], points: ArrayLike) -> tu
     """Convert `points` (p, 2) to an array. Also returns whether each point lies inside (p,), and the point on a side
     that is nearest to it (p, 2)."""
     loop_arrays, point_array = [xp.asarray(loop) for loop in loops], xp.asarray(points, float)
-    start = xp.concatenate(loop_arrays)
-    sides = xp.concatenate([xp.roll(loop, -1, axis=0) for loop in loop_arrays]) - start
-    offset = point_array[:, None] - start
-    fraction = xp.clip((offset * sides).sum(axis=-1) / (sides**2).sum(axis=-1), 0, 1)
-    points_on_sides = start + fraction[..., None] * sides  # (p, s, 2)
+    side_starts = xp.concatenate(loop_arrays)
+    side_vectors = xp.concatenate([xp.roll(loop, -1, axis=0) for loop in loop_arrays]) - side_starts
+    start_offsets = point_array[:, None] - side_starts
+    side_fractions = xp.clip((start_offsets * side_vectors).sum(axis=-1) / (side_vectors**2).sum(axis=-1), 0, 1)
+    points_on_sides = side_starts + side_fractions[..., None] * side_vectors  # (p, s, 2)
     nearest_side_index = xp.argmin(((point_array[:, None] - points_on_sides) ** 2).sum(axis=-1), axis=1)
     nearest_points = xp.take_along_axis(points_on_sides, nearest_side_index[:, None, None], axis=1)[:, 0]
     is_inside = (
@@ -338,7 +344,7 @@ def _side_lengths(loop: Loop) -> Float[Array, " k"]:
     return xp.sqrt(((xp.roll(loop, -1, axis=0) - loop) ** 2).sum(axis=1))
 
 
-def _shoelace(loop: Loop) -> Float[Array, ""]:
+def _signed_loop_area(loop: Loop) -> Float[Array, ""]:
     xp = namespace(loop)
     x, y = loop[:, 0], loop[:, 1]
     return 0.5 * (x * xp.roll(y, -1) - xp.roll(x, -1) * y).sum()
@@ -347,12 +353,12 @@ def _shoelace(loop: Loop) -> Float[Array, ""]:
 def _is_inside(loop: Loop, points: Float[Array, "... 2"]) -> Bool[Array, "..."]:
     """Even-odd rule: count the sides that a ray towards +x crosses."""
 
-    def toggle_at_crossing(is_inside: Array, side: Array) -> tuple[Array, None]:
-        (x0, y0), (x1, y1) = side
-        spans_point = (y0 > points[..., 1]) != (y1 > points[..., 1])
-        side_height = jnp.where(spans_point, y1 - y0, 1.0)
+    def toggle_at_crossing(is_inside: Array, loop_side: Array) -> tuple[Array, None]:
+        (x0, y0), (x1, y1) = loop_side
+        is_spanning_point = (y0 > points[..., 1]) != (y1 > points[..., 1])
+        side_height = jnp.where(is_spanning_point, y1 - y0, 1.0)
         x = x0 + (points[..., 1] - y0) * (x1 - x0) / side_height
-        return is_inside ^ (spans_point & (points[..., 0] < x)), None
+        return is_inside ^ (is_spanning_point & (points[..., 0] < x)), None
 
-    sides = jnp.stack([loop, jnp.roll(loop, -1, axis=0)], axis=1)
-    return jax.lax.scan(toggle_at_crossing, jnp.zeros(points.shape[:-1], bool), sides)[0]
+    loop_sides = jnp.stack([loop, jnp.roll(loop, -1, axis=0)], axis=1)
+    return jax.lax.scan(toggle_at_crossing, jnp.zeros(points.shape[:-1], bool), loop_sides)[0]

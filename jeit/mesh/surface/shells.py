@@ -35,13 +35,13 @@ def surface_of(mesh: Mesh, tag: str | None = None) -> Mesh:
     """
     if mesh.dimension != 3:
         raise ValueError("mesh: only solids have a boundary surface; this one consists of triangles.")
-    facets = np.asarray(mesh.facets)
+    boundary_facets = np.asarray(mesh.facets)
     if tag is not None:
         check_name("tag", tag, mesh.tags)
-        facets = facets[np.asarray(mesh.tags[tag])]
-    used_nodes, cells = np.unique(facets, return_inverse=True)
+        boundary_facets = boundary_facets[np.asarray(mesh.tags[tag])]
+    used_nodes, cells = np.unique(boundary_facets, return_inverse=True)
     with size_checked():
-        return Mesh.create(np.asarray(mesh.points)[used_nodes], cells.reshape(facets.shape))
+        return Mesh.create(np.asarray(mesh.points)[used_nodes], cells.reshape(boundary_facets.shape))
 
 
 # Minimum cosine of the angle between the mean normal at a node and the normals of its triangles: below it, the node is
@@ -74,55 +74,62 @@ def node_normals(mesh: Mesh) -> np.ndarray:
     cell_normals = np.asarray(normals(mesh))
     if not mesh.is_surface:
         return np.broadcast_to(cell_normals[:1], (mesh.num_points, 3)).copy()
-    corners = points[cells]
-    previous_edges, next_edges = np.roll(corners, 1, axis=1) - corners, np.roll(corners, -1, axis=1) - corners
-    lengths = np.linalg.norm(previous_edges, axis=2) * np.linalg.norm(next_edges, axis=2)
-    angle = np.arccos(np.clip((previous_edges * next_edges).sum(axis=2) / lengths, -1, 1))
+    cell_corners = points[cells]
+    previous_edges, next_edges = (
+        np.roll(cell_corners, 1, axis=1) - cell_corners,
+        np.roll(cell_corners, -1, axis=1) - cell_corners,
+    )
+    length_products = np.linalg.norm(previous_edges, axis=2) * np.linalg.norm(next_edges, axis=2)
+    corner_angles = np.arccos(np.clip((previous_edges * next_edges).sum(axis=2) / length_products, -1, 1))
     mean_normals = np.zeros_like(points)
-    np.add.at(mean_normals, cells, angle[..., None] * cell_normals[:, None])
+    np.add.at(mean_normals, cells, corner_angles[..., None] * cell_normals[:, None])
     mean_normals /= np.linalg.norm(mean_normals, axis=1, keepdims=True)
     min_cosine = np.ones(len(points))
     np.minimum.at(min_cosine, cells, (mean_normals[cells] * cell_normals[:, None]).sum(axis=2))
-    slopes, is_determined = _fit_slopes(points, cells, mean_normals)
+    node_slopes, is_determined = _fit_slopes(points, cells, mean_normals)
     is_smooth_node = (min_cosine > _MIN_CREASE_COSINE) & is_determined
-    fitted_normals = mean_normals - np.where(is_smooth_node[:, None], slopes, 0)
+    fitted_normals = mean_normals - np.where(is_smooth_node[:, None], node_slopes, 0)
     return fitted_normals / np.linalg.norm(fitted_normals, axis=1, keepdims=True)
 
 
-def _fit_slopes(points: np.ndarray, cells: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _fit_slopes(
+    points: np.ndarray, cells: np.ndarray, node_normal_estimates: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Fit a quadratic surface to the first and second neighbours of each node, as a height above the plane
-    perpendicular to `normal`. Returns the slopes (n, 3) of the fit at the nodes, and whether the neighbours determine
-    the fit."""
+    perpendicular to `node_normal_estimates`. Returns the slopes (n, 3) of the fit at the nodes, and whether the
+    neighbours determine the fit."""
     num_nodes = len(points)
-    pairs = np.concatenate([cells[:, [a, b]] for a in range(3) for b in range(3)])
-    adjacency = coo_array((np.ones(len(pairs)), pairs.T), shape=(num_nodes, num_nodes)).tocsr()
-    two_ring_neighbours = coo_array(adjacency @ adjacency)
-    centre_node, neighbour = two_ring_neighbours.row, two_ring_neighbours.col
-    is_distinct = centre_node != neighbour
-    centre_node, neighbour = centre_node[is_distinct], neighbour[is_distinct]
-    auxiliary_axis = np.eye(3)[np.abs(normal).argmin(axis=1)]
-    first_axis = np.cross(normal, auxiliary_axis)
+    node_pairs = np.concatenate([cells[:, [a, b]] for a in range(3) for b in range(3)])
+    adjacency_matrix = coo_array((np.ones(len(node_pairs)), node_pairs.T), shape=(num_nodes, num_nodes)).tocsr()
+    two_ring_neighbours = coo_array(adjacency_matrix @ adjacency_matrix)
+    centre_node, neighbour_node = two_ring_neighbours.row, two_ring_neighbours.col
+    is_distinct = centre_node != neighbour_node
+    centre_node, neighbour_node = centre_node[is_distinct], neighbour_node[is_distinct]
+    auxiliary_axis = np.eye(3)[np.abs(node_normal_estimates).argmin(axis=1)]
+    first_axis = np.cross(node_normal_estimates, auxiliary_axis)
     first_axis /= np.linalg.norm(first_axis, axis=1, keepdims=True)
-    axes = np.stack([first_axis, np.cross(normal, first_axis), normal], axis=1)  # (n, 3, 3)
-    offset = np.einsum("pij,pj->pi", axes[centre_node], points[neighbour] - points[centre_node])
-    scale = np.sqrt(
-        np.bincount(centre_node, (offset**2).sum(axis=1), num_nodes) / np.bincount(centre_node, minlength=num_nodes)
+    # Local axes (n, 3, 3).
+    local_axes = np.stack([first_axis, np.cross(node_normal_estimates, first_axis), node_normal_estimates], axis=1)
+    local_offsets = np.einsum("pij,pj->pi", local_axes[centre_node], points[neighbour_node] - points[centre_node])
+    neighbourhood_radii = np.sqrt(
+        np.bincount(centre_node, (local_offsets**2).sum(axis=1), num_nodes)
+        / np.bincount(centre_node, minlength=num_nodes)
     )
-    u, v, height = (offset / scale[centre_node][:, None]).T
+    u, v, scaled_heights = (local_offsets / neighbourhood_radii[centre_node][:, None]).T
     quadratic_terms = np.stack([u, v, u * u / 2, u * v, v * v / 2], axis=1)
-    matrix, right_hand_side = (
+    normal_matrix, right_hand_side = (
         np.zeros((num_nodes, _NUM_COEFFICIENTS, _NUM_COEFFICIENTS)),
         np.zeros((num_nodes, _NUM_COEFFICIENTS)),
     )
     for k in range(_NUM_COEFFICIENTS):
-        right_hand_side[:, k] = np.bincount(centre_node, quadratic_terms[:, k] * height, num_nodes)
+        right_hand_side[:, k] = np.bincount(centre_node, quadratic_terms[:, k] * scaled_heights, num_nodes)
         for j in range(_NUM_COEFFICIENTS):
-            matrix[:, k, j] = np.bincount(centre_node, quadratic_terms[:, k] * quadratic_terms[:, j], num_nodes)
-    eigenvalues = np.linalg.eigvalsh(matrix)
-    is_determined = eigenvalues[:, 0] > _MIN_EIGENVALUE_RATIO * eigenvalues[:, -1]
-    matrix[~is_determined] = np.eye(_NUM_COEFFICIENTS)
-    slopes = np.linalg.solve(matrix, right_hand_side[..., None])[:, :2, 0]
-    return np.einsum("ni,nij->nj", slopes, axes[:, :2]), is_determined
+            normal_matrix[:, k, j] = np.bincount(centre_node, quadratic_terms[:, k] * quadratic_terms[:, j], num_nodes)
+    matrix_eigenvalues = np.linalg.eigvalsh(normal_matrix)
+    is_determined = matrix_eigenvalues[:, 0] > _MIN_EIGENVALUE_RATIO * matrix_eigenvalues[:, -1]
+    normal_matrix[~is_determined] = np.eye(_NUM_COEFFICIENTS)
+    height_slopes = np.linalg.solve(normal_matrix, right_hand_side[..., None])[:, :2, 0]
+    return np.einsum("ni,nij->nj", height_slopes, local_axes[:, :2]), is_determined
 
 
 # Distance from a fold to a node, divided by the distance between folds, below which the fold is moved onto the node, to
@@ -170,67 +177,85 @@ def bend(mesh: Mesh, radius: float, *, axis: str = "y", num_folds: int | None = 
     bent_axis = 0 if axis == "y" else 1
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
     fold_positions = _fold_positions(points[:, bent_axis], points[cells], bent_axis, num_folds)
-    edges = {name: np.asarray(mesh.facets)[np.asarray(facet_indices)] for name, facet_indices in mesh.tags.items()}
+    tagged_edges = {
+        name: np.asarray(mesh.facets)[np.asarray(facet_indices)] for name, facet_indices in mesh.tags.items()
+    }
     for line in fold_positions[1:-1]:
-        points, cells, edges = _cut_cells(points, cells, edges, points[:, bent_axis] - line)
+        points, cells, tagged_edges = _cut_cells(points, cells, tagged_edges, points[:, bent_axis] - line)
     horizontal_coordinate, vertical_coordinate = _roll_coordinates(points[:, bent_axis], fold_positions, float(radius))
-    columns = (
+    coordinate_columns = (
         [horizontal_coordinate, points[:, 1], vertical_coordinate]
         if bent_axis == 0
         else [points[:, 0], horizontal_coordinate, vertical_coordinate]
     )
-    return Mesh.create(np.stack(columns, axis=1), cells, tags=edges)
+    return Mesh.create(np.stack(coordinate_columns, axis=1), cells, tags=tagged_edges)
 
 
-def _fold_positions(positions: np.ndarray, corners: np.ndarray, bent_axis: int, num_folds: int | None) -> np.ndarray:
+def _fold_positions(
+    sheet_positions: np.ndarray, cell_corners: np.ndarray, bent_axis: int, num_folds: int | None
+) -> np.ndarray:
     """Coordinates in metres, across the sheet, of the lines along which it is bent, including the two borders of the
     sheet."""
-    width = np.ptp(positions)
-    sorted_positions = np.sort(positions)
-    rows = sorted_positions[np.concatenate([[True], np.diff(sorted_positions) > _LINE_TOLERANCE * width])]
-    coordinates = corners[..., bent_axis]
+    sheet_width = np.ptp(sheet_positions)
+    sorted_positions = np.sort(sheet_positions)
+    distinct_positions = sorted_positions[
+        np.concatenate([[True], np.diff(sorted_positions) > _LINE_TOLERANCE * sheet_width])
+    ]
+    corner_coordinates = cell_corners[..., bent_axis]
     first_row, last_row = (
-        np.searchsorted(rows, side - _LINE_TOLERANCE * width)
-        for side in (coordinates.min(axis=1), coordinates.max(axis=1))
+        np.searchsorted(distinct_positions, side_coordinates - _LINE_TOLERANCE * sheet_width)
+        for side_coordinates in (corner_coordinates.min(axis=1), corner_coordinates.max(axis=1))
     )
     if num_folds is None and (last_row - first_row <= 1).all():
-        return rows
-    mean_edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean()
-    lines = np.linspace(rows[0], rows[-1], 1 + (num_folds or max(1, round(width / mean_edge))))
-    nearest_positions = sorted_positions[np.abs(sorted_positions - lines[:, None]).argmin(axis=1)]
-    is_near = np.abs(nearest_positions - lines) < _FOLD_SNAP_DISTANCE * (lines[1] - lines[0])
-    return np.where(is_near, nearest_positions, lines)
+        return distinct_positions
+    mean_edge_length = np.linalg.norm(cell_corners - np.roll(cell_corners, 1, axis=1), axis=2).mean()
+    fold_lines = np.linspace(
+        distinct_positions[0], distinct_positions[-1], 1 + (num_folds or max(1, round(sheet_width / mean_edge_length)))
+    )
+    nearest_positions = sorted_positions[np.abs(sorted_positions - fold_lines[:, None]).argmin(axis=1)]
+    is_near = np.abs(nearest_positions - fold_lines) < _FOLD_SNAP_DISTANCE * (fold_lines[1] - fold_lines[0])
+    return np.where(is_near, nearest_positions, fold_lines)
 
 
 def _cut_cells(
-    points: np.ndarray, cells: np.ndarray, edges: dict[str, np.ndarray], height: np.ndarray
+    points: np.ndarray, cells: np.ndarray, edges_by_tag: dict[str, np.ndarray], height_over_line: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Cut cells and named edges along a line; `height` (n,): signed distances of the nodes from the line."""
-    side = np.where(np.abs(height) <= _LINE_TOLERANCE * np.ptp(height), 0, np.sign(height)).astype(int)
-    sides = side[cells]
-    is_crossed = (sides.min(axis=1) < 0) & (sides.max(axis=1) > 0)
+    """Cut cells and named edges along a line; `height_over_line` (n,): signed distances of the nodes from the line."""
+    node_sides = np.where(
+        np.abs(height_over_line) <= _LINE_TOLERANCE * np.ptp(height_over_line), 0, np.sign(height_over_line)
+    ).astype(int)
+    cell_sides = node_sides[cells]
+    is_crossed = (cell_sides.min(axis=1) < 0) & (cell_sides.max(axis=1) > 0)
     if not is_crossed.any():
-        return points, cells, edges
-    pairs = np.sort(cells[is_crossed][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    pairs = np.unique(pairs[side[pairs].prod(axis=1) < 0], axis=0)
-    fraction = (height[pairs[:, 0]] / (height[pairs[:, 0]] - height[pairs[:, 1]]))[:, None]
-    midpoint_nodes = {(a, b): len(points) + k for k, (a, b) in enumerate(map(tuple, pairs.tolist()))}
-    points = np.concatenate([points, (1 - fraction) * points[pairs[:, 0]] + fraction * points[pairs[:, 1]]])
+        return points, cells, edges_by_tag
+    crossed_edges = np.sort(cells[is_crossed][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    crossed_edges = np.unique(crossed_edges[node_sides[crossed_edges].prod(axis=1) < 0], axis=0)
+    crossing_fractions = (
+        height_over_line[crossed_edges[:, 0]]
+        / (height_over_line[crossed_edges[:, 0]] - height_over_line[crossed_edges[:, 1]])
+    )[:, None]
+    midpoint_nodes = {(a, b): len(points) + k for k, (a, b) in enumerate(map(tuple, crossed_edges.tolist()))}
+    points = np.concatenate(
+        [
+            points,
+            (1 - crossing_fractions) * points[crossed_edges[:, 0]] + crossing_fractions * points[crossed_edges[:, 1]],
+        ]
+    )
 
     def midpoint_node(a: int, b: int) -> int:
         return midpoint_nodes[min(a, b), max(a, b)]
 
     new_cells = []
-    for corners in cells[is_crossed].tolist():
-        signs = side[corners].tolist()
-        if 0 in signs:
-            k = signs.index(0)
-            a, b, c = corners[k:] + corners[:k]
+    for crossed_corners in cells[is_crossed].tolist():
+        corner_signs = node_sides[crossed_corners].tolist()
+        if 0 in corner_signs:
+            k = corner_signs.index(0)
+            a, b, c = crossed_corners[k:] + crossed_corners[:k]
             first_midpoint = midpoint_node(b, c)
             new_cells += [(a, b, first_midpoint), (a, first_midpoint, c)]
         else:
-            k = signs.index(-sum(signs))
-            a, b, c = corners[k:] + corners[:k]
+            k = corner_signs.index(-sum(corner_signs))
+            a, b, c = crossed_corners[k:] + crossed_corners[:k]
             first_midpoint, second_midpoint = midpoint_node(a, b), midpoint_node(a, c)
             new_cells.append((a, first_midpoint, second_midpoint))
             is_first_diagonal_shorter = np.linalg.norm(points[first_midpoint] - points[c]) < np.linalg.norm(
@@ -242,8 +267,8 @@ def _cut_cells(
                 else [(first_midpoint, b, second_midpoint), (b, c, second_midpoint)]
             )
     named_edges = {}
-    for name, edge_ends in edges.items():
-        is_crossed_edge = side[edge_ends].prod(axis=1) < 0
+    for name, edge_ends in edges_by_tag.items():
+        is_crossed_edge = node_sides[edge_ends].prod(axis=1) < 0
         edge_halves = [
             [(a, midpoint_node(a, b)), (midpoint_node(a, b), b)] for a, b in edge_ends[is_crossed_edge].tolist()
         ]
@@ -252,28 +277,33 @@ def _cut_cells(
 
 
 def _roll_coordinates(
-    positions: np.ndarray, fold_positions: np.ndarray, radius: float
+    sheet_positions: np.ndarray, fold_positions: np.ndarray, radius: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Horizontal and vertical coordinates of positions (n,) on the sheet after bending. The `fold_positions` lie on a
     circle; the middle of the sheet stays at 0."""
     sheet_centre = (fold_positions[0] + fold_positions[-1]) / 2
     if np.isinf(radius):
-        return positions - sheet_centre, np.zeros_like(positions)
+        return sheet_positions - sheet_centre, np.zeros_like(sheet_positions)
     strip_widths = np.diff(fold_positions)
-    size = abs(radius)
-    too_wide = strip_widths.max() > 2 * size
-    fold_angles = 2 * np.arcsin(np.minimum(strip_widths / (2 * size), 1))
-    if too_wide or fold_angles.sum() >= 2 * np.pi:
-        width = fold_positions[-1] - fold_positions[0]
+    bend_radius = abs(radius)
+    is_too_wide = strip_widths.max() > 2 * bend_radius
+    fold_angles = 2 * np.arcsin(np.minimum(strip_widths / (2 * bend_radius), 1))
+    if is_too_wide or fold_angles.sum() >= 2 * np.pi:
+        sheet_width = fold_positions[-1] - fold_positions[0]
         raise ValueError(
-            f"radius: a sheet {width:.4g} m wide would overlap itself on a cylinder of radius {size:.4g} m. It needs "
-            f"more than {width / (2 * np.pi):.4g} m, and finer cells where these are large; a closed sleeve is a "
-            "jeit.mesh.tube."
+            f"radius: a sheet {sheet_width:.4g} m wide would overlap itself on a cylinder of radius {bend_radius:.4g} "
+            f"m. It needs more than {sheet_width / (2 * np.pi):.4g} m, and finer cells where these are large; a closed "
+            "sleeve is a jeit.mesh.tube."
         )
-    angle = np.concatenate([[0.0], np.cumsum(fold_angles)])
-    angle -= np.interp(sheet_centre, fold_positions, angle)
-    horizontal, vertical = size * np.sin(angle), size * (np.cos(angle) - 1) * np.sign(radius)
-    return np.interp(positions, fold_positions, horizontal), np.interp(positions, fold_positions, vertical)
+    fold_line_angles = np.concatenate([[0.0], np.cumsum(fold_angles)])
+    fold_line_angles -= np.interp(sheet_centre, fold_positions, fold_line_angles)
+    horizontal_of_folds, vertical_of_folds = (
+        bend_radius * np.sin(fold_line_angles),
+        bend_radius * (np.cos(fold_line_angles) - 1) * np.sign(radius),
+    )
+    return np.interp(sheet_positions, fold_positions, horizontal_of_folds), np.interp(
+        sheet_positions, fold_positions, vertical_of_folds
+    )
 
 
 _SHELL_TAGS = ("inner", "outer", "side")
@@ -317,84 +347,89 @@ def shell(
         raise ValueError("surface: this mesh is flat, and a shell needs a surface in space; use jeit.mesh.layer.")
     thickness = check_length("thickness", thickness)
     num_layers = unstructured.check_count("num_layers", num_layers, 1)
-    points, cells, facets = (np.asarray(array) for array in (surface.points, surface.cells, surface.facets))
+    points, cells, border_edges = (np.asarray(array) for array in (surface.points, surface.cells, surface.facets))
     num_nodes = len(points)
     unstructured.check_total(num_nodes * (num_layers + 1), "num_layers")
-    directions = node_normals(surface) if normals is None else _check_normals(normals, num_nodes)
-    directions = directions if outward else -directions
-    tetrahedra = stacked_cells(cells, num_nodes, num_layers)
+    node_directions = node_normals(surface) if normals is None else _check_normals(normals, num_nodes)
+    node_directions = node_directions if outward else -node_directions
+    shell_tetrahedra = stacked_cells(cells, num_nodes, num_layers)
     # Sorting the corners in `stacked_cells` inverts some prisms. The second of the three tetrahedra of a prism has the
     # opposite orientation to the other two tetrahedra.
-    orientation = np.where(odd_permutation(cells) ^ (not outward), -1.0, 1.0)
-    tetrahedron_signs = np.tile(np.outer(orientation, (1, -1, 1)).ravel(), num_layers)
+    orientation_signs = np.where(odd_permutation(cells) ^ (not outward), -1.0, 1.0)
+    tetrahedron_signs = np.tile(np.outer(orientation_signs, (1, -1, 1)).ravel(), num_layers)
 
-    def layer_points(height: float) -> np.ndarray:
-        return np.concatenate([points + k * height / num_layers * directions for k in range(num_layers + 1)])
+    def layer_points(layer_height: float) -> np.ndarray:
+        return np.concatenate([points + k * layer_height / num_layers * node_directions for k in range(num_layers + 1)])
 
-    _check_upright(layer_points, tetrahedra, tetrahedron_signs, thickness, len(cells))
-    tags: dict[str, ArrayLike] = {"inner": cells, "outer": cells + num_layers * num_nodes}
+    _check_upright(layer_points, shell_tetrahedra, tetrahedron_signs, thickness, len(cells))
+    tagged_facets: dict[str, ArrayLike] = {"inner": cells, "outer": cells + num_layers * num_nodes}
     if not outward:
-        tags = {"outer": tags["inner"], "inner": tags["outer"]}
-    if len(facets):
-        tags["side"] = stacked_wall(facets, num_nodes, num_layers)
+        tagged_facets = {"outer": tagged_facets["inner"], "inner": tagged_facets["outer"]}
+    if len(border_edges):
+        tagged_facets["side"] = stacked_wall(border_edges, num_nodes, num_layers)
     for name, facet_indices in surface.tags.items():
         if name in _SHELL_TAGS:
             raise ValueError(f"surface: its tag {name!r} is taken in a shell. Rename it.")
-        tags[name] = stacked_wall(facets[np.asarray(facet_indices)], num_nodes, num_layers)
-    mesh = Mesh.create(layer_points(thickness), tetrahedra, tags=tags)
+        tagged_facets[name] = stacked_wall(border_edges[np.asarray(facet_indices)], num_nodes, num_layers)
+    mesh = Mesh.create(layer_points(thickness), shell_tetrahedra, tags=tagged_facets)
     _check_no_self_contact(mesh, thickness)
     return mesh
 
 
 def _check_normals(normals: ArrayLike, num_nodes: int) -> np.ndarray:
-    directions = np.asarray(normals, dtype=float)
-    if directions.shape != (num_nodes, 3) or not np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-6):
+    unit_normals = np.asarray(normals, dtype=float)
+    if unit_normals.shape != (num_nodes, 3) or not np.allclose(np.linalg.norm(unit_normals, axis=1), 1, atol=1e-6):
         raise ValueError(
-            f"normals: expected unit vectors at the nodes, shape ({num_nodes}, 3), got shape {directions.shape}."
+            f"normals: expected unit vectors at the nodes, shape ({num_nodes}, 3), got shape {unit_normals.shape}."
         )
-    return directions
+    return unit_normals
 
 
-def _volumes(points: np.ndarray, tetrahedra: np.ndarray, tetrahedron_signs: np.ndarray) -> np.ndarray:
-    edges = points[tetrahedra[:, 1:]] - points[tetrahedra[:, :1]]
-    return tetrahedron_signs * np.linalg.det(edges) / 6
+def _scaled_tetrahedron_volumes(
+    points: np.ndarray, tetrahedra: np.ndarray, tetrahedron_signs: np.ndarray
+) -> np.ndarray:
+    edge_vectors = points[tetrahedra[:, 1:]] - points[tetrahedra[:, :1]]
+    return tetrahedron_signs * np.linalg.det(edge_vectors) / 6
 
 
 def _check_upright(
     layer_points, tetrahedra: np.ndarray, tetrahedron_signs: np.ndarray, thickness: float, num_triangles: int
 ) -> None:
-    volume = _volumes(layer_points(thickness), tetrahedra, tetrahedron_signs)
-    if volume.min() > 0:
+    scaled_volumes = _scaled_tetrahedron_volumes(layer_points(thickness), tetrahedra, tetrahedron_signs)
+    if scaled_volumes.min() > 0:
         return
-    if thickness > (size := float(np.ptp(layer_points(0.0), axis=0).max())):
+    if thickness > (surface_extent := float(np.ptp(layer_points(0.0), axis=0).max())):
         raise ValueError(
-            f"thickness: {thickness:.4g} m is more than the surface is large, {size:.4g} m. Are both in metres? If the "
-            f"thickness is millimetres, give {1e-3 * thickness:.4g}; if the surface came from a file of another unit, "
-            "read it with that: jeit.mesh.read(..., scale=1e-3) for millimetres, 0.0254 for inches, 1 for metres."
+            f"thickness: {thickness:.4g} m is more than the surface is large, {surface_extent:.4g} m. Are both in "
+            f"metres? If the thickness is millimetres, give {1e-3 * thickness:.4g}; if the surface came from a file of "
+            "another unit, read it with that: jeit.mesh.read(..., scale=1e-3) for millimetres, 0.0254 for inches, 1 "
+            "for metres."
         )
     lower_thickness, upper_thickness = 0.0, thickness
     for _ in range(_BISECTION_STEPS):
-        middle_thickness = (lower_thickness + upper_thickness) / 2
-        is_upright = _volumes(layer_points(middle_thickness), tetrahedra, tetrahedron_signs).min() > 0
+        trial_thickness = (lower_thickness + upper_thickness) / 2
+        is_upright = _scaled_tetrahedron_volumes(layer_points(trial_thickness), tetrahedra, tetrahedron_signs).min() > 0
         lower_thickness, upper_thickness = (
-            (middle_thickness, upper_thickness) if is_upright else (lower_thickness, middle_thickness)
+            (trial_thickness, upper_thickness) if is_upright else (lower_thickness, trial_thickness)
         )
-    worst_tetrahedron = int(np.argmin(_volumes(layer_points(upper_thickness), tetrahedra, tetrahedron_signs)))
-    triangle = worst_tetrahedron // 3 % num_triangles
-    position = layer_points(0.0)[tetrahedra[worst_tetrahedron, 0]].round(6).tolist()
+    worst_tetrahedron = int(
+        np.argmin(_scaled_tetrahedron_volumes(layer_points(upper_thickness), tetrahedra, tetrahedron_signs))
+    )
+    worst_triangle = worst_tetrahedron // 3 % num_triangles
+    worst_position = layer_points(0.0)[tetrahedra[worst_tetrahedron, 0]].round(6).tolist()
     max_thickness = (1 - 5e-4) * lower_thickness  # does not exceed `lower_thickness` after rounding to four digits
     raise ValueError(
-        f"thickness: {thickness:.4g} m is more than the radius of curvature of the surface at triangle {triangle}, "
-        f"near {position} m: the skin turns inside out there. It can be {max_thickness:.4g} m thick at most; or let it "
-        "grow to the other side, or smooth the surface."
+        f"thickness: {thickness:.4g} m is more than the radius of curvature of the surface at triangle "
+        f"{worst_triangle}, near {worst_position} m: the skin turns inside out there. It can be {max_thickness:.4g} m "
+        "thick at most; or let it grow to the other side, or smooth the surface."
     )
 
 
 def _check_no_self_contact(mesh: Mesh, thickness: float) -> None:
-    points, boundary = np.asarray(mesh.points), np.asarray(mesh.facets)
-    if (pair := first_crossing(points, boundary)) is not None:
-        position = points[boundary[pair[0]]].mean(axis=0).round(6).tolist()
+    points, boundary_triangles = np.asarray(mesh.points), np.asarray(mesh.facets)
+    if (contact_pair := first_crossing(points, boundary_triangles)) is not None:
+        contact_position = points[boundary_triangles[contact_pair[0]]].mean(axis=0).round(6).tolist()
         raise ValueError(
-            f"thickness: a skin {thickness:.4g} m thick grows into itself near {position} m, where parts of the "
-            "surface lie closer together than that. Make it thinner."
+            f"thickness: a skin {thickness:.4g} m thick grows into itself near {contact_position} m, where parts of "
+            "the surface lie closer together than that. Make it thinner."
         )

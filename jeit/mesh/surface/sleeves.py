@@ -51,8 +51,8 @@ def tube(
     ```
     """
     radius, height = check_length("radius", radius), check_length("height", height)
-    num_per_ring, rows = _node_counts(2 * np.pi * radius, height, num_points, cell_size, num_around)
-    return _sleeve_mesh(height, np.full((rows + 1, 2), radius), num_per_ring)
+    num_per_ring, num_rows = _node_counts(2 * np.pi * radius, height, num_points, cell_size, num_around)
+    return _sleeve_mesh(height, np.full((num_rows + 1, 2), radius), num_per_ring)
 
 
 def forearm(
@@ -85,22 +85,24 @@ def forearm(
     ```
     """
     length = check_length("length", length)
-    ends = np.stack([_semi_axes("wrist", wrist), _semi_axes("elbow", elbow)])
-    mean_girth = float(np.mean([_arc_lengths(*end)[-1] for end in ends]))
-    slant_length = float(np.hypot(length, np.abs(ends[1] - ends[0]).mean()))
-    num_per_ring, rows = _node_counts(mean_girth, slant_length, num_points, cell_size, num_around)
-    fractions = np.linspace(0, 1, rows + 1)[:, None]
-    return _sleeve_mesh(length, (1 - fractions) * ends[0] + fractions * ends[1], num_per_ring)
+    end_semi_axes = np.stack([_semi_axes("wrist", wrist), _semi_axes("elbow", elbow)])
+    mean_girth = float(np.mean([_arc_lengths(*semi_axes_of_end)[-1] for semi_axes_of_end in end_semi_axes]))
+    slant_length = float(np.hypot(length, np.abs(end_semi_axes[1] - end_semi_axes[0]).mean()))
+    num_per_ring, num_rows = _node_counts(mean_girth, slant_length, num_points, cell_size, num_around)
+    height_fractions = np.linspace(0, 1, num_rows + 1)[:, None]
+    return _sleeve_mesh(
+        length, (1 - height_fractions) * end_semi_axes[0] + height_fractions * end_semi_axes[1], num_per_ring
+    )
 
 
-def _semi_axes(name: str, radii: float | Sequence[float]) -> np.ndarray:
+def _semi_axes(name: str, given_radii: float | Sequence[float]) -> np.ndarray:
     try:
-        semi_axes = np.asarray(radii, dtype=float)
+        semi_axes = np.asarray(given_radii, dtype=float)
     except (TypeError, ValueError):
         semi_axes = np.zeros(3)
     if semi_axes.shape not in ((), (2,)):
         raise ValueError(f"{name}: give a radius in metres, or two, along x and along y.")
-    return np.array([check_length(name, float(value)) for value in np.broadcast_to(semi_axes, 2)])
+    return np.array([check_length(name, float(semi_axis)) for semi_axis in np.broadcast_to(semi_axes, 2)])
 
 
 def _node_counts(
@@ -112,63 +114,81 @@ def _node_counts(
             raise ValueError("num_around: give it, num_points or cell_size, not two of them.")
         num_per_ring = unstructured.check_count("num_around", num_around, _MIN_NODES_AROUND_SLEEVE)
         return num_per_ring, max(1, round(height / (_RELATIVE_ROW_HEIGHT * girth / num_per_ring)))
-    target = unstructured.MeshTarget.create(num_points, cell_size)
-    if target.cell_size is None:
+    mesh_target = unstructured.MeshTarget.create(num_points, cell_size)
+    if mesh_target.cell_size is None:
         # Number of nodes n = (g / h) (H / (0.87 h) + 1), with the girth g, the height H and the edge length h.
-        num_nodes = target.num_points
-        edge = np.sqrt(girth * height / (_RELATIVE_ROW_HEIGHT * num_nodes))
+        num_nodes = mesh_target.num_points
+        edge_length = np.sqrt(girth * height / (_RELATIVE_ROW_HEIGHT * num_nodes))
         for _ in range(30):
-            edge = np.sqrt(girth * (height / _RELATIVE_ROW_HEIGHT + edge) / num_nodes)
-        rows = max(1, round(height / (_RELATIVE_ROW_HEIGHT * edge)))
-        num_per_ring = max(_MIN_NODES_AROUND_SLEEVE, round(num_nodes / (rows + 1)))
+            edge_length = np.sqrt(girth * (height / _RELATIVE_ROW_HEIGHT + edge_length) / num_nodes)
+        num_rows = max(1, round(height / (_RELATIVE_ROW_HEIGHT * edge_length)))
+        num_per_ring = max(_MIN_NODES_AROUND_SLEEVE, round(num_nodes / (num_rows + 1)))
     else:
-        num_per_ring = max(_MIN_NODES_AROUND_SLEEVE, round(girth / target.cell_size))
-        rows = max(1, round(height / (_RELATIVE_ROW_HEIGHT * girth / num_per_ring)))
-    unstructured.check_total(num_per_ring * (rows + 1), "num_points" if target.cell_size is None else "cell_size")
-    return num_per_ring, rows
+        num_per_ring = max(_MIN_NODES_AROUND_SLEEVE, round(girth / mesh_target.cell_size))
+        num_rows = max(1, round(height / (_RELATIVE_ROW_HEIGHT * girth / num_per_ring)))
+    unstructured.check_total(
+        num_per_ring * (num_rows + 1), "num_points" if mesh_target.cell_size is None else "cell_size"
+    )
+    return num_per_ring, num_rows
 
 
 def _arc_lengths(a: float, b: float) -> np.ndarray:
     """Arc length along an ellipse with semi-axes a and b, at evenly spaced values of its angular parameter."""
-    angle = np.linspace(0, 2 * np.pi, _NUM_ELLIPSE_SAMPLES + 1)
-    corners = np.stack([a * np.cos(angle), b * np.sin(angle)], axis=1)
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    angular_parameters = np.linspace(0, 2 * np.pi, _NUM_ELLIPSE_SAMPLES + 1)
+    ellipse_points = np.stack([a * np.cos(angular_parameters), b * np.sin(angular_parameters)], axis=1)
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ellipse_points, axis=0), axis=1))])
 
 
 def _sleeve_mesh(height: float, semi_axes: np.ndarray, num_per_ring: int) -> Mesh:
     """Mesh a sleeve from rows of nodes on ellipses with `semi_axes` (r + 1, 2), evenly spaced along each ellipse."""
-    rings = []
-    for row, (a, b) in enumerate(semi_axes):
-        relative_angles = (np.arange(num_per_ring) + row % 2 / 2) / num_per_ring
-        angle = 2 * np.pi * relative_angles
+    ring_points = []
+    for row_number, (a, b) in enumerate(semi_axes):
+        relative_angles = (np.arange(num_per_ring) + row_number % 2 / 2) / num_per_ring
+        node_angles = 2 * np.pi * relative_angles
         if a != b:
-            length = _arc_lengths(a, b)
-            angle = np.interp(relative_angles * length[-1], length, np.linspace(0, 2 * np.pi, _NUM_ELLIPSE_SAMPLES + 1))
-        rings.append(np.stack([a * np.cos(angle), b * np.sin(angle), np.full(num_per_ring, height * row)], axis=1))
-    points = np.concatenate(rings)
+            arc_length_samples = _arc_lengths(a, b)
+            node_angles = np.interp(
+                relative_angles * arc_length_samples[-1],
+                arc_length_samples,
+                np.linspace(0, 2 * np.pi, _NUM_ELLIPSE_SAMPLES + 1),
+            )
+        ring_points.append(
+            np.stack(
+                [a * np.cos(node_angles), b * np.sin(node_angles), np.full(num_per_ring, height * row_number)], axis=1
+            )
+        )
+    points = np.concatenate(ring_points)
     points[:, 2] /= len(semi_axes) - 1
     node_index = np.arange(len(points)).reshape(len(semi_axes), num_per_ring)
     cells = [
-        _triangles_between_rings(lower_ring, upper_ring, row % 2)
-        for row, (lower_ring, upper_ring) in enumerate(pairwise(node_index))
+        _triangles_between_rings(lower_ring, upper_ring, row_number % 2)
+        for row_number, (lower_ring, upper_ring) in enumerate(pairwise(node_index))
     ]
 
-    def loop(ring: np.ndarray) -> np.ndarray:
+    def ring_edges(ring: np.ndarray) -> np.ndarray:
         return np.stack([ring, np.roll(ring, -1)], axis=1)
 
-    return Mesh.create(points, np.concatenate(cells), tags={"bottom": loop(node_index[0]), "top": loop(node_index[-1])})
+    return Mesh.create(
+        points, np.concatenate(cells), tags={"bottom": ring_edges(node_index[0]), "top": ring_edges(node_index[-1])}
+    )
 
 
-def _triangles_between_rings(lower_ring: np.ndarray, upper_ring: np.ndarray, lower_is_ahead: int) -> np.ndarray:
-    """Triangles between two rings with equal numbers of nodes, offset by half the node spacing; `lower_is_ahead`:
+def _triangles_between_rings(lower_ring: np.ndarray, upper_ring: np.ndarray, is_lower_ahead: int) -> np.ndarray:
+    """Triangles between two rings with equal numbers of nodes, offset by half the node spacing; `is_lower_ahead`:
     whether the nodes of the lower ring are ahead by this offset."""
-    next_low, next_high = np.roll(lower_ring, -1), np.roll(upper_ring, -1)
-    if lower_is_ahead:
+    next_lower_nodes, next_upper_nodes = np.roll(lower_ring, -1), np.roll(upper_ring, -1)
+    if is_lower_ahead:
         return np.concatenate(
-            [np.stack([lower_ring, next_low, next_high], 1), np.stack([lower_ring, next_high, upper_ring], 1)]
+            [
+                np.stack([lower_ring, next_lower_nodes, next_upper_nodes], 1),
+                np.stack([lower_ring, next_upper_nodes, upper_ring], 1),
+            ]
         )
     return np.concatenate(
-        [np.stack([lower_ring, next_low, upper_ring], 1), np.stack([next_low, next_high, upper_ring], 1)]
+        [
+            np.stack([lower_ring, next_lower_nodes, upper_ring], 1),
+            np.stack([next_lower_nodes, next_upper_nodes, upper_ring], 1),
+        ]
     )
 
 
@@ -192,26 +212,26 @@ def sphere(radius: float, *, num_points: int | None = None, cell_size: float | N
     ```
     """
     radius = check_length("radius", radius)
-    target = unstructured.MeshTarget.create(num_points, cell_size)
-    if target.cell_size is None:
-        num_divisions = max(1, round(np.sqrt((target.num_points - 2) / 10)))
+    mesh_target = unstructured.MeshTarget.create(num_points, cell_size)
+    if mesh_target.cell_size is None:
+        num_divisions = max(1, round(np.sqrt((mesh_target.num_points - 2) / 10)))
     else:
         # The area of the sphere is divided into 20 k² triangles of area (√3 / 4) h².
-        num_divisions = max(1, round(np.sqrt(4 * np.pi / 20 / (np.sqrt(3) / 4)) * radius / target.cell_size))
+        num_divisions = max(1, round(np.sqrt(4 * np.pi / 20 / (np.sqrt(3) / 4)) * radius / mesh_target.cell_size))
     unstructured.check_total(10 * num_divisions**2 + 2, "cell_size")
-    corners = _icosahedron()
-    face_nodes = corners[ConvexHull(corners).simplices]
+    icosahedron_corners = _icosahedron_corners()
+    face_nodes = icosahedron_corners[ConvexHull(icosahedron_corners).simplices]
     i, j = np.meshgrid(np.arange(num_divisions + 1), np.arange(num_divisions + 1), indexing="ij")
     is_inside = i + j <= num_divisions
-    weights = np.stack([num_divisions - i - j, i, j], axis=-1)[is_inside] / num_divisions
+    barycentric_weights = np.stack([num_divisions - i - j, i, j], axis=-1)[is_inside] / num_divisions
     node_index = np.full(is_inside.shape, -1)
     node_index[is_inside] = np.arange(is_inside.sum())
     upward_triangles = np.stack([node_index[:-1, :-1], node_index[1:, :-1], node_index[:-1, 1:]], axis=-1)
     downward_triangles = np.stack([node_index[1:, 1:], node_index[:-1, 1:], node_index[1:, :-1]], axis=-1)
     face_cells = np.concatenate([upward_triangles.reshape(-1, 3), downward_triangles.reshape(-1, 3)])
     face_cells = face_cells[(face_cells >= 0).all(axis=1)]
-    points = np.concatenate([weights @ face for face in face_nodes])
-    cells = np.concatenate([face_cells + k * len(weights) for k in range(len(face_nodes))])
+    points = np.concatenate([barycentric_weights @ face_corners for face_corners in face_nodes])
+    cells = np.concatenate([face_cells + k * len(barycentric_weights) for k in range(len(face_nodes))])
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     # Nodes on the edges of the icosahedron were created once for each of the two faces.
     points, cells = merge_points(points, cells, 1e-6 / num_divisions)
@@ -253,9 +273,9 @@ def cap(
         )
     flat_disk = disk(radius * float(angle), num_points=num_points, cell_size=cell_size, refine=refine)
     x, y = np.asarray(flat_disk.points).T
-    distance = np.hypot(x, y)
-    radial_factor = np.sinc(distance / radius / np.pi)  # sin(d / R) / (d / R)
-    points = np.stack([x * radial_factor, y * radial_factor, radius * np.cos(distance / radius)], axis=1)
+    axis_distances = np.hypot(x, y)
+    radial_factor = np.sinc(axis_distances / radius / np.pi)  # sin(d / R) / (d / R)
+    points = np.stack([x * radial_factor, y * radial_factor, radius * np.cos(axis_distances / radius)], axis=1)
     return Mesh.create(points, flat_disk.cells, tags={"edge": np.arange(flat_disk.num_facets)})
 
 
@@ -265,8 +285,8 @@ def _orient_outward(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
     return np.where(is_outward[:, None], cells, cells[:, [0, 2, 1]])
 
 
-def _icosahedron() -> np.ndarray:
+def _icosahedron_corners() -> np.ndarray:
     """Corners of an icosahedron (12, 3)."""
     golden_ratio = (1 + np.sqrt(5)) / 2
-    plane = np.array([[0, a, b * golden_ratio] for a in (1, -1) for b in (1, -1)])
-    return np.concatenate([np.roll(plane, k, axis=1) for k in range(3)]) / np.hypot(1, golden_ratio)
+    golden_rectangle = np.array([[0, a, b * golden_ratio] for a in (1, -1) for b in (1, -1)])
+    return np.concatenate([np.roll(golden_rectangle, k, axis=1) for k in range(3)]) / np.hypot(1, golden_ratio)

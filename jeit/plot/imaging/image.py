@@ -71,8 +71,10 @@ def check_body(mesh: Mesh, electrodes: AbstractElectrodes | None) -> None:
 
 def draw_outline(mesh: Mesh, ax: Axes) -> None:
     """Draw the boundary of a 2-D mesh, including holes."""
-    edges = np.asarray(mesh.points)[np.asarray(mesh.facets)]
-    ax.add_collection(LineCollection(list(edges), colors=DARK_GREY, linewidths=0.9, capstyle="round", zorder=2))
+    boundary_edges = np.asarray(mesh.points)[np.asarray(mesh.facets)]
+    ax.add_collection(
+        LineCollection(list(boundary_edges), colors=DARK_GREY, linewidths=0.9, capstyle="round", zorder=2)
+    )
 
 
 def draw_slice_outline(
@@ -82,8 +84,13 @@ def draw_slice_outline(
     metres."""
     # Pad by one pixel, so that the edge is closed where it touches the border of the picture.
     is_inside = np.pad(np.isfinite(pixels).astype(float), 1)
-    width, height = (extent[1] - extent[0]) / pixels.shape[1], (extent[3] - extent[2]) / pixels.shape[0]
-    padded_extent = (extent[0] - width, extent[1] + width, extent[2] - height, extent[3] + height)
+    pixel_width, pixel_height = (extent[1] - extent[0]) / pixels.shape[1], (extent[3] - extent[2]) / pixels.shape[0]
+    padded_extent = (
+        extent[0] - pixel_width,
+        extent[1] + pixel_width,
+        extent[2] - pixel_height,
+        extent[3] + pixel_height,
+    )
     ax.contour(is_inside, [0.5], extent=padded_extent, origin="upper", colors=DARK_GREY, linewidths=0.9, zorder=2)
 
 
@@ -132,17 +139,19 @@ def plot_image(
     """
     check_body(mesh, electrodes)
     check_scale(scale)
-    image = np.asarray(values)
-    if image.shape not in ((mesh.num_cells,), (mesh.num_points,)):
+    value_array = np.asarray(values)
+    if value_array.shape not in ((mesh.num_cells,), (mesh.num_points,)):
         raise ValueError(
-            f"values has shape {image.shape}; give one for each of the {mesh.num_cells} cells or the "
+            f"values has shape {value_array.shape}; give one for each of the {mesh.num_cells} cells or the "
             f"{mesh.num_points} nodes."
         )
-    if np.iscomplexobj(image):
+    if np.iscomplexobj(value_array):
         raise ValueError("values are complex; draw their real or imaginary part.")
     ax = get_or_create_axes(ax)
     if mesh.dimension == 3:
-        cell_image = image if image.shape == (mesh.num_cells,) else image[np.asarray(mesh.cells)].mean(axis=1)
+        cell_image = (
+            value_array if value_array.shape == (mesh.num_cells,) else value_array[np.asarray(mesh.cells)].mean(axis=1)
+        )
         raster = Raster.create(mesh, height=height)
         pixels, extent = np.asarray(raster.sample(jnp.asarray(cell_image))), raster.extent
         if not np.isfinite(pixels).any():
@@ -156,11 +165,11 @@ def plot_image(
         points = np.asarray(mesh.points)
         extent = extent_of(points)
         triangles = Triangulation(points[:, 0], points[:, 1], np.asarray(mesh.cells))
-        fitted_scale = scale.of(image, "S")
+        fitted_scale = scale.of(value_array, "S")
         # Edges in the colour of their cell prevent gaps between cells, through which the background would be visible.
         flat_style = {"shading": "flat", "edgecolors": "face", "linewidth": 0.5}
-        style = flat_style if image.shape == (mesh.num_cells,) else {"shading": "gouraud"}
-        mappable = ax.tripcolor(triangles, fitted_scale.factor * image, **style, **fitted_scale.keywords)
+        shading_style = flat_style if value_array.shape == (mesh.num_cells,) else {"shading": "gouraud"}
+        mappable = ax.tripcolor(triangles, fitted_scale.factor * value_array, **shading_style, **fitted_scale.keywords)
     _finish_axes(ax, mesh, electrodes, inclusions, extent, title)
     fitted_scale.draw_bar(ax, mappable)
     return ax
@@ -200,14 +209,14 @@ def plot_raster(
     return ax
 
 
-def _finish_axes(ax: Axes, mesh: Mesh | None, electrodes, inclusions, extent, title: str | None) -> None:
+def _finish_axes(ax: Axes, mesh: Mesh | None, electrodes, inclusions, axes_extent, title: str | None) -> None:
     if mesh is not None and mesh.dimension == 2:
         draw_outline(mesh, ax)
     if mesh is not None and electrodes is not None:
         draw_electrodes(mesh, electrodes, ax=ax)
     draw_inclusions(inclusions, ax=ax)
-    hide_axes(ax, extent, numbered=electrodes is not None)
-    draw_scale_bar(ax, extent)
+    hide_axes(ax, axes_extent, numbered=electrodes is not None)
+    draw_scale_bar(ax, axes_extent)
     if title:
         ax.set_title(title)
 
@@ -243,25 +252,30 @@ def plot_admittivity(
     plot_admittivity(mesh, image * (1 + 0.1j), electrodes)
     ```
     """
-    image: Any = np.asarray(values)
-    if not np.iscomplexobj(image):
+    complex_values: Any = np.asarray(values)
+    if not np.iscomplexobj(complex_values):
         raise ValueError("values are real; draw them with plot_image.")
     if figure is None:
         figure = Figure(figsize=(11.5, 5), layout="constrained")
     title_prefix = "Change of " if difference else ""
-    names = [f"{title_prefix}{name}" for name in ("conductivity σ", "susceptivity ωε")]
+    component_names = [f"{title_prefix}{name}" for name in ("conductivity σ", "susceptivity ωε")]
     first_component, second_component = (
         plot_image(
             mesh,
-            component,
+            component_values,
             electrodes,
             scale=ColourScale(difference=difference, quantity=name[0].upper() + name[1:], limit=colour_limit),
-            title=title,
+            title=component_title,
             ax=ax,
             **options,
         )
-        for ax, component, name, colour_limit, title in zip(
-            figure.subplots(1, 2), (image.real, image.imag), names, limits, titles, strict=True
+        for ax, component_values, name, colour_limit, component_title in zip(
+            figure.subplots(1, 2),
+            (complex_values.real, complex_values.imag),
+            component_names,
+            limits,
+            titles,
+            strict=True,
         )
     )
     return first_component, second_component
@@ -277,19 +291,19 @@ def plot_sensitivity(
     `model.voltages`, scalar or per cell, in S (3-D: S/m); `height` as in `plot_image`. Raises `ValueError` for a
     conductivity per node.
     """
-    jacobian = np.asarray(model.jacobian(conductivity))
-    if jacobian.shape[1] != model.mesh.num_cells:
+    jacobian_matrix = np.asarray(model.jacobian(conductivity))
+    if jacobian_matrix.shape[1] != model.mesh.num_cells:
         raise ValueError("conductivity: give a scalar or one value per cell, for a sensitivity per cell.")
-    density = np.linalg.norm(jacobian, axis=0) / np.asarray(measures(model.mesh))
-    decibels = 20 * np.log10(np.maximum(density / density.max(), 1e-12))
+    sensitivity_density = np.linalg.norm(jacobian_matrix, axis=0) / np.asarray(measures(model.mesh))
+    sensitivity_decibels = 20 * np.log10(np.maximum(sensitivity_density / sensitivity_density.max(), 1e-12))
     # The field is singular at the ends of electrodes, so 0 dB is set to the value exceeded in 1 % of the cells.
-    upper_limit = np.quantile(decibels, 0.99)
-    quantity = "Sensitivity per area (dB)" if model.mesh.dimension == 2 else "Sensitivity per volume (dB)"
+    upper_limit = np.quantile(sensitivity_decibels, 0.99)
+    quantity_label = "Sensitivity per area (dB)" if model.mesh.dimension == 2 else "Sensitivity per volume (dB)"
     return plot_image(
         model.mesh,
-        np.minimum(decibels, upper_limit) - upper_limit,
+        np.minimum(sensitivity_decibels, upper_limit) - upper_limit,
         model.electrodes,
-        scale=ColourScale(difference=False, quantity=quantity, unit="", limit=0.0, colour_map="magma"),
+        scale=ColourScale(difference=False, quantity=quantity_label, unit="", limit=0.0, colour_map="magma"),
         title=title,
         height=height,
         ax=ax,

@@ -83,21 +83,21 @@ class FramePicture:
         self.ax, self.fitted = ax, fitted
         self.raster = _make_raster(mesh) if raster is None else raster
         extent, is_inside = self.raster.extent, np.asarray(self.raster.cell) >= 0
-        body = np.where(is_inside, 0.0, np.nan)
-        ax.imshow(body, extent=extent, cmap=ListedColormap([_BODY_COLOUR]), interpolation="nearest", zorder=0)
-        self.mappable = ax.imshow(body, extent=extent, interpolation="nearest", zorder=1, **fitted.keywords)
+        body_pixels = np.where(is_inside, 0.0, np.nan)
+        ax.imshow(body_pixels, extent=extent, cmap=ListedColormap([_BODY_COLOUR]), interpolation="nearest", zorder=0)
+        self.mappable = ax.imshow(body_pixels, extent=extent, interpolation="nearest", zorder=1, **fitted.keywords)
         if mesh.dimension == 2:
             draw_outline(mesh, ax)
         else:
-            draw_slice_outline(body, extent, ax)
+            draw_slice_outline(body_pixels, extent, ax)
         if electrodes is not None:
             draw_electrodes(mesh, electrodes, numbers=show_numbers, ax=ax)
         hide_axes(ax, extent, numbered=show_numbers and electrodes is not None)
         if show_scale_bar:
             draw_scale_bar(ax, extent)
-        centre = (extent[0] + extent[1]) / 2, (extent[2] + extent[3]) / 2
-        style = {"ha": "center", "va": "center", "color": DARK_GREY, "fontsize": 10, "zorder": 5}
-        self.refusal_text = ax.text(*centre, "refused", **style)  # pyright: ignore[reportArgumentType]
+        extent_centre = (extent[0] + extent[1]) / 2, (extent[2] + extent[3]) / 2
+        text_style = {"ha": "center", "va": "center", "color": DARK_GREY, "fontsize": 10, "zorder": 5}
+        self.refusal_text = ax.text(*extent_centre, "refused", **text_style)  # pyright: ignore[reportArgumentType]
 
     def show(self, change: Float[np.ndarray, " m"], title: str) -> None:
         """Show a frame. `change`: change of conductivity per cell (m,), NaN for a refused frame."""
@@ -149,44 +149,54 @@ def plot_frames(
     ```
     """
     check_body(mesh, electrodes)
-    values = np.asarray(changes)
-    if values.ndim != 2 or values.shape[1] != mesh.num_cells or not len(values):
-        raise ValueError(f"changes has shape {values.shape}; give (frames, {mesh.num_cells}), one value for each cell.")
-    frame_titles = [f"frame {number}" for number in range(len(values))] if titles is None else list(titles)
-    if len(frame_titles) != len(values):
-        raise ValueError(f"titles are {len(frame_titles)}, and the frames {len(values)}; give one each.")
-    fitted_scale, selected = fit_scale(values, mesh, scale), select_frames(len(values), most)
-    columns = min(len(selected), 4)
-    rows = -(-len(selected) // columns)
-    figure = Figure(figsize=(2.3 * columns + 1.1, 2.5 * rows + 0.3), layout="constrained")
-    grid = figure.add_gridspec(rows, columns + 1, width_ratios=[1] * columns + [0.05])
-    raster, pictures = _make_raster(mesh), []
-    for panel_index, frame in enumerate(selected):
-        ax = figure.add_subplot(grid[panel_index // columns, panel_index % columns])
-        picture = FramePicture(
+    change_array = np.asarray(changes)
+    if change_array.ndim != 2 or change_array.shape[1] != mesh.num_cells or not len(change_array):
+        raise ValueError(
+            f"changes has shape {change_array.shape}; give (frames, {mesh.num_cells}), one value for each cell."
+        )
+    frame_titles = (
+        [f"frame {frame_number}" for frame_number in range(len(change_array))] if titles is None else list(titles)
+    )
+    if len(frame_titles) != len(change_array):
+        raise ValueError(f"titles are {len(frame_titles)}, and the frames {len(change_array)}; give one each.")
+    fitted_scale, selected_frames = fit_scale(change_array, mesh, scale), select_frames(len(change_array), most)
+    num_columns = min(len(selected_frames), 4)
+    num_rows = -(-len(selected_frames) // num_columns)
+    figure = Figure(figsize=(2.3 * num_columns + 1.1, 2.5 * num_rows + 0.3), layout="constrained")
+    panel_grid = figure.add_gridspec(num_rows, num_columns + 1, width_ratios=[1] * num_columns + [0.05])
+    raster, frame_pictures = _make_raster(mesh), []
+    for panel_index, frame in enumerate(selected_frames):
+        ax = figure.add_subplot(panel_grid[panel_index // num_columns, panel_index % num_columns])
+        frame_picture = FramePicture(
             ax, mesh, electrodes, fitted_scale, show_numbers=False, show_scale_bar=panel_index == 0, raster=raster
         )
-        picture.show(values[frame], frame_titles[frame])
-        pictures.append(picture)
+        frame_picture.show(change_array[frame], frame_titles[frame])
+        frame_pictures.append(frame_picture)
     if scale.bar:
-        colour_bar_axes = figure.add_subplot(grid[:, -1])
-        fitted_scale.draw_bar(colour_bar_axes, pictures[0].mappable, colour_bar_axes)
+        colour_bar_axes = figure.add_subplot(panel_grid[:, -1])
+        fitted_scale.draw_bar(colour_bar_axes, frame_pictures[0].mappable, colour_bar_axes)
     if count is None:
-        refused_titles = [title for title, row in zip(frame_titles, values, strict=True) if not np.isfinite(row).all()]
-        count = FrameCount(len(values), len(refused_titles), refused_titles)
-    text = _count_text(count, len(selected), mesh)
+        refused_titles = [
+            frame_title
+            for frame_title, frame_changes in zip(frame_titles, change_array, strict=True)
+            if not np.isfinite(frame_changes).all()
+        ]
+        count = FrameCount(len(change_array), len(refused_titles), refused_titles)
+    text = _count_text(count, len(selected_frames), mesh)
     if text:
         figure.supxlabel(text, fontsize=9, color=LIGHT_GREY)
     return figure
 
 
-def _count_text(count: FrameCount, num_drawn: int, mesh: Mesh) -> str:
+def _count_text(frame_count: FrameCount, num_drawn: int, mesh: Mesh) -> str:
     """Text about the number of frames drawn and about the refused frames of a stream."""
-    sentences = [] if num_drawn == count.number else [f"{num_drawn} of {count.number} frames"]
-    if count.refused:
-        names = ", ".join(count.names[:_MAX_NAMED_FRAMES]) + (" …" if count.refused > _MAX_NAMED_FRAMES else "")
-        sentences.append(f"{count.refused} of {count.number} refused: {names}")
-    return "; ".join([*sentences, *filter(None, [slice_text(mesh, beginning="slices")])])
+    count_sentences = [] if num_drawn == frame_count.number else [f"{num_drawn} of {frame_count.number} frames"]
+    if frame_count.refused:
+        refused_names = ", ".join(frame_count.names[:_MAX_NAMED_FRAMES]) + (
+            " …" if frame_count.refused > _MAX_NAMED_FRAMES else ""
+        )
+        count_sentences.append(f"{frame_count.refused} of {frame_count.number} refused: {refused_names}")
+    return "; ".join([*count_sentences, *filter(None, [slice_text(mesh, beginning="slices")])])
 
 
 # Minimum amplitude at which the phase is drawn: as a share of the maximum amplitude, and as a multiple of the noise of
@@ -220,58 +230,69 @@ def plot_series(
     frames_figure, maps_figure = subfigures
     raster = _make_raster(series.mesh, height)
     _draw_frames(frames_figure, series, electrodes, num_lines, raster)
-    grid = maps_figure.add_gridspec(num_rows + 1, 3, height_ratios=[1.0] * (num_rows + 1))
-    maps = _RegionMaps(series, electrodes, raster)
+    map_grid = maps_figure.add_gridspec(num_rows + 1, 3, height_ratios=[1.0] * (num_rows + 1))
+    region_maps = _RegionMaps(series, electrodes, raster)
     functional_title = ", ".join(filter(None, ["functional image", slice_text(series.mesh, height)]))
     deviation_scale = ColourScale(difference=False, quantity="Standard deviation over time")
-    maps.draw_map(maps_figure.add_subplot(grid[0, 0]), series.functional(), deviation_scale, functional_title)
-    for row, oscillation in enumerate(oscillations):
+    region_maps.draw_map(
+        maps_figure.add_subplot(map_grid[0, 0]), series.functional(), deviation_scale, functional_title
+    )
+    for panel_row, oscillation in enumerate(oscillations):
         amplitude_scale = ColourScale(difference=False, quantity=f"Amplitude at {oscillation.frequency:.3g} Hz")
-        title = f"{oscillation.frequency:.4g} Hz (resolution {oscillation.resolution:.2g} Hz)"
-        maps.draw_map(maps_figure.add_subplot(grid[row, 1]), oscillation.amplitude, amplitude_scale, title)
+        map_title = f"{oscillation.frequency:.4g} Hz (resolution {oscillation.resolution:.2g} Hz)"
+        region_maps.draw_map(
+            maps_figure.add_subplot(map_grid[panel_row, 1]), oscillation.amplitude, amplitude_scale, map_title
+        )
         has_phase = (oscillation.amplitude > _MIN_RELATIVE_AMPLITUDE_OF_PHASE * oscillation.amplitude.max()) & (
             oscillation.amplitude > _MIN_SIGNAL_TO_NOISE_OF_PHASE * oscillation.noise
         )
-        maps.draw_phase(
-            maps_figure.add_subplot(grid[row, 2]), np.where(has_phase, np.degrees(oscillation.phase), np.nan)
+        region_maps.draw_phase(
+            maps_figure.add_subplot(map_grid[panel_row, 2]), np.where(has_phase, np.degrees(oscillation.phase), np.nan)
         )
-    mean_changes = {name: series.mean_change(region) for name, region in regions.items()}
-    max_change = max((float(np.nanmax(np.abs(mean))) for mean in mean_changes.values()), default=0.0)
-    factor, unit = choose_si_prefix(max_change or 1.0, series.unit)
-    spectra = (
-        {name: _spectrum(factor * mean, series.times) for name, mean in mean_changes.items()} if series.timed else {}
+    mean_changes = {name: series.mean_change(region_cells) for name, region_cells in regions.items()}
+    max_change = max((float(np.nanmax(np.abs(mean_change))) for mean_change in mean_changes.values()), default=0.0)
+    unit_factor, change_unit = choose_si_prefix(max_change or 1.0, series.unit)
+    region_spectra = (
+        {name: _curve_spectrum(unit_factor * mean_change, series.times) for name, mean_change in mean_changes.items()}
+        if series.timed
+        else {}
     )
-    drawn_spectra = {name: spectrum for name, spectrum in spectra.items() if spectrum is not None}
+    drawn_spectra = {
+        name: region_spectrum for name, region_spectrum in region_spectra.items() if region_spectrum is not None
+    }
     # Without oscillations, curves are drawn beside the functional image.
-    curves_grid = (grid[num_rows, :] if num_rows else grid[0, 1:]).subgridspec(1, 2, width_ratios=[1.6, 1.0])
+    curves_grid = (map_grid[num_rows, :] if num_rows else map_grid[0, 1:]).subgridspec(1, 2, width_ratios=[1.6, 1.0])
     curves_position = curves_grid[0] if drawn_spectra else curves_grid[:]
-    _draw_curves(maps_figure.add_subplot(curves_position), mean_changes, series, factor, unit)
+    _draw_curves(maps_figure.add_subplot(curves_position), mean_changes, series, unit_factor, change_unit)
     if drawn_spectra:
-        _draw_spectra(maps_figure.add_subplot(curves_grid[1]), drawn_spectra, oscillations, unit)
+        _draw_spectra(maps_figure.add_subplot(curves_grid[1]), drawn_spectra, oscillations, change_unit)
     return figure
 
 
 def _draw_frames(
-    figure, series: ImageSeries, electrodes: AbstractElectrodes | None, num_lines: int, raster: Raster
+    figure, image_series: ImageSeries, electrodes: AbstractElectrodes | None, num_lines: int, raster: Raster
 ) -> None:
     """Draw evenly spaced frames in `num_lines` lines, on one colour scale."""
-    selected, fitted_scale = select_frames(len(series.times), SERIES_FRAMES), fit_scale(series.changes, series.mesh)
-    grid = figure.add_gridspec(num_lines, _FRAMES_PER_ROW + 1, width_ratios=[1] * _FRAMES_PER_ROW + [0.05])
-    for panel_index, frame in enumerate(selected):
-        ax = figure.add_subplot(grid[panel_index // _FRAMES_PER_ROW, panel_index % _FRAMES_PER_ROW])
-        picture = FramePicture(
+    selected_frames, fitted_scale = (
+        select_frames(len(image_series.times), SERIES_FRAMES),
+        fit_scale(image_series.changes, image_series.mesh),
+    )
+    panel_grid = figure.add_gridspec(num_lines, _FRAMES_PER_ROW + 1, width_ratios=[1] * _FRAMES_PER_ROW + [0.05])
+    for panel_index, frame in enumerate(selected_frames):
+        ax = figure.add_subplot(panel_grid[panel_index // _FRAMES_PER_ROW, panel_index % _FRAMES_PER_ROW])
+        frame_picture = FramePicture(
             ax,
-            series.mesh,
+            image_series.mesh,
             electrodes,
             fitted_scale,
             show_numbers=False,
             show_scale_bar=panel_index == 0,
             raster=raster,
         )
-        picture.show(series.changes[frame], series.titles[frame])
+        frame_picture.show(image_series.changes[frame], image_series.titles[frame])
         if panel_index == 0:
-            colour_bar_axes = figure.add_subplot(grid[:, -1])
-            fitted_scale.draw_bar(colour_bar_axes, picture.mappable, colour_bar_axes)
+            colour_bar_axes = figure.add_subplot(panel_grid[:, -1])
+            fitted_scale.draw_bar(colour_bar_axes, frame_picture.mappable, colour_bar_axes)
 
 
 class _RegionMaps:
@@ -280,19 +301,21 @@ class _RegionMaps:
     def __init__(self, series: ImageSeries, electrodes: AbstractElectrodes | None, raster: Raster):
         self.mesh, self.unit, self.electrodes, self.raster = series.mesh, series.unit, electrodes, raster
 
-    def draw_map(self, ax: Axes, values: np.ndarray, scale: ColourScale, title: str) -> None:
-        pixels = np.asarray(self.raster.sample(as_array(values)))
-        fitted_scale: FittedScale = scale.of(pixels[np.isfinite(pixels)], self.unit)
-        fitted_scale.draw_bar(ax, self._show_pixels(ax, fitted_scale.factor * pixels, title, **fitted_scale.keywords))
+    def draw_map(self, ax: Axes, cell_values: np.ndarray, colour_scale: ColourScale, map_title: str) -> None:
+        map_pixels = np.asarray(self.raster.sample(as_array(cell_values)))
+        fitted_scale: FittedScale = colour_scale.of(map_pixels[np.isfinite(map_pixels)], self.unit)
+        fitted_scale.draw_bar(
+            ax, self._show_pixels(ax, fitted_scale.factor * map_pixels, map_title, **fitted_scale.keywords)
+        )
 
-    def draw_phase(self, ax: Axes, degrees: np.ndarray) -> None:
-        pixels = np.asarray(self.raster.sample(as_array(degrees)))
-        mappable = self._show_pixels(ax, pixels, "phase", cmap="hsv", vmin=-180, vmax=180)
+    def draw_phase(self, ax: Axes, phase_degrees: np.ndarray) -> None:
+        phase_pixels = np.asarray(self.raster.sample(as_array(phase_degrees)))
+        mappable = self._show_pixels(ax, phase_pixels, "phase", cmap="hsv", vmin=-180, vmax=180)
         ax.figure.colorbar(mappable, ax=ax, ticks=[-180, -90, 0, 90, 180], label="Phase (degrees)")
 
-    def _show_pixels(self, ax: Axes, pixels: np.ndarray, title: str, **keywords):
+    def _show_pixels(self, ax: Axes, map_pixels: np.ndarray, map_title: str, **image_options):
         extent = self.raster.extent
-        mappable = ax.imshow(pixels, extent=extent, interpolation="nearest", **keywords)
+        mappable = ax.imshow(map_pixels, extent=extent, interpolation="nearest", **image_options)
         if self.mesh.dimension == 2:
             draw_outline(self.mesh, ax)
         else:
@@ -301,37 +324,41 @@ class _RegionMaps:
             draw_electrodes(self.mesh, self.electrodes, numbers=False, ax=ax)
         hide_axes(ax, extent, numbered=False)
         draw_scale_bar(ax, extent)
-        ax.set_title(title, fontsize=10)
+        ax.set_title(map_title, fontsize=10)
         return mappable
 
 
-def _spectrum(mean: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+def _curve_spectrum(mean_change: np.ndarray, frame_times: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Frequencies and amplitudes of a curve; None if there are too few frames for more than one frequency."""
-    if np.isfinite(mean).sum() < _MIN_FRAMES:
+    if np.isfinite(mean_change).sum() < _MIN_FRAMES:
         return None
-    frequencies, amplitude = amplitude_spectrum(mean, times)
-    return (frequencies, amplitude) if len(frequencies) > 1 else None
+    frequencies, spectrum_amplitudes = amplitude_spectrum(mean_change, frame_times)
+    return (frequencies, spectrum_amplitudes) if len(frequencies) > 1 else None
 
 
 def _draw_curves(
-    ax: Axes, mean_changes: Mapping[str, np.ndarray], series: ImageSeries, factor: float, unit: str
+    ax: Axes, mean_changes: Mapping[str, np.ndarray], image_series: ImageSeries, unit_factor: float, change_unit: str
 ) -> None:
     """Draw the mean change of each region over time."""
-    for name, mean in mean_changes.items():
-        ax.plot(series.times, factor * mean, linewidth=1.2, label=name)
-    ax.set(xlabel="Time (s)" if series.timed else "Frame", ylabel=f"Mean change ({unit})", title="regions over time")
+    for name, mean_change in mean_changes.items():
+        ax.plot(image_series.times, unit_factor * mean_change, linewidth=1.2, label=name)
+    ax.set(
+        xlabel="Time (s)" if image_series.timed else "Frame",
+        ylabel=f"Mean change ({change_unit})",
+        title="regions over time",
+    )
     if mean_changes:
         ax.legend(fontsize=8, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.25), ncols=3)
     _style_graph(ax)
 
 
-def _draw_spectra(ax: Axes, spectra: Mapping, oscillations: Sequence[Oscillation], unit: str) -> None:
+def _draw_spectra(ax: Axes, region_spectra: Mapping, oscillations: Sequence[Oscillation], amplitude_unit: str) -> None:
     """Draw the spectra of the regions, in the same order of colours as their curves."""
-    for frequencies, amplitude in spectra.values():
-        ax.plot(frequencies, amplitude, linewidth=1.2)
+    for frequencies, amplitudes in region_spectra.values():
+        ax.plot(frequencies, amplitudes, linewidth=1.2)
     for oscillation in oscillations:
         ax.axvline(oscillation.frequency, color=DARK_GREY, linewidth=0.8, linestyle=":")
-    ax.set(xlabel="Frequency (Hz)", ylabel=f"Amplitude ({unit})", title="their spectra")
+    ax.set(xlabel="Frequency (Hz)", ylabel=f"Amplitude ({amplitude_unit})", title="their spectra")
     _style_graph(ax)
 
 

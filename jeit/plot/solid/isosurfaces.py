@@ -39,33 +39,35 @@ def draw_visible_body(ax: Axes, camera: Camera, inclusion: Inclusion) -> None:
 def draw_body_in_plane(ax: Axes, plane: Plane, inclusion: Inclusion) -> None:
     """Draw the outline of the section of an inclusion by a plane, and its sign in the middle."""
     if inclusion.form is not None:
-        surface = inclusion.form.surface()
-        segments = crossed_edges(surface.triangles, plane.distance(surface.points)).at_corners(surface.points)
-        if len(segments):
-            corners = _draw_dashed_hull(ax, plane.on_page(segments.reshape(-1, 3)))
-            x, y = (corners.min(axis=0) + corners.max(axis=0)) / 2
+        inclusion_surface = inclusion.form.surface()
+        section_segments = crossed_edges(
+            inclusion_surface.triangles, plane.distance(inclusion_surface.points)
+        ).at_corners(inclusion_surface.points)
+        if len(section_segments):
+            hull_corners = _draw_dashed_hull(ax, plane.on_page(section_segments.reshape(-1, 3)))
+            x, y = (hull_corners.min(axis=0) + hull_corners.max(axis=0)) / 2
             mark_sign(ax, x, y, inclusion.sign)
         return
-    centre = np.array(inclusion.centroid)
-    squared_radius = inclusion.radius**2 - float(plane.distance(centre)) ** 2
+    inclusion_centre = np.array(inclusion.centroid)
+    squared_radius = inclusion.radius**2 - float(plane.distance(inclusion_centre)) ** 2
     if squared_radius > 0:
-        x, y = plane.on_page(centre)
+        x, y = plane.on_page(inclusion_centre)
         ax.add_patch(Circle((x, y), float(np.sqrt(squared_radius)), **_DASH_PATTERN))
         mark_sign(ax, x, y, inclusion.sign)
 
 
 def _draw_dashed_hull(ax: Axes, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "k 2"]:
     """Draw the convex hull of points as a dashed line, and return its corners."""
-    corners = points[ConvexHull(points, qhull_options="QJ").vertices]
-    ax.add_patch(Polygon(corners, **_DASH_PATTERN))
-    return corners
+    hull_corners = points[ConvexHull(points, qhull_options="QJ").vertices]
+    ax.add_patch(Polygon(hull_corners, **_DASH_PATTERN))
+    return hull_corners
 
 
 DEFAULT_LEVELS = (0.5,)
 OUTER_OPACITY = 0.3
 # Isosurfaces of changes of one sign are drawn if the maximum change of this sign is at least this fraction of the
 # maximum change of either sign.
-_MIN_PEAK = 0.3
+_MIN_RELATIVE_PEAK = 0.3
 
 
 def plot_isosurfaces(
@@ -137,25 +139,27 @@ def draw_in_space(
     check_kind("camera", camera, Camera, "a Camera, such as Camera(azimuth=-60, elevation=25)")
     scene = Scene(camera)
     add_hull(scene, mesh)
-    surfaces = level_surfaces(mesh, values, levels, is_signed=fitted.scale.difference)
-    for value, fraction, surface in surfaces:
-        colour = np.array(map_to_colours(fitted, np.array([value]))[0])
-        colour[3] = 1.0 if fraction == max(levels) else OUTER_OPACITY
-        scene.add_triangles(surface.points, surface.triangles, colour, smooth=True)
+    isosurfaces = level_surfaces(mesh, values, levels, is_signed=fitted.scale.difference)
+    for isosurface_value, isosurface_level, isosurface in isosurfaces:
+        isosurface_colour = np.array(map_to_colours(fitted, np.array([isosurface_value]))[0])
+        isosurface_colour[3] = 1.0 if isosurface_level == max(levels) else OUTER_OPACITY
+        scene.add_triangles(isosurface.points, isosurface.triangles, isosurface_colour, smooth=True)
     for plane in planes:
-        outline = cut_by_plane(mesh, plane).outline
+        section_outline = cut_by_plane(mesh, plane).outline
         end_points = (
-            outline[..., :1] * plane.right + outline[..., 1:] * plane.up + (plane.point @ plane.toward) * plane.toward
+            section_outline[..., :1] * plane.right
+            + section_outline[..., 1:] * plane.up
+            + (plane.point @ plane.toward) * plane.toward
         )
         scene.add_lines(end_points, DARK_GREY, 0.6)
-    shapes = shapes_of(mesh, electrodes) if isinstance(electrodes, AbstractElectrodes) else electrodes
-    points, facets = np.asarray(mesh.points), np.asarray(mesh.facets)
-    if shapes is not None:
-        add_electrodes(scene, points, facets, shapes, translucent_in_front=bool(surfaces))
+    electrode_shapes = shapes_of(mesh, electrodes) if isinstance(electrodes, AbstractElectrodes) else electrodes
+    points, boundary_facets = np.asarray(mesh.points), np.asarray(mesh.facets)
+    if electrode_shapes is not None:
+        add_electrodes(scene, points, boundary_facets, electrode_shapes, translucent_in_front=bool(isosurfaces))
     scene.draw(ax)
-    hide_axes_in_space(ax, camera, points, numbered=shapes is not None)
-    if shapes is not None:
-        number_electrodes(ax, scene, points, facets, shapes)
+    hide_axes_in_space(ax, camera, points, numbered=electrode_shapes is not None)
+    if electrode_shapes is not None:
+        number_electrodes(ax, scene, points, boundary_facets, electrode_shapes)
     for inclusion in inclusions:
         draw_visible_body(ax, camera, inclusion)
     return ax
@@ -169,28 +173,36 @@ def level_surfaces(
     `levels`: shares of the maximum change of each sign if `is_signed`, otherwise fractions of the range from minimum to
     maximum. Raises `ValueError` for levels that are not between 0 and 1.
     """
-    fractions = check_levels(levels)
-    image = node_values(mesh, np.asarray(values))
-    reference = 0.0 if is_signed else float(image.min())
-    min_peak = _MIN_PEAK * float(np.abs(image - reference).max())
-    surfaces = []
-    for sign in (1.0, -1.0) if is_signed else (1.0,):
-        peak_change = float((sign * (image - reference)).max())
+    level_fractions = check_levels(levels)
+    image_at_nodes = node_values(mesh, np.asarray(values))
+    reference_value = 0.0 if is_signed else float(image_at_nodes.min())
+    min_peak = _MIN_RELATIVE_PEAK * float(np.abs(image_at_nodes - reference_value).max())
+    found_surfaces = []
+    for change_sign in (1.0, -1.0) if is_signed else (1.0,):
+        peak_change = float((change_sign * (image_at_nodes - reference_value)).max())
         if peak_change > 0 and peak_change >= min_peak:
-            for fraction in fractions:
-                level = sign * fraction * peak_change
-                surfaces.append((reference + level, fraction, isosurface_of(mesh, image - reference, level)))
-    return surfaces
+            for level_fraction in level_fractions:
+                isosurface_value = change_sign * level_fraction * peak_change
+                found_surfaces.append(
+                    (
+                        reference_value + isosurface_value,
+                        level_fraction,
+                        isosurface_of(mesh, image_at_nodes - reference_value, isosurface_value),
+                    )
+                )
+    return found_surfaces
 
 
 def check_levels(levels: Sequence[float]) -> list[float]:
     """Check the levels of isosurfaces, and return them as a list. Raises `ValueError` for a level that is not between 0
     and 1."""
-    fractions: Float[np.ndarray, " k"] | Sequence = np.atleast_1d(np.asarray(levels, dtype=object))
-    if len(fractions) == 0 or not all(is_number(level) and 0 < level < 1 for level in fractions):
-        level_texts = ", ".join(describe(level) for level in fractions[:4]) or "none"
+    level_fractions: Float[np.ndarray, " k"] | Sequence = np.atleast_1d(np.asarray(levels, dtype=object))
+    if len(level_fractions) == 0 or not all(
+        is_number(level_fraction) and 0 < level_fraction < 1 for level_fraction in level_fractions
+    ):
+        level_texts = ", ".join(describe(level_fraction) for level_fraction in level_fractions[:4]) or "none"
         raise ValueError(f"levels must be shares of the strongest change, from 0 to 1; given were {level_texts}.")
-    return [float(level) for level in fractions]
+    return [float(level_fraction) for level_fraction in level_fractions]
 
 
 def check_drawn(mesh: Mesh, electrodes, scale: ColourScale) -> None:
@@ -199,5 +211,5 @@ def check_drawn(mesh: Mesh, electrodes, scale: ColourScale) -> None:
     check_solid(mesh)
     check_scale(scale)
     if electrodes is not None:
-        kinds = (AbstractElectrodes, ElectrodeShapes)
-        check_kind("electrodes", electrodes, kinds, "those of jeit.electrodes, such as FacePatches")
+        electrode_kinds = (AbstractElectrodes, ElectrodeShapes)
+        check_kind("electrodes", electrodes, electrode_kinds, "those of jeit.electrodes, such as FacePatches")

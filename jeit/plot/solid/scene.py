@@ -47,9 +47,9 @@ class Camera:
     elevation: float = 25.0
 
     def __post_init__(self):
-        for name, value in (("azimuth", self.azimuth), ("elevation", self.elevation)):
-            if not is_number(value):
-                raise ValueError(f"{name} must be an angle in degrees; it is {describe(value)}.")
+        for name, angle_value in (("azimuth", self.azimuth), ("elevation", self.elevation)):
+            if not is_number(angle_value):
+                raise ValueError(f"{name} must be an angle in degrees; it is {describe(angle_value)}.")
         if not -90 <= self.elevation <= 90:
             raise ValueError(f"elevation must lie between −90 (from below) and 90 degrees; it is {self.elevation:g}.")
 
@@ -81,22 +81,22 @@ class Camera:
     def light(self, normals: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
         """Brightness (m,) of surfaces with the given normals of any length, from `_MIN_BRIGHTNESS` to 1; both sides of
         a surface have the same brightness."""
-        length = np.maximum(np.linalg.norm(normals, axis=-1), 1e-300)
-        direction = normals / length[:, None]
-        direction = direction * np.where(direction @ self.toward < 0, -1.0, 1.0)[:, None]
+        normal_lengths = np.maximum(np.linalg.norm(normals, axis=-1), 1e-300)
+        unit_normals = normals / normal_lengths[:, None]
+        unit_normals = unit_normals * np.where(unit_normals @ self.toward < 0, -1.0, 1.0)[:, None]
         light_direction = (
             _LIGHT_DIRECTION[0] * self.right + _LIGHT_DIRECTION[1] * self.up + _LIGHT_DIRECTION[2] * self.toward
         )
         return _MIN_BRIGHTNESS + (1 - _MIN_BRIGHTNESS) * np.clip(
-            direction @ light_direction / np.linalg.norm(light_direction), 0, 1
+            unit_normals @ light_direction / np.linalg.norm(light_direction), 0, 1
         )
 
 
 CORNER_VIEW = Camera()
 
 
-_RIM = [withStroke(linewidth=2.2, foreground="white")]
-_HALO = [withStroke(linewidth=3, foreground="white")]
+_RIM_EFFECTS = [withStroke(linewidth=2.2, foreground="white")]
+_HALO_EFFECTS = [withStroke(linewidth=3, foreground="white")]
 _AXIS_NAMES = ("x", "y", "z")
 # Colour of surfaces without values.
 BODY_COLOUR = "#b9bec6"
@@ -107,11 +107,11 @@ class Scene:
 
     def __init__(self, camera: Camera):
         self.camera = camera
-        self._corners: list[np.ndarray] = []
-        self._nearness: list[np.ndarray] = []
-        self._face: list[np.ndarray] = []
-        self._edge: list[np.ndarray] = []
-        self._width: list[np.ndarray] = []
+        self._piece_corners: list[np.ndarray] = []
+        self._piece_nearness: list[np.ndarray] = []
+        self._face_colours: list[np.ndarray] = []
+        self._edge_colours: list[np.ndarray] = []
+        self._line_widths: list[np.ndarray] = []
 
     def add_triangles(
         self,
@@ -126,23 +126,28 @@ class Scene:
         """Add triangles with colours (m, 4). `smooth`: whether to light them as a smooth surface; `is_lit`: whether to
         darken triangles turned away from the light; `depth_offset`: distance in metres by which the triangles are moved
         towards the viewer when sorted by depth."""
-        corners = points[triangles]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        triangle_corners = points[triangles]
+        triangle_normals = np.cross(
+            triangle_corners[:, 1] - triangle_corners[:, 0], triangle_corners[:, 2] - triangle_corners[:, 0]
+        )
         if smooth:
             node_normals = np.stack(
-                [np.bincount(triangles.ravel(), np.repeat(component, 3), len(points)) for component in normals.T],
+                [
+                    np.bincount(triangles.ravel(), np.repeat(normal_component, 3), len(points))
+                    for normal_component in triangle_normals.T
+                ],
                 axis=1,
             )
-            normals = node_normals[triangles].sum(axis=1)
+            triangle_normals = node_normals[triangles].sum(axis=1)
         face_colours = np.array(np.broadcast_to(colours, (len(triangles), 4)), dtype=float)
         if is_lit:
-            face_colours[:, :3] *= self.camera.light(normals)[:, None]
-        distances_towards_viewer = self.camera.nearness(corners.mean(axis=1)) + depth_offset
+            face_colours[:, :3] *= self.camera.light(triangle_normals)[:, None]
+        distances_towards_viewer = self.camera.nearness(triangle_corners.mean(axis=1)) + depth_offset
         # Edges in the colour of their face close gaps. Translucent triangles have no edges, as these would be visible
         # as a net.
         is_opaque = face_colours[:, 3] > 0.99
-        self._add(
-            corners[:, [0, 1, 2, 2]],
+        self._add_pieces(
+            triangle_corners[:, [0, 1, 2, 2]],
             distances_towards_viewer,
             face_colours,
             np.where(is_opaque[:, None], face_colours, 0),
@@ -154,9 +159,9 @@ class Scene:
     ) -> None:
         """Add a convex polygon on a surface, divided into pieces that are sorted separately; `depth_offset` as in
         `add_triangles`. Edges on the `rim` are drawn as lines."""
-        centre = corners.mean(axis=0)
+        polygon_centre = corners.mean(axis=0)
         corner_index = np.arange(len(corners))
-        points = np.concatenate([corners, (corners + centre) / 2, centre[None]])
+        points = np.concatenate([corners, (corners + polygon_centre) / 2, polygon_centre[None]])
         inner_vertices, next_corner, num_corners = (
             corner_index + len(corners),
             (corner_index + 1) % len(corners),
@@ -170,44 +175,45 @@ class Scene:
             ]
         )
         self.add_triangles(points, triangles, np.array(to_rgba(colour)), depth_offset=depth_offset)
-        edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)[rim]
-        self.add_lines(edges, DARK_GREY, 0.5, depth_offset=depth_offset + abs(depth_offset) * 0.05)
+        rim_edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)[rim]
+        self.add_lines(rim_edges, DARK_GREY, 0.5, depth_offset=depth_offset + abs(depth_offset) * 0.05)
 
     def add_lines(
         self, end_points: Float[np.ndarray, "s 2 3"], colour, width: float, *, depth_offset: float = 0.0
     ) -> None:
         """Add lines between pairs of `end_points`, `width` in points; `depth_offset` as in `add_triangles`."""
-        edge = np.broadcast_to(to_rgba(colour), (len(end_points), 4))
+        line_colours = np.broadcast_to(to_rgba(colour), (len(end_points), 4))
         distances_towards_viewer = self.camera.nearness(end_points.mean(axis=1)) + depth_offset
-        self._add(
+        self._add_pieces(
             end_points[:, [0, 1, 1, 0]],
             distances_towards_viewer,
             np.zeros((len(end_points), 4)),
-            edge,
+            line_colours,
             np.full(len(end_points), width),
         )
 
-    def _add(self, corners, distances_towards_viewer, face, edge, width) -> None:
-        self._corners.append(self.camera.on_page(corners))
-        self._nearness.append(distances_towards_viewer)
-        self._face.append(face)
-        self._edge.append(edge)
-        self._width.append(width)
+    def _add_pieces(self, piece_corners, distances_towards_viewer, face_colours, edge_colours, line_widths) -> None:
+        self._piece_corners.append(self.camera.on_page(piece_corners))
+        self._piece_nearness.append(distances_towards_viewer)
+        self._face_colours.append(face_colours)
+        self._edge_colours.append(edge_colours)
+        self._line_widths.append(line_widths)
 
     def draw(self, ax: Axes) -> None:
         """Draw all pieces of the scene, from the farthest to the nearest."""
-        if not self._corners:
+        if not self._piece_corners:
             return
-        drawing_order = np.argsort(np.concatenate(self._nearness), kind="stable")
-        corners, face, edge, width = (
-            np.concatenate(arrays)[drawing_order] for arrays in (self._corners, self._face, self._edge, self._width)
+        drawing_order = np.argsort(np.concatenate(self._piece_nearness), kind="stable")
+        piece_corners, face_colours, edge_colours, line_widths = (
+            np.concatenate(piece_arrays)[drawing_order]
+            for piece_arrays in (self._piece_corners, self._face_colours, self._edge_colours, self._line_widths)
         )
         ax.add_collection(
             PolyCollection(
-                corners,  # pyright: ignore[reportArgumentType]
-                facecolors=face,
-                edgecolors=edge,
-                linewidths=width,
+                piece_corners,  # pyright: ignore[reportArgumentType]
+                facecolors=face_colours,
+                edgecolors=edge_colours,
+                linewidths=line_widths,
                 closed=True,
                 capstyle="round",
                 joinstyle="round",
@@ -220,16 +226,16 @@ def hide_axes_in_space(ax: Axes, camera: Camera, points: Float[np.ndarray, "n 3"
     """Set equal scales and limits around the projected `points`, remove the frame, and draw a scale bar and arrows of
     the axes below. `numbered`: whether to leave space for numbers of electrodes."""
     page_points = camera.on_page(points)
-    (left, low), (right, high) = page_points.min(axis=0), page_points.max(axis=0)
-    size = max(right - left, high - low)
-    margin_width = (0.09 if numbered else 0.03) * size
+    (page_left, page_bottom), (page_right, page_top) = page_points.min(axis=0), page_points.max(axis=0)
+    page_extent = max(page_right - page_left, page_top - page_bottom)
+    margin_width = (0.09 if numbered else 0.03) * page_extent
     ax.set_aspect("equal")
-    ax.set_xlim(left - max(margin_width, 0.07 * size), right + max(margin_width, 0.07 * size))
-    ax.set_ylim(low - 0.24 * size - 0.4 * margin_width, high + margin_width)
+    ax.set_xlim(page_left - max(margin_width, 0.07 * page_extent), page_right + max(margin_width, 0.07 * page_extent))
+    ax.set_ylim(page_bottom - 0.24 * page_extent - 0.4 * margin_width, page_top + margin_width)
     ax.set_axis_off()
-    draw_scale_bar(ax, (left, right, low - 0.4 * margin_width, high))
-    cross_position = (right - 0.05 * size, low - 0.4 * margin_width - 0.14 * size)
-    draw_axes_cross(ax, camera.on_page(np.eye(3)), cross_position, 0.09 * size)
+    draw_scale_bar(ax, (page_left, page_right, page_bottom - 0.4 * margin_width, page_top))
+    cross_position = (page_right - 0.05 * page_extent, page_bottom - 0.4 * margin_width - 0.14 * page_extent)
+    draw_axes_cross(ax, camera.on_page(np.eye(3)), cross_position, 0.09 * page_extent)
 
 
 def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], origin: tuple[float, float], length: float) -> None:
@@ -238,20 +244,20 @@ def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], origin: tupl
 
     `directions`: (3, 2), projected unit vectors; `length`: length of an arrow that is not shortened by projection.
     """
-    for axis_name, direction in zip(_AXIS_NAMES, directions, strict=True):
-        if np.hypot(*direction) < 0.15:
+    for axis_name, axis_direction in zip(_AXIS_NAMES, directions, strict=True):
+        if np.hypot(*axis_direction) < 0.15:
             continue
-        tip = np.array(origin) + length * direction
-        style = {
+        arrow_tip = np.array(origin) + length * axis_direction
+        arrow_style = {
             "arrowstyle": "-|>,head_width=0.14,head_length=0.28",
             "color": DARK_GREY,
             "linewidth": 0.9,
             "shrinkA": 0,
             "shrinkB": 0,
         }
-        ax.annotate("", xy=tuple(tip), xytext=origin, arrowprops=style, annotation_clip=False)
+        ax.annotate("", xy=tuple(arrow_tip), xytext=origin, arrowprops=arrow_style, annotation_clip=False)
         # The distance of the letter from the tip does not depend on the length of the arrow.
-        x, y = tip + 0.3 * length * direction / np.hypot(*direction)
+        x, y = arrow_tip + 0.3 * length * axis_direction / np.hypot(*axis_direction)
         ax.text(x, y, axis_name, ha="center", va="center", fontsize=8, color=DARK_GREY)
 
 
@@ -262,11 +268,13 @@ def draw_number(
     x, y = position
     ax.text(
         x, y, text, ha=alignment, va="center", fontsize=fontsize, color=DARK_GREY, alpha=0.45 if is_faint else 1.0,
-        path_effects=_RIM, zorder=4,
+        path_effects=_RIM_EFFECTS, zorder=4,
     )  # fmt: skip
 
 
 def mark_sign(ax: Axes, x: float, y: float, sign: int) -> None:
     """Draw a plus at a conductive inclusion, or a minus at a resistive inclusion."""
     marker = "+" if sign > 0 else "_"
-    ax.plot(x, y, marker=marker, color=DARK_GREY, markersize=8, markeredgewidth=1.4, zorder=4, path_effects=_HALO)
+    ax.plot(
+        x, y, marker=marker, color=DARK_GREY, markersize=8, markeredgewidth=1.4, zorder=4, path_effects=_HALO_EFFECTS
+    )

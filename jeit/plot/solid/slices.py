@@ -64,10 +64,10 @@ def plot_slice(
     ```
     """
     check_drawn(mesh, electrodes, scale)
-    image = cell_values(mesh, values)
-    fitted_scale = scale.of(image, "S/m")
+    image_on_cells = cell_values(mesh, values)
+    fitted_scale = scale.of(image_on_cells, "S/m")
     ax = get_or_create_axes(ax)
-    mappable = draw_slice(ax, mesh, image, plane, electrodes, inclusions=inclusions, fitted=fitted_scale)
+    mappable = draw_slice(ax, mesh, image_on_cells, plane, electrodes, inclusions=inclusions, fitted=fitted_scale)
     finish_slice(ax, plane, data_extent(ax), draw_cross=True)
     fitted_scale.draw_bar(ax, mappable)
     return ax
@@ -102,29 +102,36 @@ def plot_slices(
     ```
     """
     check_drawn(mesh, electrodes, scale)
-    planes = create_planes(mesh, axis, at)
-    image = cell_values(mesh, values)
-    fitted_scale = scale.of(image, "S/m")
-    shapes = _electrode_shapes(mesh, electrodes)
-    points = planes[0].on_page(np.asarray(mesh.points))
-    (left, low), (right, high) = points.min(axis=0), points.max(axis=0)
-    columns = _num_columns(len(planes), (high - low) / (right - left))
-    rows = -(-len(planes) // columns)
-    width = min(3.2, 12 / columns)
-    height = width * ((high - low) + 0.2 * (right - left)) / (right - left)
+    slice_planes = create_planes(mesh, axis, at)
+    image_on_cells = cell_values(mesh, values)
+    fitted_scale = scale.of(image_on_cells, "S/m")
+    electrode_shapes = _electrode_shapes(mesh, electrodes)
+    points = slice_planes[0].on_page(np.asarray(mesh.points))
+    (page_left, page_bottom), (page_right, page_top) = points.min(axis=0), points.max(axis=0)
+    num_columns = _num_columns(len(slice_planes), (page_top - page_bottom) / (page_right - page_left))
+    num_rows = -(-len(slice_planes) // num_columns)
+    panel_width = min(3.2, 12 / num_columns)
+    panel_height = panel_width * ((page_top - page_bottom) + 0.2 * (page_right - page_left)) / (page_right - page_left)
     figure = (
-        Figure(figsize=(columns * width + 1.3, rows * (height + 0.3)), layout="constrained")
+        Figure(figsize=(num_columns * panel_width + 1.3, num_rows * (panel_height + 0.3)), layout="constrained")
         if figure is None
         else figure
     )
-    grid = figure.add_gridspec(rows, columns + 1, width_ratios=[1] * columns + [0.05])
-    panels = [figure.add_subplot(grid[divmod(k, columns)]) for k in range(len(planes))]
-    for panel, plane in zip(panels, planes, strict=True):
-        mappable = draw_slice(panel, mesh, image, plane, shapes, inclusions=inclusions, fitted=fitted_scale)
-        finish_slice(panel, plane, (left, right, low, high), draw_cross=panel is panels[0])
-        if scale.bar and panel is panels[-1]:
-            bar = figure.add_subplot(grid[:, columns])
-            fitted_scale.draw_bar(panel, mappable, bar)
+    panel_grid = figure.add_gridspec(num_rows, num_columns + 1, width_ratios=[1] * num_columns + [0.05])
+    slice_panels = [figure.add_subplot(panel_grid[divmod(k, num_columns)]) for k in range(len(slice_planes))]
+    for slice_panel, slice_plane in zip(slice_panels, slice_planes, strict=True):
+        mappable = draw_slice(
+            slice_panel, mesh, image_on_cells, slice_plane, electrode_shapes, inclusions=inclusions, fitted=fitted_scale
+        )
+        finish_slice(
+            slice_panel,
+            slice_plane,
+            (page_left, page_right, page_bottom, page_top),
+            draw_cross=slice_panel is slice_panels[0],
+        )
+        if scale.bar and slice_panel is slice_panels[-1]:
+            bar_axes = figure.add_subplot(panel_grid[:, num_columns])
+            fitted_scale.draw_bar(slice_panel, mappable, bar_axes)
     return figure
 
 
@@ -134,22 +141,22 @@ def create_planes(mesh: Mesh, axis: str, coordinates_or_number: Sequence[float] 
     for too many or no planes."""
     if axis not in AXES:
         raise ValueError(f"axis must be 'x', 'y' or 'z'; it is {describe(axis)}.")
-    coordinates = np.asarray(mesh.points)[:, AXES.index(axis)]
+    node_coordinates = np.asarray(mesh.points)[:, AXES.index(axis)]
     if isinstance(coordinates_or_number, int | np.integer) and not isinstance(coordinates_or_number, bool):
         if not 1 <= coordinates_or_number <= MAX_SLICES:
             raise ValueError(
                 f"at must be a number of slices from 1 to {MAX_SLICES}, or their places; it is {coordinates_or_number}."
             )
-        plane_positions = coordinates.min() + (np.arange(coordinates_or_number) + 0.5) / coordinates_or_number * np.ptp(
-            coordinates
-        )
+        plane_positions = node_coordinates.min() + (
+            np.arange(coordinates_or_number) + 0.5
+        ) / coordinates_or_number * np.ptp(node_coordinates)
     else:
         plane_positions = np.atleast_1d(np.asarray(coordinates_or_number, dtype=object))
         if not 1 <= len(plane_positions) <= MAX_SLICES:
             raise ValueError(
                 f"at must be the places of 1 to {MAX_SLICES} slices, in metres; they are {len(plane_positions)}."
             )
-    return [Plane.at(axis, position) for position in plane_positions]
+    return [Plane.at(axis, plane_position) for plane_position in plane_positions]
 
 
 def draw_slice(
@@ -164,18 +171,20 @@ def draw_slice(
 ) -> ScalarMappable:
     """Draw a section of a solid image with its outline, electrodes and inclusions in a fitted colour scale; return the
     mappable for a colour bar."""
-    section = cut_by_plane(mesh, plane)
-    cells = PolyCollection(section.polygons, edgecolors="face", linewidths=0.4)  # pyright: ignore[reportArgumentType]
-    cells.set_array(fitted.factor * image[section.cell])
+    plane_section = cut_by_plane(mesh, plane)
+    cells = PolyCollection(plane_section.polygons, edgecolors="face", linewidths=0.4)  # pyright: ignore[reportArgumentType]
+    cells.set_array(fitted.factor * image[plane_section.cell])
     cells.set_cmap(fitted.keywords["cmap"])
     cells.set_clim(fitted.keywords["vmin"], fitted.keywords["vmax"])
     ax.add_collection(cells)
     ax.add_collection(
-        LineCollection(list(section.outline), colors=DARK_GREY, linewidths=0.9, capstyle="round", zorder=2)
+        LineCollection(list(plane_section.outline), colors=DARK_GREY, linewidths=0.9, capstyle="round", zorder=2)
     )
-    shapes = _electrode_shapes(mesh, electrodes)
-    if shapes is not None:
-        _draw_cut_electrodes(ax, plane, shapes, 0.05 * longest_side(mesh), section.polygons.reshape(-1, 2).mean(axis=0))
+    electrode_shapes = _electrode_shapes(mesh, electrodes)
+    if electrode_shapes is not None:
+        _draw_cut_electrodes(
+            ax, plane, electrode_shapes, 0.05 * longest_side(mesh), plane_section.polygons.reshape(-1, 2).mean(axis=0)
+        )
     for inclusion in inclusions:
         draw_body_in_plane(ax, plane, inclusion)
     return cells
@@ -184,38 +193,40 @@ def draw_slice(
 def finish_slice(ax: Axes, plane: Plane, window: tuple[float, float, float, float], *, draw_cross: bool) -> None:
     """Set equal scales of both axes over a `window` (left, right, low, high), and draw a title and, if `draw_cross`, a
     scale bar and arrows of the axes."""
-    left, right, low, high = window
-    size = max(right - left, high - low)
-    margin_width = 0.08 * size
+    page_left, page_right, page_bottom, page_top = window
+    page_extent = max(page_right - page_left, page_top - page_bottom)
+    margin_width = 0.08 * page_extent
     ax.set_aspect("equal")
-    ax.set_xlim(left - margin_width, right + margin_width)
-    ax.set_ylim(low - 0.2 * size, high + margin_width)
+    ax.set_xlim(page_left - margin_width, page_right + margin_width)
+    ax.set_ylim(page_bottom - 0.2 * page_extent, page_top + margin_width)
     ax.set_axis_off()
     if draw_cross:
-        draw_scale_bar(ax, (left, right, low, high))
-        directions = np.stack([plane.right, plane.up], axis=1)
-        draw_axes_cross(ax, directions, (right - 0.05 * size, low - 0.15 * size), 0.07 * size)
+        draw_scale_bar(ax, (page_left, page_right, page_bottom, page_top))
+        page_directions = np.stack([plane.right, plane.up], axis=1)
+        draw_axes_cross(
+            ax, page_directions, (page_right - 0.05 * page_extent, page_bottom - 0.15 * page_extent), 0.07 * page_extent
+        )
     ax.set_title(plane.name, fontsize=10)
 
 
 def data_extent(ax: Axes) -> tuple[float, float, float, float]:
     """Extent (left, right, low, high) of the data drawn on axes."""
-    box = ax.dataLim
-    return box.x0, box.x1, box.y0, box.y1
+    data_limits = ax.dataLim
+    return data_limits.x0, data_limits.x1, data_limits.y0, data_limits.y1
 
 
 def cell_values(mesh: Mesh, values: ArrayLike) -> np.ndarray:
     """Values per cell (m,); values per node are averaged in each cell. Raises `ValueError` for a wrong shape and for
     complex values."""
-    image = np.asarray(values)
-    if image.shape not in ((mesh.num_cells,), (mesh.num_points,)):
+    image_values = np.asarray(values)
+    if image_values.shape not in ((mesh.num_cells,), (mesh.num_points,)):
         raise ValueError(
-            f"values has shape {image.shape}; give one for each of the {mesh.num_cells} cells or the "
+            f"values has shape {image_values.shape}; give one for each of the {mesh.num_cells} cells or the "
             f"{mesh.num_points} nodes."
         )
-    if np.iscomplexobj(image):
+    if np.iscomplexobj(image_values):
         raise ValueError("values are complex; draw their real or imaginary part.")
-    return image if len(image) == mesh.num_cells else image[np.asarray(mesh.cells)].mean(axis=1)
+    return image_values if len(image_values) == mesh.num_cells else image_values[np.asarray(mesh.cells)].mean(axis=1)
 
 
 def _electrode_shapes(mesh: Mesh, electrodes) -> ElectrodeShapes | None:
@@ -224,29 +235,31 @@ def _electrode_shapes(mesh: Mesh, electrodes) -> ElectrodeShapes | None:
     return shapes_of(mesh, electrodes)
 
 
-def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, distance: float, section_centre) -> None:
+def _draw_cut_electrodes(
+    ax: Axes, plane: Plane, electrode_shapes: ElectrodeShapes, number_distance: float, section_centre
+) -> None:
     """Draw a thick line where a plane intersects an electrode, and the number of the electrode outside the body beside
     the line."""
     lines_by_electrode: dict[int, list[np.ndarray]] = {}
-    for corners, electrode_index in zip(shapes.polygons(), shapes.electrode, strict=True):
-        distances = plane.distance(corners)
-        if len(corners) < 3 or distances.min() > 0 or distances.max() < 0:
+    for polygon_corners, electrode_index in zip(electrode_shapes.polygons(), electrode_shapes.electrode, strict=True):
+        corner_distances = plane.distance(polygon_corners)
+        if len(polygon_corners) < 3 or corner_distances.min() > 0 or corner_distances.max() < 0:
             continue
-        ring_indices = np.arange(1, len(corners) - 1)
+        ring_indices = np.arange(1, len(polygon_corners) - 1)
         fan_triangles = np.stack([np.zeros_like(ring_indices), ring_indices, ring_indices + 1], axis=1)
-        lines = plane.on_page(crossed_edges(fan_triangles, distances).at_corners(corners))
-        if len(lines):
-            lines_by_electrode.setdefault(int(electrode_index), []).extend(lines)
-    for electrode_index, lines in lines_by_electrode.items():
-        ax.add_collection(LineCollection(lines, colors=ELECTRODE_COLOUR, linewidths=4, capstyle="butt", zorder=3))
-        segment_ends = np.concatenate(lines)
-        position = segment_ends.mean(axis=0)
-        if np.ptp(segment_ends, axis=0).max() < 0.1 * distance:
+        cut_lines = plane.on_page(crossed_edges(fan_triangles, corner_distances).at_corners(polygon_corners))
+        if len(cut_lines):
+            lines_by_electrode.setdefault(int(electrode_index), []).extend(cut_lines)
+    for electrode_index, cut_lines in lines_by_electrode.items():
+        ax.add_collection(LineCollection(cut_lines, colors=ELECTRODE_COLOUR, linewidths=4, capstyle="butt", zorder=3))
+        segment_ends = np.concatenate(cut_lines)
+        cut_centre = segment_ends.mean(axis=0)
+        if np.ptp(segment_ends, axis=0).max() < 0.1 * number_distance:
             continue  # only a corner of the electrode is cut
         # The number is placed perpendicular to the line, away from the middle of the section.
-        normal = np.linalg.svd(segment_ends - position)[2][1]
-        position = position + distance * normal * np.sign(normal @ (position - section_centre))
-        draw_number(ax, position, str(electrode_index + 1), fontsize=7, is_faint=False)
+        cut_normal = np.linalg.svd(segment_ends - cut_centre)[2][1]
+        cut_centre = cut_centre + number_distance * cut_normal * np.sign(cut_normal @ (cut_centre - section_centre))
+        draw_number(ax, cut_centre, str(electrode_index + 1), fontsize=7, is_faint=False)
 
 
 def _num_columns(num_panels: int, aspect_ratio: float) -> int:
@@ -254,9 +267,16 @@ def _num_columns(num_panels: int, aspect_ratio: float) -> int:
     of a panel."""
     preferred_num_columns = max(1, round(float(np.sqrt(1.6 * num_panels * aspect_ratio))))
     # Of several similar numbers of columns, the number that leaves the fewest panels empty is chosen.
-    candidates = range(max(1, preferred_num_columns - 1), preferred_num_columns + 2)
+    candidate_numbers = range(max(1, preferred_num_columns - 1), preferred_num_columns + 2)
     return min(
-        num_panels, min(candidates, key=lambda columns: (-num_panels % columns, abs(columns - preferred_num_columns)))
+        num_panels,
+        min(
+            candidate_numbers,
+            key=lambda candidate_number: (
+                -num_panels % candidate_number,
+                abs(candidate_number - preferred_num_columns),
+            ),
+        ),
     )
 
 
@@ -289,37 +309,50 @@ def plot_solid(
     ```
     """
     check_drawn(mesh, electrodes, scale)
-    image = cell_values(mesh, values)
-    fitted_scale = scale.of(image, "S/m")
-    shapes = _electrode_shapes(mesh, electrodes)
-    common_point = common_point_of_slices(mesh, image, inclusions)
-    planes = [Plane.at(axis, float(common_point[AXES.index(axis)])) for axis in ("z", "x", "y")]
+    image_on_cells = cell_values(mesh, values)
+    fitted_scale = scale.of(image_on_cells, "S/m")
+    electrode_shapes = _electrode_shapes(mesh, electrodes)
+    common_plane_point = common_point_of_slices(mesh, image_on_cells, inclusions)
+    slice_planes = [
+        Plane.at(normal_axis, float(common_plane_point[AXES.index(normal_axis)])) for normal_axis in ("z", "x", "y")
+    ]
     figure = Figure(figsize=(12.6, 6.4), layout="constrained") if figure is None else figure
-    grid = figure.add_gridspec(2, 4, width_ratios=(1.75, 1, 1, 0.045))
-    space = figure.add_subplot(grid[:, 0])
+    panel_grid = figure.add_gridspec(2, 4, width_ratios=(1.75, 1, 1, 0.045))
+    space_axes = figure.add_subplot(panel_grid[:, 0])
     draw_in_space(
-        space,
+        space_axes,
         mesh,
         values,
-        shapes,
+        electrode_shapes,
         levels=levels,
         inclusions=inclusions,
         camera=camera,
         fitted=fitted_scale,
-        planes=planes,
+        planes=slice_planes,
     )
-    half_size = longest_side(mesh) / 2
-    for plane, grid_cell in zip(planes, (grid[0, 1], grid[0, 2], grid[1, 1]), strict=True):
-        panel = figure.add_subplot(grid_cell)
-        draw_slice(panel, mesh, image, plane, shapes, inclusions=inclusions, fitted=fitted_scale)
-        page_points = plane.on_page(np.asarray(mesh.points))
+    half_longest_side = longest_side(mesh) / 2
+    for slice_plane, grid_cell in zip(
+        slice_planes, (panel_grid[0, 1], panel_grid[0, 2], panel_grid[1, 1]), strict=True
+    ):
+        slice_panel = figure.add_subplot(grid_cell)
+        draw_slice(
+            slice_panel, mesh, image_on_cells, slice_plane, electrode_shapes, inclusions=inclusions, fitted=fitted_scale
+        )
+        page_points = slice_plane.on_page(np.asarray(mesh.points))
         x, y = (page_points.min(axis=0) + page_points.max(axis=0)) / 2
         # All slices are drawn with the same scale of lengths.
-        finish_slice(panel, plane, (x - half_size, x + half_size, y - half_size, y + half_size), draw_cross=True)
-    _caption(figure.add_subplot(grid[1, 2]), common_point, levels, inclusions, difference=scale.difference)
+        finish_slice(
+            slice_panel,
+            slice_plane,
+            (x - half_longest_side, x + half_longest_side, y - half_longest_side, y + half_longest_side),
+            draw_cross=True,
+        )
+    _draw_caption(
+        figure.add_subplot(panel_grid[1, 2]), common_plane_point, levels, inclusions, is_difference=scale.difference
+    )
     if scale.bar:
-        bar = figure.add_subplot(grid[:, 3])
-        fitted_scale.draw_bar(space, mappable(fitted_scale), bar)
+        bar_axes = figure.add_subplot(panel_grid[:, 3])
+        fitted_scale.draw_bar(space_axes, mappable(fitted_scale), bar_axes)
     return figure
 
 
@@ -331,27 +364,41 @@ def common_point_of_slices(mesh: Mesh, image: np.ndarray, inclusions: Sequence[I
     return np.asarray(centroids(mesh))[np.abs(image - (np.median(image))).argmax()]
 
 
-def _caption(ax: Axes, common_point, levels, inclusions: Sequence[Inclusion], *, difference: bool) -> None:
+def _draw_caption(
+    ax: Axes, common_plane_point, isosurface_levels, inclusions: Sequence[Inclusion], *, is_difference: bool
+) -> None:
     """Draw a caption that describes the slices, the isosurfaces and the inclusions."""
     ax.set_axis_off()
-    level_texts = ", ".join(f"{100 * level:g}" for level in sorted(levels))
-    scale_text = "of the strongest change" if difference else "of the way from least to greatest"
-    lines = [f"slices through ({_position_text(common_point)}) mm", f"surfaces at {level_texts} % {scale_text}"]
+    level_texts = ", ".join(f"{100 * isosurface_level:g}" for isosurface_level in sorted(isosurface_levels))
+    scale_text = "of the strongest change" if is_difference else "of the way from least to greatest"
+    caption_lines = [
+        f"slices through ({_position_text(common_plane_point)}) mm",
+        f"surfaces at {level_texts} % {scale_text}",
+    ]
     if inclusions:
         ball_text = "" if all(inclusion.form for inclusion in inclusions) else ", drawn as balls of their volume"
-        lines += ["", f"found, dashed{ball_text}:"]
+        caption_lines += ["", f"found, dashed{ball_text}:"]
     for inclusion in inclusions[:_MAX_LISTED_INCLUSIONS]:
-        sign = "+" if inclusion.sign > 0 else "−"
-        column = "column of " if inclusion.is_column else ""
-        radius = "" if inclusion.centroid_radius is None else f" ±{1e3 * inclusion.centroid_radius:.2g}"
-        place_text = f"({_position_text(inclusion.centroid)}){radius} mm"
-        lines.append(f"{sign}  {column}{1e6 * inclusion.area:.3g} cm³ at {place_text}")
+        sign_text = "+" if inclusion.sign > 0 else "−"
+        column_text = "column of " if inclusion.is_column else ""
+        radius_text = "" if inclusion.centroid_radius is None else f" ±{1e3 * inclusion.centroid_radius:.2g}"
+        place_text = f"({_position_text(inclusion.centroid)}){radius_text} mm"
+        caption_lines.append(f"{sign_text}  {column_text}{1e6 * inclusion.area:.3g} cm³ at {place_text}")
         if inclusion.contrast_interval is not None:
-            lines.append(f"    {interval_text(inclusion.contrast_interval, signed_percent)}")
+            caption_lines.append(f"    {interval_text(inclusion.contrast_interval, signed_percent)}")
     if len(inclusions) > _MAX_LISTED_INCLUSIONS:
-        lines.append(f"and {len(inclusions) - _MAX_LISTED_INCLUSIONS} more")
-    ax.text(0, 0.9, "\n".join(lines), transform=ax.transAxes, va="top", fontsize=8.5, color=DARK_GREY, linespacing=1.6)
+        caption_lines.append(f"and {len(inclusions) - _MAX_LISTED_INCLUSIONS} more")
+    ax.text(
+        0,
+        0.9,
+        "\n".join(caption_lines),
+        transform=ax.transAxes,
+        va="top",
+        fontsize=8.5,
+        color=DARK_GREY,
+        linespacing=1.6,
+    )
 
 
 def _position_text(position) -> str:
-    return ", ".join(f"{1e3 * value:.0f}" for value in position).replace("-", "−")
+    return ", ".join(f"{1e3 * coordinate:.0f}" for coordinate in position).replace("-", "−")

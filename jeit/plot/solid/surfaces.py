@@ -70,14 +70,17 @@ def plot_surface(
     ax = get_or_create_axes(ax)
     scene, fitted_scale = Scene(camera), None
     if values is None:
-        colours = np.array(to_rgba(BODY_COLOUR))
+        surface_colours = np.array(to_rgba(BODY_COLOUR))
     else:
-        image = checked_values(values, len(point_array), len(triangle_array))
-        fitted_scale = scale.of(image, "S")
-        colours = map_to_colours(
-            fitted_scale, image if len(image) == len(triangle_array) else image[triangle_array].mean(axis=1)
+        surface_values = checked_values(values, len(point_array), len(triangle_array))
+        fitted_scale = scale.of(surface_values, "S")
+        surface_colours = map_to_colours(
+            fitted_scale,
+            surface_values
+            if len(surface_values) == len(triangle_array)
+            else surface_values[triangle_array].mean(axis=1),
         )
-    scene.add_triangles(point_array, triangle_array, colours, smooth=True)
+    scene.add_triangles(point_array, triangle_array, surface_colours, smooth=True)
     if electrodes is not None:
         add_electrodes(scene, point_array, triangle_array, electrodes)
     scene.draw(ax)
@@ -119,29 +122,29 @@ def checked_surface(points: ArrayLike, triangles: ArrayLike) -> tuple[Float[np.n
 def checked_values(values: ArrayLike, num_points: int, num_triangles: int) -> Float[np.ndarray, " k"]:
     """Check the values of a surface per triangle or per point, and return them as an array. Raises `ValueError` for
     a wrong shape and for complex values."""
-    image = np.asarray(values)
-    if image.shape not in ((num_triangles,), (num_points,)):
+    surface_values = np.asarray(values)
+    if surface_values.shape not in ((num_triangles,), (num_points,)):
         raise ValueError(
-            f"values has shape {image.shape}; give one for each of the {num_triangles} triangles or the {num_points} "
-            "points."
+            f"values has shape {surface_values.shape}; give one for each of the {num_triangles} triangles or the "
+            f"{num_points} points."
         )
-    if np.iscomplexobj(image):
+    if np.iscomplexobj(surface_values):
         raise ValueError("values are complex; draw their real or imaginary part.")
-    return image
+    return surface_values
 
 
 def map_to_colours(fitted: FittedScale, values: Float[np.ndarray, " m"]) -> Float[np.ndarray, "m 4"]:
     """Colours (m, 4) of values in a fitted colour scale."""
-    return colormaps[fitted.keywords["cmap"]](_normalise(fitted)(fitted.factor * np.asarray(values)))
+    return colormaps[fitted.keywords["cmap"]](_normalised_colours(fitted)(fitted.factor * np.asarray(values)))
 
 
 def mappable(fitted: FittedScale) -> ScalarMappable:
     """Create a matplotlib mappable with the fitted colour scale, for a colour bar."""
-    return ScalarMappable(_normalise(fitted), fitted.keywords["cmap"])
+    return ScalarMappable(_normalised_colours(fitted), fitted.keywords["cmap"])
 
 
-def _normalise(fitted: FittedScale) -> Normalize:
-    return Normalize(fitted.keywords["vmin"], fitted.keywords["vmax"])
+def _normalised_colours(fitted_scale: FittedScale) -> Normalize:
+    return Normalize(fitted_scale.keywords["vmin"], fitted_scale.keywords["vmax"])
 
 
 def plot_curved_skin(
@@ -182,29 +185,33 @@ def plot_curved_skin(
     mesh = layout.surface
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
     ax = get_or_create_axes(ax)
-    scene, fitted_scale, colours = Scene(camera), None, np.array(to_rgba(BODY_COLOUR))
+    scene, fitted_scale, surface_colours = Scene(camera), None, np.array(to_rgba(BODY_COLOUR))
     if values is not None:
-        image = checked_values(values, len(points), len(cells))
-        fitted_scale = scale.of(image, "S")
-        colours = map_to_colours(fitted_scale, image if len(image) == len(cells) else image[cells].mean(axis=1))
-    scene.add_triangles(points, cells, colours, smooth=True)
-    surface = ProjectionSurface(points, cells)
+        surface_values = checked_values(values, len(points), len(cells))
+        fitted_scale = scale.of(surface_values, "S")
+        surface_colours = map_to_colours(
+            fitted_scale, surface_values if len(surface_values) == len(cells) else surface_values[cells].mean(axis=1)
+        )
+    scene.add_triangles(points, cells, surface_colours, smooth=True)
+    skin_surface = ProjectionSurface(points, cells)
     # Pieces are sorted by the depth of their centres, so discs are moved in front of the triangles on which they lie.
     depth_offset = float(np.sqrt(np.asarray(measures(mesh)).max()))
-    for corners in shapes_of(mesh, layout.discs(1.0)).polygons():
-        (normal,) = surface.normals(corners.mean(axis=0)[None])
-        cosine = abs(float(normal @ camera.toward))
-        rim = np.ones(len(corners), bool)
-        scene.add_polygon(corners, ELECTRODE_COLOUR, depth_offset=depth_offset / max(cosine, 0.1), rim=rim)
+    for disc_corners in shapes_of(mesh, layout.discs(1.0)).polygons():
+        (disc_normal,) = skin_surface.normals(disc_corners.mean(axis=0)[None])
+        viewing_cosine = abs(float(disc_normal @ camera.toward))
+        is_rim_edge = np.ones(len(disc_corners), bool)
+        scene.add_polygon(
+            disc_corners, ELECTRODE_COLOUR, depth_offset=depth_offset / max(viewing_cosine, 0.1), rim=is_rim_edge
+        )
     scene.draw(ax)
     triangles = Triangles.of(mesh)
-    for (name, mark_points), colour in zip((marks or {}).items(), SERIES_COLOURS, strict=False):
+    for (name, mark_points), mark_colour in zip((marks or {}).items(), SERIES_COLOURS, strict=False):
         surface_points = triangles.nearest(np.atleast_2d(np.asarray(mark_points, float))).points
         visible_points = _visible_points(mesh, surface_points, camera)
         ax.plot(
             *camera.on_page(visible_points).T,
             "o",
-            color=colour,
+            color=mark_colour,
             markersize=5,
             markeredgecolor="white",
             label=name,
@@ -231,18 +238,21 @@ def plot_curved_skin(
 def _visible_points(mesh, points, camera: Camera):
     """Select the points that the surface does not hide: no part of the surface is nearer to the viewer on the same
     ray."""
-    corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
-    page_corners, depths = camera.on_page(corners), camera.nearness(corners)
-    visible_masks = []
-    for point in points:
-        page_position, depth = camera.on_page(point[None])[0], float(camera.nearness(point[None])[0])
+    triangle_corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
+    page_corners, corner_depths = camera.on_page(triangle_corners), camera.nearness(triangle_corners)
+    visibility_masks = []
+    for tested_point in points:
+        page_position, point_depth = (
+            camera.on_page(tested_point[None])[0],
+            float(camera.nearness(tested_point[None])[0]),
+        )
         a, b, c = (page_corners[:, k] - page_position for k in range(3))
-        areas = np.stack([b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0], c[:, 0] * a[:, 1] - c[:, 1] * a[:, 0],
+        partial_areas = np.stack([b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0], c[:, 0] * a[:, 1] - c[:, 1] * a[:, 0],
                           a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]], axis=1)  # fmt: skip
-        doubled_area = areas.sum(axis=1)
-        weights = areas / np.where(doubled_area == 0, 1.0, doubled_area)[:, None]
-        covers_point = (weights >= 0).all(axis=1) & (doubled_area != 0)
-        covering_depths = (weights * depths).sum(axis=1)[covers_point]
-        if not (covering_depths > depth + _MARK_OFFSET * longest_side(mesh)).any():
-            visible_masks.append(point)
-    return np.array(visible_masks).reshape(-1, 3)
+        doubled_area = partial_areas.sum(axis=1)
+        barycentric_weights = partial_areas / np.where(doubled_area == 0, 1.0, doubled_area)[:, None]
+        is_covering_point = (barycentric_weights >= 0).all(axis=1) & (doubled_area != 0)
+        covering_depths = (barycentric_weights * corner_depths).sum(axis=1)[is_covering_point]
+        if not (covering_depths > point_depth + _MARK_OFFSET * longest_side(mesh)).any():
+            visibility_masks.append(tested_point)
+    return np.array(visibility_masks).reshape(-1, 3)

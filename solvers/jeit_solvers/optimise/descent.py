@@ -98,9 +98,9 @@ def ended_number(result: optx.RESULTS) -> Int[Array, ""]:
     Status.of_number(ended_number(optx.RESULTS.successful))
     ```
     """
-    reached_limit = result == optx.RESULTS.nonlinear_max_steps_reached
-    other_number = jnp.where(reached_limit, Status.STEP_LIMIT.number, Status.STALLED.number)
-    return jnp.where(result == optx.RESULTS.successful, Status.CONVERGED.number, other_number)
+    has_reached_limit = result == optx.RESULTS.nonlinear_max_steps_reached
+    other_status_number = jnp.where(has_reached_limit, Status.STEP_LIMIT.number, Status.STALLED.number)
+    return jnp.where(result == optx.RESULTS.successful, Status.CONVERGED.number, other_status_number)
 
 
 Objective = Callable[[Float[Array, " n"]], Float[Array, ""]]
@@ -123,7 +123,7 @@ class BoundedMinimum(Module):
     converged: Bool[Array, ""]
 
 
-def _jaxopt() -> Any:
+def _import_jaxopt() -> Any:
     """The module jaxopt, imported only when needed, with its deprecation warning suppressed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -156,9 +156,11 @@ def lbfgsb(
     found = lbfgsb(bowl, jnp.zeros(3), 0.0, 1.0, max_steps=100, tolerance=1e-8)
     ```
     """
-    solver = _jaxopt().LBFGSB(objective, maxiter=max_steps, tol=tolerance, history_size=20)
-    solution = solver.run(start, bounds=(lower, upper))
-    return BoundedMinimum(solution.params, solution.state.iter_num, solution.state.error <= tolerance)
+    lbfgsb_solver = _import_jaxopt().LBFGSB(objective, maxiter=max_steps, tol=tolerance, history_size=20)
+    solver_solution = lbfgsb_solver.run(start, bounds=(lower, upper))
+    return BoundedMinimum(
+        solver_solution.params, solver_solution.state.iter_num, solver_solution.state.error <= tolerance
+    )
 
 
 def projected_gradient(
@@ -184,24 +186,26 @@ def projected_gradient(
     ```
     """
     lower, upper = jnp.asarray(lower), jnp.asarray(upper)
-    jaxopt = _jaxopt()
-    solver = jaxopt.ProjectedGradient(objective, jaxopt.projection.projection_box, acceleration=True)
+    jaxopt = _import_jaxopt()
+    gradient_solver = jaxopt.ProjectedGradient(objective, jaxopt.projection.projection_box, acceleration=True)
 
-    def is_unfinished(carry):
-        _, state = carry
-        return (state.iter_num < max_steps) & (state.error > tolerance)
+    def is_unfinished(loop_state):
+        _, solver_state = loop_state
+        return (solver_state.iter_num < max_steps) & (solver_state.error > tolerance)
 
-    def step(carry):
-        point, state = carry
-        extrapolated_point = state.velocity
-        point, state = solver.update(point, state, hyperparams_proj=(lower, upper))
+    def gradient_step(loop_state):
+        point, solver_state = loop_state
+        extrapolated_point = solver_state.velocity
+        point, solver_state = gradient_solver.update(point, solver_state, hyperparams_proj=(lower, upper))
         # jaxopt extrapolates beyond the bounds, where the objective may not be defined, and takes two equal points in
         # succession for a minimum, although the gradient was computed elsewhere.
-        error = jnp.linalg.norm(point - extrapolated_point) / state.stepsize
-        return point, state._replace(velocity=jnp.clip(state.velocity, lower, upper), error=error)
+        error = jnp.linalg.norm(point - extrapolated_point) / solver_state.stepsize
+        return point, solver_state._replace(velocity=jnp.clip(solver_state.velocity, lower, upper), error=error)
 
-    solution, state = jax.lax.while_loop(is_unfinished, step, (start, solver.init_state(start)))
-    return BoundedMinimum(solution, state.iter_num, state.error <= tolerance)
+    current_point, solver_state = jax.lax.while_loop(
+        is_unfinished, gradient_step, (start, gradient_solver.init_state(start))
+    )
+    return BoundedMinimum(current_point, solver_state.iter_num, solver_state.error <= tolerance)
 
 
 def scipy_lbfgsb(
@@ -235,25 +239,31 @@ def scipy_lbfgsb(
     x, value, status = scipy_lbfgsb(jax.value_and_grad(bowl), np.zeros(3), 0.0, 1.0, tolerance=1e-8)
     ```
     """
-    shape = np.shape(start)
-    bounds_per_entry = [np.broadcast_to(np.asarray(bound, float), shape).ravel() for bound in (lower, upper)]
+    start_shape = np.shape(start)
+    bounds_per_entry = [
+        np.broadcast_to(np.asarray(bound_value, float), start_shape).ravel() for bound_value in (lower, upper)
+    ]
 
-    def evaluate_vector(vector):
-        value, gradient = value_and_gradient(jnp.asarray(vector).reshape(shape))
-        return np.asarray(value, float), np.asarray(gradient, float).ravel()
+    def evaluate_vector(flat_vector):
+        objective_value, objective_gradient = value_and_gradient(jnp.asarray(flat_vector).reshape(start_shape))
+        return np.asarray(objective_value, float), np.asarray(objective_gradient, float).ravel()
 
-    result = scipy.optimize.minimize(
+    scipy_result = scipy.optimize.minimize(
         evaluate_vector,
         np.asarray(start, float).ravel(),
         jac=True,
         tol=tolerance,
         bounds=np.stack(bounds_per_entry, axis=1),
         method="L-BFGS-B",
-        callback=None if callback is None else lambda vector: callback(jnp.asarray(vector).reshape(shape)),
+        callback=None
+        if callback is None
+        else lambda flat_vector: callback(jnp.asarray(flat_vector).reshape(start_shape)),
         options={"maxiter": max_steps},
     )
-    status = Status.CONVERGED if result.success else Status.STEP_LIMIT if result.status == 1 else Status.STALLED
-    return result.x.reshape(shape), float(result.fun), status
+    end_status = (
+        Status.CONVERGED if scipy_result.success else Status.STEP_LIMIT if scipy_result.status == 1 else Status.STALLED
+    )
+    return scipy_result.x.reshape(start_shape), float(scipy_result.fun), end_status
 
 
 # Minimum scale of a shortened step, and fraction of the predicted decrease of the cost that an accepted step must
@@ -318,7 +328,7 @@ class Descent(optx.AbstractLeastSquaresSolver):
         if "expand" not in options:
             raise ValueError("Descent needs options={'expand': function}; see its documentation.")
         xp = namespace(y)
-        zero_scalar, zero_count = xp.zeros((), y.dtype), xp.zeros((), int)
+        zero_scalar, zero_step_count = xp.zeros((), y.dtype), xp.zeros((), int)
         return DescentState(
             trial=y,
             direction=xp.zeros_like(y),
@@ -327,8 +337,8 @@ class Descent(optx.AbstractLeastSquaresSolver):
             curvature=zero_scalar,
             cost=zero_scalar + np.inf,
             damping=zero_scalar + self.damping,
-            num_steps=zero_count,
-            num_accepted=zero_count,
+            num_steps=zero_step_count,
+            num_accepted=zero_step_count,
             history=xp.full(self.history, np.nan, y.dtype),
             converged=xp.zeros((), bool),
             is_stuck=xp.zeros((), bool),
@@ -338,35 +348,35 @@ class Descent(optx.AbstractLeastSquaresSolver):
         """Evaluate the trial point. If its cost is low enough, continue from the trial point; otherwise try a shorter
         step."""
         xp = namespace(y)
-        cost, step = options["expand"](state.trial, args)
+        trial_cost, model_step = options["expand"](state.trial, args)
         predicted_decrease = -(state.scale * state.slope + 0.5 * state.scale**2 * state.curvature)
         # Close to the minimum, steps change the cost by less than its rounding error, but still approach the minimum.
         rounding_error = _ROUNDING_FACTOR * np.finfo(y.dtype).eps * state.cost
-        is_accepted = xp.isfinite(cost) & (
-            cost <= state.cost + rounding_error - _SUFFICIENT_DECREASE * predicted_decrease
+        is_accepted = xp.isfinite(trial_cost) & (
+            trial_cost <= state.cost + rounding_error - _SUFFICIENT_DECREASE * predicted_decrease
         )
 
-        def accepted():
-            gain = xp.where(xp.isfinite(state.cost), (state.cost - cost) / predicted_decrease, 0.5)
-            damping = state.damping * xp.select([gain > 0.75, gain < 0.25], [0.25, 4.0], 1.0)
-            direction, slope, curvature = step(damping)
+        def accept_trial():
+            gain_ratio = xp.where(xp.isfinite(state.cost), (state.cost - trial_cost) / predicted_decrease, 0.5)
+            new_damping = state.damping * xp.select([gain_ratio > 0.75, gain_ratio < 0.25], [0.25, 4.0], 1.0)
+            step_direction, cost_slope, cost_curvature = model_step(new_damping)
             return DescentState(
-                trial=state.trial + direction,
-                direction=direction,
+                trial=state.trial + step_direction,
+                direction=step_direction,
                 scale=xp.ones_like(state.scale),
-                slope=slope,
-                curvature=curvature,
-                cost=cost,
-                damping=damping,
+                slope=cost_slope,
+                curvature=cost_curvature,
+                cost=trial_cost,
+                damping=new_damping,
                 num_steps=state.num_steps + 1,
                 num_accepted=state.num_accepted + 1,
-                history=replace_at(state.history, state.num_accepted, cost),
-                converged=abs(slope + 0.5 * curvature) <= self.rtol * cost + self.atol,
+                history=replace_at(state.history, state.num_accepted, trial_cost),
+                converged=abs(cost_slope + 0.5 * cost_curvature) <= self.rtol * trial_cost + self.atol,
                 is_stuck=xp.zeros((), bool),
             )
 
-        def rejected():
-            scale = state.scale / 2
+        def reject_trial():
+            step_scale = state.scale / 2
             state_with_shorter_step = eqx.tree_at(
                 lambda descent_state: (
                     descent_state.trial,
@@ -376,7 +386,13 @@ class Descent(optx.AbstractLeastSquaresSolver):
                     descent_state.is_stuck,
                 ),
                 state,
-                (y + scale * state.direction, scale, 4 * state.damping, state.num_steps + 1, scale < _MIN_STEP_SCALE),
+                (
+                    y + step_scale * state.direction,
+                    step_scale,
+                    4 * state.damping,
+                    state.num_steps + 1,
+                    step_scale < _MIN_STEP_SCALE,
+                ),
             )
             # If the cost at the start is not finite, no shorter step is possible.
             return eqx.tree_at(
@@ -386,8 +402,8 @@ class Descent(optx.AbstractLeastSquaresSolver):
             )
 
         if xp is np:
-            return (state.trial, accepted(), None) if is_accepted else (y, rejected(), None)
-        next_state = jax.lax.cond(is_accepted, accepted, rejected)
+            return (state.trial, accept_trial(), None) if is_accepted else (y, reject_trial(), None)
+        next_state = jax.lax.cond(is_accepted, accept_trial, reject_trial)
         return jnp.where(is_accepted, state.trial, y), next_state, None
 
     def at_once(
@@ -395,13 +411,17 @@ class Descent(optx.AbstractLeastSquaresSolver):
     ) -> tuple[Any, DescentState]:
         """Descend in NumPy with the same steps that `optimistix.least_squares` takes in a compiled program. Returns the
         final point and state."""
-        options, point = {"expand": expand}, start
-        unused: Any = None  # further arguments from optimistix, which are not used
-        state = self.init(unused, point, arguments, options, unused, unused, unused)
+        descent_options, start_point = {"expand": expand}, start
+        unused_argument: Any = None  # further arguments from optimistix, which are not used
+        descent_state = self.init(
+            unused_argument, start_point, arguments, descent_options, unused_argument, unused_argument, unused_argument
+        )
         with np.errstate(all="ignore"):
-            while state.num_steps < max_steps and not (state.converged or state.is_stuck):
-                point, state, _ = self.step(unused, point, arguments, options, state, unused)
-        return point, state
+            while descent_state.num_steps < max_steps and not (descent_state.converged or descent_state.is_stuck):
+                start_point, descent_state, _ = self.step(
+                    unused_argument, start_point, arguments, descent_options, descent_state, unused_argument
+                )
+        return start_point, descent_state
 
     def terminate(self, fn, y, args, options, state, tags):
         """Whether the descent has converged, or is stuck because no shorter step lowers the cost."""

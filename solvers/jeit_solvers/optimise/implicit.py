@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from jeit_solvers.engines import undifferentiated
 
 # Relative tolerance of the linear system.
-_TOLERANCE = 1e-11
+_RELATIVE_ENERGY_TOLERANCE = 1e-11
 # Maximum number of conjugate-gradient steps; with a good preconditioner about a dozen are taken.
 _MAX_STEPS = 500
 # The Newton step to the minimum is the last if its length, measured as the square root of the decrease of the cost, is
@@ -63,40 +63,44 @@ def as_minimum(
     jax.jacobian(minimum)(2.0)
     ```
     """
-    return _minimum(jax.lax.stop_gradient(point), problem, gradient, precondition)
+    return _differentiable_minimum(jax.lax.stop_gradient(point), problem, gradient, precondition)
 
 
 @eqx.filter_custom_jvp
-def _minimum(point, problem, gradient, precondition):
+def _differentiable_minimum(point, problem_data, gradient_function, make_preconditioner):
     return point
 
 
-@_minimum.def_jvp
+@_differentiable_minimum.def_jvp
 def _minimum_jvp(primals, tangents):
-    solver_point, problem, gradient, precondition = primals
-    point = _minimum(solver_point, problem, gradient, precondition)
+    solver_point, problem_data, gradient_function, make_preconditioner = primals
+    minimum_point = _differentiable_minimum(solver_point, problem_data, gradient_function, make_preconditioner)
     problem_tangent = tangents[1]
     if not jax.tree.leaves(problem_tangent):
-        return point, jnp.zeros_like(point)
+        return minimum_point, jnp.zeros_like(minimum_point)
     # Point and problem are constants here: only the minimum is differentiated, not the Newton steps that lead to it.
-    start_point, constant_problem = undifferentiated((solver_point, problem))
-    model = precondition(start_point, constant_problem)
-    refined_point = point + jax.lax.stop_gradient(_refine(start_point, constant_problem, gradient, model) - start_point)
-    _, gradient_change = eqx.filter_jvp(
-        lambda problem: gradient(refined_point, problem), (problem,), (problem_tangent,)
+    start_point, constant_problem = undifferentiated((solver_point, problem_data))
+    model = make_preconditioner(start_point, constant_problem)
+    refined_point = minimum_point + jax.lax.stop_gradient(
+        _refine_by_newton(start_point, constant_problem, gradient_function, model) - start_point
     )
-    _, hessian = jax.linearize(lambda x: gradient(x, problem), refined_point)
-    return point, _solve(hessian, -gradient_change, model)
+    _, gradient_change = eqx.filter_jvp(
+        lambda problem_data: gradient_function(refined_point, problem_data), (problem_data,), (problem_tangent,)
+    )
+    _, hessian_product = jax.linearize(lambda x: gradient_function(x, problem_data), refined_point)
+    return minimum_point, _solve_with_hessian(hessian_product, -gradient_change, model)
 
 
-def _solve(hessian: LinearMap, right_hand_side: Float[Array, " n"], preconditioner: LinearMap) -> Float[Array, " n"]:
-    """Solve H x = `right_hand_side` by preconditioned conjugate gradients. `hessian`: returns H v for a vector v;
-    `preconditioner`: returns an approximation of H⁻¹ v."""
+def _solve_with_hessian(
+    hessian_product: LinearMap, right_hand_side: Float[Array, " n"], preconditioner: LinearMap
+) -> Float[Array, " n"]:
+    """Solve H x = `right_hand_side` by preconditioned conjugate gradients. `hessian_product`: returns H v for a vector
+    v; `preconditioner`: returns an approximation of H⁻¹ v."""
 
-    def solve(multiply, vector):
-        return _conjugate_gradients(multiply, vector, preconditioner)
+    def solve_linear_system(multiply_by_hessian, right_hand_vector):
+        return _conjugate_gradients(multiply_by_hessian, right_hand_vector, preconditioner)
 
-    return jax.lax.custom_linear_solve(hessian, right_hand_side, solve, symmetric=True)
+    return jax.lax.custom_linear_solve(hessian_product, right_hand_side, solve_linear_system, symmetric=True)
 
 
 def _conjugate_gradients(
@@ -106,56 +110,58 @@ def _conjugate_gradients(
     Computations, 2013, 11.5). `hessian_product`: returns H v for a vector v; `preconditioner`: returns an approximation
     of H⁻¹ v."""
 
-    def is_unfinished(state):
-        _, _, _, energy, num_steps = state
-        return (energy > tolerance) & (num_steps < _MAX_STEPS)
+    def is_unfinished(iteration_state):
+        _, _, _, residual_energy, num_steps = iteration_state
+        return (residual_energy > energy_tolerance) & (num_steps < _MAX_STEPS)
 
-    def step(state):
-        x, residual, direction, energy, num_steps = state
-        hessian_direction = hessian_product(direction)
-        step_length = energy / (direction @ hessian_direction)
+    def conjugate_step(iteration_state):
+        x, residual, search_direction, residual_energy, num_steps = iteration_state
+        hessian_direction = hessian_product(search_direction)
+        step_length = residual_energy / (search_direction @ hessian_direction)
         residual = residual - step_length * hessian_direction
-        preconditioned = preconditioner(residual)
-        new_energy = residual @ preconditioned
+        preconditioned_residual = preconditioner(residual)
+        new_energy = residual @ preconditioned_residual
         return (
-            x + step_length * direction,
+            x + step_length * search_direction,
             residual,
-            preconditioned + (new_energy / energy) * direction,
+            preconditioned_residual + (new_energy / residual_energy) * search_direction,
             new_energy,
             num_steps + 1,
         )
 
-    start = preconditioner(right_hand_side)
-    start_energy = right_hand_side @ start
-    tolerance = _TOLERANCE**2 * start_energy
+    start_direction = preconditioner(right_hand_side)
+    start_energy = right_hand_side @ start_direction
+    energy_tolerance = _RELATIVE_ENERGY_TOLERANCE**2 * start_energy
     return jax.lax.while_loop(
-        is_unfinished, step, (jnp.zeros_like(right_hand_side), right_hand_side, start, start_energy, 0)
+        is_unfinished,
+        conjugate_step,
+        (jnp.zeros_like(right_hand_side), right_hand_side, start_direction, start_energy, 0),
     )[0]
 
 
-def _refine(
-    point: Float[Array, " n"], problem: Any, gradient: Gradient, preconditioner: LinearMap
+def _refine_by_newton(
+    point: Float[Array, " n"], problem_data: Any, gradient_function: Gradient, preconditioner: LinearMap
 ) -> Float[Array, " n"]:
     """Find the minimum by Newton's method, started at a nearby `point`. The iteration continues as long as the steps
     become shorter in the norm of the Hessian."""
 
-    def step(state):
-        trial_point, last_point, length, num_steps, _ = state
-        trial_gradient, hessian = jax.linearize(lambda x: gradient(x, problem), trial_point)
-        direction = _conjugate_gradients(hessian, -trial_gradient, preconditioner)
-        new_length = jnp.sqrt(jnp.abs(trial_gradient @ direction))
-        is_shorter = new_length < length
+    def newton_step(iteration_state):
+        trial_point, last_point, last_length, num_steps, _ = iteration_state
+        trial_gradient, hessian_product = jax.linearize(lambda x: gradient_function(x, problem_data), trial_point)
+        newton_direction = _conjugate_gradients(hessian_product, -trial_gradient, preconditioner)
+        new_length = jnp.sqrt(jnp.abs(trial_gradient @ newton_direction))
+        is_shorter = new_length < last_length
         return (
-            jnp.where(is_shorter, trial_point + direction, last_point),
+            jnp.where(is_shorter, trial_point + newton_direction, last_point),
             trial_point,
             new_length,
             num_steps + 1,
             is_shorter,
         )
 
-    def is_unfinished(state):
-        _, _, length, num_steps, is_shorter = state
-        return is_shorter & (num_steps < _MAX_NEWTON_STEPS) & (length > _LAST_STEP_LENGTH)
+    def is_unfinished(iteration_state):
+        _, _, last_length, num_steps, is_shorter = iteration_state
+        return is_shorter & (num_steps < _MAX_NEWTON_STEPS) & (last_length > _LAST_STEP_LENGTH)
 
-    start = point, point, jnp.asarray(jnp.inf, point.dtype), 0, jnp.bool_(True)
-    return jax.lax.while_loop(is_unfinished, step, start)[0]
+    start_state = point, point, jnp.asarray(jnp.inf, point.dtype), 0, jnp.bool_(True)
+    return jax.lax.while_loop(is_unfinished, newton_step, start_state)[0]

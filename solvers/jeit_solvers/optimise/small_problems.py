@@ -67,16 +67,18 @@ def solve_small(matrix: Float[Array, "n n F"], right_hand_sides: Float[Array, "n
     solve_small(small, jnp.ones((3, 100)))
     ```
     """
-    num_unknowns, lower_factor = matrix.shape[0], _cholesky(matrix)
-    forward: list[Array] = []
+    num_unknowns, lower_factor = matrix.shape[0], _small_cholesky(matrix)
+    forward_solution: list[Array] = []
     for i in range(num_unknowns):
-        residual = right_hand_sides[i] - sum(lower_factor[i, k] * forward[k] for k in range(i))
-        forward.append(residual / lower_factor[i, i])
-    solution: dict[int, Array] = {}
+        row_residual = right_hand_sides[i] - sum(lower_factor[i, k] * forward_solution[k] for k in range(i))
+        forward_solution.append(row_residual / lower_factor[i, i])
+    solution_rows: dict[int, Array] = {}
     for i in reversed(range(num_unknowns)):
-        residual = forward[i] - sum(lower_factor[k, i] * solution[k] for k in range(i + 1, num_unknowns))
-        solution[i] = residual / lower_factor[i, i]
-    return namespace(matrix, right_hand_sides).stack([solution[i] for i in range(num_unknowns)])
+        row_residual = forward_solution[i] - sum(
+            lower_factor[k, i] * solution_rows[k] for k in range(i + 1, num_unknowns)
+        )
+        solution_rows[i] = row_residual / lower_factor[i, i]
+    return namespace(matrix, right_hand_sides).stack([solution_rows[i] for i in range(num_unknowns)])
 
 
 def gradient_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Float[Array, "n F"]:
@@ -113,17 +115,19 @@ def hessian_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Fl
     ```
     """
     if isinstance(x, np.ndarray):
-        differences = _DIFFERENCE_STEP * np.eye(len(x))[:, :, None]
+        difference_steps = _DIFFERENCE_STEP * np.eye(len(x))[:, :, None]
 
         def second_derivative(k: int, m: int) -> Any:
             forward_gradient, backward_gradient = (
-                complex_slope(value, points, m) for points in (x + differences[k], x - differences[k])
+                complex_slope(value, points, m) for points in (x + difference_steps[k], x - difference_steps[k])
             )
             return (forward_gradient - backward_gradient) / (2 * _DIFFERENCE_STEP)
 
         return symmetric_small([[second_derivative(k, m) for m in range(k + 1)] for k in range(len(x))])
-    directions = jnp.eye(len(x))[:, :, None] * jnp.ones_like(x)
-    return jnp.stack([jax.jvp(partial(gradient_small, value), (x,), (direction,))[1] for direction in directions])
+    unit_directions = jnp.eye(len(x))[:, :, None] * jnp.ones_like(x)
+    return jnp.stack(
+        [jax.jvp(partial(gradient_small, value), (x,), (unit_direction,))[1] for unit_direction in unit_directions]
+    )
 
 
 def definite_small(matrix: Float[Array, "n n F"]) -> Bool[Array, " F"]:
@@ -139,12 +143,12 @@ def definite_small(matrix: Float[Array, "n n F"]) -> Bool[Array, " F"]:
     definite_small(small)
     ```
     """
-    lower_factor, xp = _cholesky(matrix), namespace(matrix)
-    diagonal = xp.stack([lower_factor[i, i] for i in range(len(matrix))])
-    return xp.all(xp.isfinite(diagonal) & (diagonal > 0), axis=0)
+    lower_factor, xp = _small_cholesky(matrix), namespace(matrix)
+    factor_diagonal = xp.stack([lower_factor[i, i] for i in range(len(matrix))])
+    return xp.all(xp.isfinite(factor_diagonal) & (factor_diagonal > 0), axis=0)
 
 
-def _cholesky(matrix: Float[Array, "n n F"]) -> dict[tuple[int, int], Array]:
+def _small_cholesky(matrix: Float[Array, "n n F"]) -> dict[tuple[int, int], Array]:
     lower_factor: dict[tuple[int, int], Array] = {}
     for j in range(matrix.shape[0]):
         for i in range(j, matrix.shape[0]):
@@ -185,31 +189,31 @@ def inverse_small(matrix: Float[Array, "n n F"]) -> Float[Array, "n n F"]:
     ```
     """
     xp = namespace(matrix)
-    identity = xp.eye(len(matrix))[:, :, None] * xp.ones_like(matrix[0])
-    return xp.stack([solve_small(matrix, column) for column in identity])
+    identity_matrices = xp.eye(len(matrix))[:, :, None] * xp.ones_like(matrix[0])
+    return xp.stack([solve_small(matrix, identity_column) for identity_column in identity_matrices])
 
 
-class _State(Module):
+class _BatchState(Module):
     """State of the minimisation of each function in a batch."""
 
     x: Array
-    value: Array
+    function_value: Array
     gradient: Array
-    matrix: Array
+    hessian_matrix: Array
     damping: Array
-    num_taken: Array
+    num_steps_taken: Array
     is_done: Array
-    converged: Array
+    is_converged: Array
 
 
-class _Limits(NamedTuple):
+class _StepLimits(NamedTuple):
     """Bounds of the unknowns, maximum size and number of steps, and tolerance."""
 
-    lower: Array
-    upper: Array
+    lower_bounds: Array
+    upper_bounds: Array
     largest_step: Array
     max_steps: int
-    tolerance: float
+    step_tolerance: float
 
 
 def minimise_small(
@@ -257,102 +261,129 @@ def minimise_small(
     minimise_small(bowls, jnp.ones((3, 100)), lower=-ones, upper=ones, largest_step=ones).x
     ```
     """
-    limits = _Limits(lower, upper, largest_step, max_steps, tolerance)
+    descent_limits = _StepLimits(lower, upper, largest_step, max_steps, tolerance)
     xp = namespace(start, data, lower, upper)
     clipped_start = xp.clip(start, lower, upper)
     num_functions = clipped_start.shape[1]
     is_done = xp.zeros(num_functions, bool)
-    state = _State(
+    descent_state = _BatchState(
         x=clipped_start,
-        value=xp.full(num_functions, xp.inf),
+        function_value=xp.full(num_functions, xp.inf),
         gradient=xp.zeros_like(clipped_start),
-        matrix=xp.eye(len(clipped_start))[:, :, None] * xp.ones_like(clipped_start),
+        hessian_matrix=xp.eye(len(clipped_start))[:, :, None] * xp.ones_like(clipped_start),
         damping=xp.full(num_functions, 1e-2),
-        num_taken=xp.zeros(num_functions, int),
+        num_steps_taken=xp.zeros(num_functions, int),
         is_done=is_done if skip is None else skip,
-        converged=is_done,
+        is_converged=is_done,
     )
     num_gathered = num_functions if xp is np else num_functions // 4
     if num_gathered < _MIN_GATHERED_FUNCTIONS:
-        state = _take_steps(state, data, max_steps + 1, finish or expand, limits)
+        descent_state = _take_steps(descent_state, data, max_steps + 1, finish or expand, descent_limits)
     else:
         if skip is None:
-            state = _take_steps(state, data, _WHOLE_BATCH_STEPS + 1, expand, limits)
+            descent_state = _take_steps(descent_state, data, _WHOLE_BATCH_STEPS + 1, expand, descent_limits)
 
-        def continue_unfinished(state: _State) -> _State:
-            unfinished_indices = _first_true_indices(~state.is_done, num_gathered)
+        def continue_unfinished(descent_state: _BatchState) -> _BatchState:
+            unfinished_indices = _first_true_indices(~descent_state.is_done, num_gathered)
             gathered_state, gathered_data = jax.tree.map(
-                lambda array: xp.take(array, unfinished_indices, axis=-1, mode="clip"), (state, data)
+                lambda state_array: xp.take(state_array, unfinished_indices, axis=-1, mode="clip"),
+                (descent_state, data),
             )
             gathered_state = replace(
                 gathered_state, is_done=gathered_state.is_done | (unfinished_indices == num_functions)
             )
-            new_state = _take_steps(gathered_state, gathered_data, max_steps + 1, finish or expand, limits)
+            new_state = _take_steps(gathered_state, gathered_data, max_steps + 1, finish or expand, descent_limits)
             return jax.tree.map(
-                lambda array, new_values: set_at(array, (..., unfinished_indices), new_values), state, new_state
+                lambda state_array, new_values: set_at(state_array, (..., unfinished_indices), new_values),
+                descent_state,
+                new_state,
             )
 
-        state = while_loop(lambda state: ~xp.all(state.is_done), continue_unfinished, state)
-    return Minimum(state.x, state.value, state.converged, xp.max(state.num_taken, initial=0))
+        descent_state = while_loop(
+            lambda descent_state: ~xp.all(descent_state.is_done), continue_unfinished, descent_state
+        )
+    return Minimum(
+        descent_state.x,
+        descent_state.function_value,
+        descent_state.is_converged,
+        xp.max(descent_state.num_steps_taken, initial=0),
+    )
 
 
-def _first_true_indices(flags: Bool[Array, " F"], max_count: int) -> Int[Array, " i"]:
-    """Indices of the first true entries of `flags`: in NumPy at most `max_count` indices; in JAX exactly `max_count`,
-    filled up with F, the number of flags."""
-    if isinstance(flags, np.ndarray):
-        return host.flatnonzero(flags)[:max_count]
-    return jnp.nonzero(flags, size=max_count, fill_value=flags.size)[0]
+def _first_true_indices(boolean_flags: Bool[Array, " F"], max_count: int) -> Int[Array, " i"]:
+    """Indices of the first true entries of `boolean_flags`: in NumPy at most `max_count` indices; in JAX exactly
+    `max_count`, filled up with F, the number of flags."""
+    if isinstance(boolean_flags, np.ndarray):
+        return host.flatnonzero(boolean_flags)[:max_count]
+    return jnp.nonzero(boolean_flags, size=max_count, fill_value=boolean_flags.size)[0]
 
 
-def _next_step(state: _State, limits: _Limits) -> tuple[Array, Array]:
+def _next_step(descent_state: _BatchState, descent_limits: _StepLimits) -> tuple[Array, Array]:
     """End point of the next step, and the first-order prediction of the decrease of the value."""
-    x, gradient, matrix, xp = state.x, state.gradient, state.matrix, namespace(state)
-    is_fixed = ((x <= limits.lower) & (gradient > 0)) | ((x >= limits.upper) & (gradient < 0))
-    diagonal = xp.eye(x.shape[0], dtype=bool)[:, :, None]
-    damped_matrix = matrix + diagonal * (state.damping * matrix + 1e-300)
-    damped_matrix = xp.where(is_fixed[:, None] | is_fixed[None], xp.where(diagonal, 1.0, 0.0), damped_matrix)
-    step = -solve_small(damped_matrix, xp.where(is_fixed, 0.0, gradient))
-    step = xp.where(xp.isfinite(step), step, 0.0)
-    step = step / xp.maximum(1.0, xp.max(xp.abs(step) / limits.largest_step, axis=0))
-    end_point = xp.clip(x + step, limits.lower, limits.upper)
+    x, gradient, matrix, xp = (
+        descent_state.x,
+        descent_state.gradient,
+        descent_state.hessian_matrix,
+        namespace(descent_state),
+    )
+    is_fixed = ((x <= descent_limits.lower_bounds) & (gradient > 0)) | (
+        (x >= descent_limits.upper_bounds) & (gradient < 0)
+    )
+    diagonal_mask = xp.eye(x.shape[0], dtype=bool)[:, :, None]
+    damped_matrix = matrix + diagonal_mask * (descent_state.damping * matrix + 1e-300)
+    damped_matrix = xp.where(is_fixed[:, None] | is_fixed[None], xp.where(diagonal_mask, 1.0, 0.0), damped_matrix)
+    newton_step = -solve_small(damped_matrix, xp.where(is_fixed, 0.0, gradient))
+    newton_step = xp.where(xp.isfinite(newton_step), newton_step, 0.0)
+    newton_step = newton_step / xp.maximum(1.0, xp.max(xp.abs(newton_step) / descent_limits.largest_step, axis=0))
+    end_point = xp.clip(x + newton_step, descent_limits.lower_bounds, descent_limits.upper_bounds)
     return end_point, -xp.sum((end_point - x) * gradient, axis=0)
 
 
-def _take_steps(state: _State, data, steps: int, expand: QuadraticExpansion, limits: _Limits) -> _State:
-    """Take up to `steps` steps of the minimisation of all functions, fewer if all functions are done."""
-    xp = namespace(state, data)
+def _take_steps(
+    descent_state: _BatchState,
+    problem_data,
+    num_steps: int,
+    expand_quadratically: QuadraticExpansion,
+    descent_limits: _StepLimits,
+) -> _BatchState:
+    """Take up to `num_steps` steps of the minimisation of all functions, fewer if all functions are done."""
+    xp = namespace(descent_state, problem_data)
 
-    def body(loop):
-        num_iterations, state = loop
+    def loop_body(loop_state):
+        num_iterations, descent_state = loop_state
         # The first iteration only evaluates the start, from which no step has been computed yet.
-        is_first_evaluation = xp.isinf(state.value)
-        trial_point, predicted_decrease = _next_step(state, limits)
-        value, gradient, matrix = expand(trial_point, data)
-        is_lower = (value <= state.value) & ~state.is_done
+        is_first_evaluation = xp.isinf(descent_state.function_value)
+        trial_point, predicted_decrease = _next_step(descent_state, descent_limits)
+        trial_value, trial_gradient, trial_matrix = expand_quadratically(trial_point, problem_data)
+        is_lower = (trial_value <= descent_state.function_value) & ~descent_state.is_done
         # A step that is clipped at a bound may increase the value; then a more damped step, closer to the negative
         # gradient, is tried.
         is_settled = (
             (predicted_decrease >= 0)
-            & (predicted_decrease <= limits.tolerance * (1 + xp.abs(state.value)))
+            & (predicted_decrease <= descent_limits.step_tolerance * (1 + xp.abs(descent_state.function_value)))
             & ~is_first_evaluation
         )
-        damping = xp.where(is_lower, xp.maximum(state.damping / 10, 1e-12), 8 * xp.maximum(state.damping, 1e-4))
-        num_taken = state.num_taken + ~(state.is_done | is_first_evaluation)
+        new_damping = xp.where(
+            is_lower, xp.maximum(descent_state.damping / 10, 1e-12), 8 * xp.maximum(descent_state.damping, 1e-4)
+        )
+        num_taken = descent_state.num_steps_taken + ~(descent_state.is_done | is_first_evaluation)
         # The search also ends when steps become too small to change the value.
-        converged = state.converged | (~state.is_done & (is_settled | (damping > _MAX_DAMPING)))
-        is_invalid = is_first_evaluation & ~xp.isfinite(value)
-        return num_iterations + 1, _State(
-            x=xp.where(is_lower, trial_point, state.x),
-            value=xp.where(is_lower, value, state.value),
-            gradient=xp.where(is_lower, gradient, state.gradient),
-            matrix=xp.where(is_lower, matrix, state.matrix),
-            damping=damping,
-            num_taken=num_taken,
-            is_done=state.is_done | converged | is_invalid | (num_taken >= limits.max_steps),
-            converged=converged,
+        is_converged_now = descent_state.is_converged | (
+            ~descent_state.is_done & (is_settled | (new_damping > _MAX_DAMPING))
+        )
+        is_invalid = is_first_evaluation & ~xp.isfinite(trial_value)
+        return num_iterations + 1, _BatchState(
+            x=xp.where(is_lower, trial_point, descent_state.x),
+            function_value=xp.where(is_lower, trial_value, descent_state.function_value),
+            gradient=xp.where(is_lower, trial_gradient, descent_state.gradient),
+            hessian_matrix=xp.where(is_lower, trial_matrix, descent_state.hessian_matrix),
+            damping=new_damping,
+            num_steps_taken=num_taken,
+            is_done=descent_state.is_done | is_converged_now | is_invalid | (num_taken >= descent_limits.max_steps),
+            is_converged=is_converged_now,
         )
 
-    def is_unfinished(loop):
-        return (loop[0] < steps) & ~xp.all(loop[1].is_done)
+    def is_unfinished(loop_state):
+        return (loop_state[0] < num_steps) & ~xp.all(loop_state[1].is_done)
 
-    return while_loop(is_unfinished, body, (xp.zeros((), int), state))[1]
+    return while_loop(is_unfinished, loop_body, (xp.zeros((), int), descent_state))[1]

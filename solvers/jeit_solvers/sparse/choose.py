@@ -78,11 +78,13 @@ class ConjugateGradient(MatrixSolver):
         del options
         max_steps = self.max_steps or min(10 * state.pattern.size, 10_000)
         last_iterate = conjugate_gradient(state, vector, self.tolerance, max_steps)
-        results = lineax.RESULTS
-        result = results.where(last_iterate.converged, results.successful, results.max_steps_reached)
-        result = results.where(last_iterate.has_broken_down, results.breakdown, result)
-        stats = {"num_steps": last_iterate.step, "max_steps": max_steps}
-        return last_iterate.solution, result, stats
+        result_kinds = lineax.RESULTS
+        solver_result = result_kinds.where(
+            last_iterate.converged, result_kinds.successful, result_kinds.max_steps_reached
+        )
+        solver_result = result_kinds.where(last_iterate.has_broken_down, result_kinds.breakdown, solver_result)
+        solver_stats = {"num_steps": last_iterate.step, "max_steps": max_steps}
+        return last_iterate.solution, solver_result, solver_stats
 
 
 class Iterate(NamedTuple):
@@ -105,39 +107,39 @@ def conjugate_gradient(
     """Run conjugate gradients, started at x = 0 and preconditioned with the diagonal M of the matrix, and return the
     last iterate."""
     inverse_diagonal = 1 / operator.pattern.diagonal(operator.values)
-    direction = inverse_diagonal * vector
-    target = tolerance * jnp.linalg.norm(direction)
+    start_direction = inverse_diagonal * vector
+    target_norm = tolerance * jnp.linalg.norm(start_direction)
 
     def is_unfinished(iterate: Iterate):
         return ~iterate.converged & ~iterate.has_broken_down & (iterate.step < max_steps)
 
-    def one_step(iterate: Iterate) -> Iterate:
-        image = operator.mv(iterate.direction)
-        curvature = iterate.direction @ image
-        length = iterate.weight / curvature
-        residual = iterate.residual - length * image
-        preconditioned = inverse_diagonal * residual
-        weight = residual @ preconditioned
+    def conjugate_gradient_step(last_iterate: Iterate) -> Iterate:
+        direction_image = operator.mv(last_iterate.direction)
+        direction_curvature = last_iterate.direction @ direction_image
+        step_length = last_iterate.weight / direction_curvature
+        new_residual = last_iterate.residual - step_length * direction_image
+        preconditioned_residual = inverse_diagonal * new_residual
+        new_weight = new_residual @ preconditioned_residual
         return Iterate(
-            iterate.solution + length * iterate.direction,
-            residual,
-            preconditioned + weight / iterate.weight * iterate.direction,
-            weight,
-            iterate.step + 1,
-            jnp.linalg.norm(preconditioned) <= target,
-            ~((jnp.vdot(iterate.direction, image).real > 0) & jnp.isfinite(curvature)),
+            last_iterate.solution + step_length * last_iterate.direction,
+            new_residual,
+            preconditioned_residual + new_weight / last_iterate.weight * last_iterate.direction,
+            new_weight,
+            last_iterate.step + 1,
+            jnp.linalg.norm(preconditioned_residual) <= target_norm,
+            ~((jnp.vdot(last_iterate.direction, direction_image).real > 0) & jnp.isfinite(direction_curvature)),
         )
 
-    start = Iterate(
+    start_iterate = Iterate(
         jnp.zeros_like(vector),
         vector,
-        direction,
-        vector @ direction,
+        start_direction,
+        vector @ start_direction,
         jnp.asarray(0),
         jnp.linalg.norm(vector) == 0,
         ~jnp.all(jnp.isfinite(vector)),
     )
-    return jax.lax.while_loop(is_unfinished, one_step, start)
+    return jax.lax.while_loop(is_unfinished, conjugate_gradient_step, start_iterate)
 
 
 class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
@@ -191,7 +193,7 @@ class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
 
     def conj(self, state: Factor, options: dict[str, Any]) -> tuple[Factor, dict[str, Any]]:
         """Return the conjugate factor, which is the factor of the conjugate matrix."""
-        return jax.tree.map(lambda block: block.conj(), state), options
+        return jax.tree.map(lambda factor_block: factor_block.conj(), state), options
 
     def assume_full_rank(self) -> bool:
         """Always true, because a positive definite matrix has full rank."""
@@ -284,29 +286,29 @@ def choose_solver(
     fronts = find_fronts(pattern, coordinates)
     allowed_memory = memory_of_machine() / 2 if memory_limit is None else memory_limit
     factor_memory = 8.0 * (fronts.num_factor_entries + fronts.num_waiting_entries)
-    seconds, multigrid_seconds = (
+    direct_seconds, multigrid_seconds = (
         fronts.num_operations / _OPERATIONS_PER_SECOND,
         pattern.num_entries * _MULTIGRID_SECONDS,
     )
     multigrid_memory = _format_bytes(pattern.num_entries * _MULTIGRID_BYTES)
-    cost = (
-        f"a factorisation takes {fronts.num_operations:.1e} operations, about {seconds:.1g} s, and "
+    cost_text = (
+        f"a factorisation takes {fronts.num_operations:.1e} operations, about {direct_seconds:.1g} s, and "
         f"{_format_bytes(factor_memory)}; multigrid takes about {multigrid_seconds:.1g} s and {multigrid_memory} for "
         "32 solutions"
     )
-    if factor_memory > allowed_memory or seconds > _DIRECT_TIME_FACTOR * multigrid_seconds:
-        comparison = f"{cost}; {_format_bytes(allowed_memory)} are allowed"
+    if factor_memory > allowed_memory or direct_seconds > _DIRECT_TIME_FACTOR * multigrid_seconds:
+        comparison_text = f"{cost_text}; {_format_bytes(allowed_memory)} are allowed"
         if multigrid_is_installed():
-            return Multigrid(tolerance, reason=f"iterative: {comparison}")
+            return Multigrid(tolerance, reason=f"iterative: {comparison_text}")
         if factor_memory > allowed_memory:
             conjugate_gradient_note = (
                 "; without pyamg (pip install 'jeit[large]') conjugate gradients take several times as long"
             )
-            return ConjugateGradient(tolerance, reason=f"iterative: {comparison}{conjugate_gradient_note}")
+            return ConjugateGradient(tolerance, reason=f"iterative: {comparison_text}{conjugate_gradient_note}")
     is_on_cpu = jax.default_backend() == "cpu"
     if fronts.num_operations > (_MAX_COMPILED_OPERATIONS_CPU if is_on_cpu else _MAX_COMPILED_OPERATIONS):
-        return FrontalCholesky(fronts, f"direct: {cost}")
-    return SparseCholesky(analyse(pattern, coordinates), reason=f"direct: {cost}")
+        return FrontalCholesky(fronts, f"direct: {cost_text}")
+    return SparseCholesky(analyse(pattern, coordinates), reason=f"direct: {cost_text}")
 
 
 def _format_bytes(num_bytes: float) -> str:

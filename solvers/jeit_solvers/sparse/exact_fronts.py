@@ -103,10 +103,10 @@ class Fronts:
     def num_waiting_entries(self) -> int:
         """Maximum number of entries of Schur complements that are stored until their parents are eliminated, if fronts
         are eliminated one after the other."""
-        waiting = max_waiting = 0
+        num_waiting = max_waiting = 0
         for front in self.fronts:
-            max_waiting = max(max_waiting, waiting + front.border**2)
-            waiting += front.border**2 - sum(self.fronts[child].border ** 2 for child in front.children)
+            max_waiting = max(max_waiting, num_waiting + front.border**2)
+            num_waiting += front.border**2 - sum(self.fronts[child].border ** 2 for child in front.children)
         return max_waiting
 
 
@@ -130,13 +130,13 @@ def find_fronts(pattern: SparsityPattern, coordinates: Any = None) -> Fronts:
     ```
     """
     coordinates = checked_coordinates(pattern, coordinates)
-    rows, columns = (np.asarray(array, dtype=np.int64) for array in (pattern.rows, pattern.columns))
-    digest = hashlib.blake2b(digest_size=16)
-    for array in (rows, columns, coordinates if coordinates is not None else np.zeros(0), np.array(_LEAF_SIZE)):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    key = digest.digest()
-    if (fronts := _CACHED_FRONTS.get(key)) is None:
-        _CACHED_FRONTS[key] = fronts = _build_fronts(pattern.size, rows, columns, coordinates, key)
+    rows, columns = (np.asarray(indices, dtype=np.int64) for indices in (pattern.rows, pattern.columns))
+    pattern_digest = hashlib.blake2b(digest_size=16)
+    for hashed_array in (rows, columns, coordinates if coordinates is not None else np.zeros(0), np.array(_LEAF_SIZE)):
+        pattern_digest.update(np.ascontiguousarray(hashed_array).tobytes())
+    cache_key = pattern_digest.digest()
+    if (fronts := _CACHED_FRONTS.get(cache_key)) is None:
+        _CACHED_FRONTS[cache_key] = fronts = _build_fronts(pattern.size, rows, columns, coordinates, cache_key)
     return fronts
 
 
@@ -145,120 +145,148 @@ _CACHED_FRONTS: WeakValueDictionary[bytes, Fronts] = WeakValueDictionary()
 
 
 def _build_fronts(
-    size: int, rows: np.ndarray, columns: np.ndarray, coordinates: np.ndarray | None, key: bytes
+    matrix_size: int, rows: np.ndarray, columns: np.ndarray, coordinates: np.ndarray | None, cache_key: bytes
 ) -> Fronts:
-    depth = max(0, int(np.ceil(np.log2(size / _LEAF_SIZE))))
-    front_indices = nested_dissection(graph_of(rows, columns, size), depth, coordinates)
+    tree_depth = max(0, int(np.ceil(np.log2(matrix_size / _LEAF_SIZE))))
+    front_indices = nested_dissection(graph_of(rows, columns, matrix_size), tree_depth, coordinates)
     nodes, front_indices = np.unique(front_indices, return_inverse=True)
-    level = np.floor(np.log2(nodes + 1)).astype(int)
-    num_top_levels = min(_LEVELS_ABOVE_SUBTREES, depth)
+    level_of_node = np.floor(np.log2(nodes + 1)).astype(int)
+    num_top_levels = min(_LEVELS_ABOVE_SUBTREES, tree_depth)
     # Steps: the subtrees are number 0, the levels above them 1, 2, …
-    step_of_node = np.maximum(num_top_levels - level, 0)
-    subtree_of_node = np.where(step_of_node, 0, (nodes + 1) >> np.maximum(level - num_top_levels, 0))
-    old_numbers = np.lexsort((_post_order_positions(nodes, level, depth), subtree_of_node, step_of_node))
+    step_of_node = np.maximum(num_top_levels - level_of_node, 0)
+    subtree_of_node = np.where(step_of_node, 0, (nodes + 1) >> np.maximum(level_of_node - num_top_levels, 0))
+    old_numbers = np.lexsort((_post_order_positions(nodes, level_of_node, tree_depth), subtree_of_node, step_of_node))
     new_numbers = np.argsort(old_numbers)
-    tree = _EliminationTree(size, rows, columns, new_numbers[front_indices], level[old_numbers], coordinates)
-    part_of_front = np.where(step_of_node, nodes, subtree_of_node)[old_numbers]
-    starts = np.flatnonzero(np.diff(part_of_front, prepend=-1))
-    slices = [slice(start, end) for start, end in itertools.pairwise([*starts.tolist(), len(nodes)])]
-    step_of_front = step_of_node[old_numbers][starts]
-    steps = tuple(
-        tuple(itertools.compress(slices, step_of_front == step_number)) for step_number in range(num_top_levels + 1)
+    elimination_tree = _EliminationTree(
+        matrix_size, rows, columns, new_numbers[front_indices], level_of_node[old_numbers], coordinates
     )
-    top = int(tree.pivots[: np.count_nonzero(step_of_node == 0)].sum())
-    return Fronts(size, len(rows), tree.order, tree.entry_order, tree.fronts(top), steps, top, key)
+    part_of_front = np.where(step_of_node, nodes, subtree_of_node)[old_numbers]
+    part_starts = np.flatnonzero(np.diff(part_of_front, prepend=-1))
+    front_slices = [
+        slice(slice_start, slice_end)
+        for slice_start, slice_end in itertools.pairwise([*part_starts.tolist(), len(nodes)])
+    ]
+    step_of_front = step_of_node[old_numbers][part_starts]
+    step_slices = tuple(
+        tuple(itertools.compress(front_slices, step_of_front == step_number))
+        for step_number in range(num_top_levels + 1)
+    )
+    first_top_row = int(elimination_tree.pivots[: np.count_nonzero(step_of_node == 0)].sum())
+    return Fronts(
+        matrix_size,
+        len(rows),
+        elimination_tree.elimination_order,
+        elimination_tree.entry_order,
+        elimination_tree.fronts(first_top_row),
+        step_slices,
+        first_top_row,
+        cache_key,
+    )
 
 
-def _post_order_positions(nodes: np.ndarray, level: np.ndarray, depth: int) -> np.ndarray:
+def _post_order_positions(nodes: np.ndarray, node_levels: np.ndarray, tree_depth: int) -> np.ndarray:
     """Positions of nodes of a complete binary tree in post-order: every node comes after all nodes below it."""
-    position = np.full(len(nodes), 2 ** (depth + 1) - 2)
-    for levels_above in range(depth):
+    post_order_position = np.full(len(nodes), 2 ** (tree_depth + 1) - 2)
+    for levels_above in range(tree_depth):
         # The ancestor of a node just below level `levels_above`: a left ancestor comes before the whole subtree of its
         # right sibling.
-        height = level - levels_above - 1
-        is_left_child = (height >= 0) & ((((nodes + 1) >> np.maximum(height, 0)) & 1) == 0)
-        position -= np.where(height >= 0, 1 + np.where(is_left_child, 2 ** (depth - levels_above) - 1, 0), 0)
-    return position
+        subtree_height = node_levels - levels_above - 1
+        is_left_child = (subtree_height >= 0) & ((((nodes + 1) >> np.maximum(subtree_height, 0)) & 1) == 0)
+        post_order_position -= np.where(
+            subtree_height >= 0, 1 + np.where(is_left_child, 2 ** (tree_depth - levels_above) - 1, 0), 0
+        )
+    return post_order_position
 
 
 class _EliminationTree:
     """Elimination tree of fronts that are numbered in the order of elimination. For each front the tree stores the
-    number of `pivots`, the number of `border` rows, the index of the `parent` and the `level` (0 at the root). `order`,
-    `entry_order`: as in `Fronts`."""
+    number of `pivots`, the number of `border` rows, the index in `parent_fronts` and the level in `front_levels` (0 at
+    the root). `elimination_order`, `entry_order`: `order` and `entry_order` as in `Fronts`."""
 
     def __init__(self, size: int, rows, columns, front_of_row, level, coordinates):
-        self.size, self.level = size, level
-        keys = (front_of_row,) if coordinates is None else (_morton_positions(coordinates), front_of_row)
-        self.order = np.lexsort(keys)
-        number = np.empty(size, dtype=np.int64)
-        number[self.order] = np.arange(size)
-        self.front = front_of_row[self.order]
-        count = len(level)
-        self.pivots = np.bincount(self.front, minlength=count)
+        self.matrix_size, self.front_levels = size, level
+        sorting_keys = (front_of_row,) if coordinates is None else (_morton_positions(coordinates), front_of_row)
+        self.elimination_order = np.lexsort(sorting_keys)
+        row_numbers = np.empty(size, dtype=np.int64)
+        row_numbers[self.elimination_order] = np.arange(size)
+        self.front_of_row = front_of_row[self.elimination_order]
+        num_fronts = len(level)
+        self.pivots = np.bincount(self.front_of_row, minlength=num_fronts)
         self.first_pivots = np.cumsum(self.pivots) - self.pivots
-        first_pivots, second = number[rows], number[columns]
-        self.earlier_rows, self.later_rows = np.minimum(first_pivots, second), np.maximum(first_pivots, second)
-        self._find_borders(count)
-        self.border = np.bincount(self.border_front, minlength=count)
-        self.border_first = np.cumsum(self.border) - self.border
-        self.rows_in_parent = self._local_indices(self.parent[self.border_front], self.border_row)
-        front_of_entry = self.front[self.earlier_rows]
+        first_pivots, second_pivots = row_numbers[rows], row_numbers[columns]
+        self.earlier_rows, self.later_rows = (
+            np.minimum(first_pivots, second_pivots),
+            np.maximum(first_pivots, second_pivots),
+        )
+        self._find_borders(num_fronts)
+        self.border = np.bincount(self.fronts_of_border, minlength=num_fronts)
+        self.border_starts = np.cumsum(self.border) - self.border
+        self.rows_in_parent = self._local_indices(self.parent_fronts[self.fronts_of_border], self.border_rows)
+        front_of_entry = self.front_of_row[self.earlier_rows]
         self.entry_order = np.argsort(front_of_entry, kind="stable")
 
-    def _find_borders(self, count: int) -> None:
+    def _find_borders(self, num_fronts: int) -> None:
         """Find the border rows of each front and its parent. The border rows are the later rows of the front's entries,
         and the border rows of its children that are not its pivots. The parent is the front that eliminates the first
         border row."""
-        size, front = self.size, self.front
-        first_fronts, second_fronts = front[self.earlier_rows], front[self.later_rows]
-        pending_entries = np.unique((first_fronts * size + self.later_rows)[first_fronts != second_fronts])
-        self.parent, borders = np.full(count, -1), [np.zeros(0, dtype=np.int64)]
-        for level in range(int(self.level.max()), -1, -1):
-            is_in_level = self.level[pending_entries // size] == level
+        matrix_size, front_of_row = self.matrix_size, self.front_of_row
+        first_fronts, second_fronts = front_of_row[self.earlier_rows], front_of_row[self.later_rows]
+        pending_entries = np.unique((first_fronts * matrix_size + self.later_rows)[first_fronts != second_fronts])
+        self.parent_fronts, level_borders = np.full(num_fronts, -1), [np.zeros(0, dtype=np.int64)]
+        for tree_level in range(int(self.front_levels.max()), -1, -1):
+            is_in_level = self.front_levels[pending_entries // matrix_size] == tree_level
             border_entries, pending_entries = pending_entries[is_in_level], pending_entries[~is_in_level]
-            child, row = np.divmod(border_entries, size)
-            borders.append(border_entries)
-            start = np.flatnonzero(np.diff(child, prepend=-1))
-            self.parent[child[start]] = front[row[start]]
-            parent_front = self.parent[child]
+            child_fronts, border_rows = np.divmod(border_entries, matrix_size)
+            level_borders.append(border_entries)
+            border_starts = np.flatnonzero(np.diff(child_fronts, prepend=-1))
+            self.parent_fronts[child_fronts[border_starts]] = front_of_row[border_rows[border_starts]]
+            parent_front = self.parent_fronts[child_fronts]
             pending_entries = np.unique(
-                np.concatenate([pending_entries, (parent_front * size + row)[front[row] != parent_front]])
+                np.concatenate(
+                    [
+                        pending_entries,
+                        (parent_front * matrix_size + border_rows)[front_of_row[border_rows] != parent_front],
+                    ]
+                )
             )
-        self.keys = np.sort(np.concatenate(borders))
-        self.border_front, self.border_row = np.divmod(self.keys, size)
+        self.border_keys = np.sort(np.concatenate(level_borders))
+        self.fronts_of_border, self.border_rows = np.divmod(self.border_keys, matrix_size)
 
     def _local_indices(self, fronts: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Index of each matrix row within the given front, in which the pivots come first and then the border."""
-        border_positions = np.searchsorted(self.keys, fronts * self.size + rows) - self.border_first[fronts]
-        is_pivot = self.front[rows] == fronts
+        border_positions = (
+            np.searchsorted(self.border_keys, fronts * self.matrix_size + rows) - self.border_starts[fronts]
+        )
+        is_pivot = self.front_of_row[rows] == fronts
         return np.where(is_pivot, rows - self.first_pivots[fronts], self.pivots[fronts] + border_positions)
 
-    def fronts(self, top: int) -> tuple[Front, ...]:
-        """All fronts of the tree; `top`: number of the first row that a front above the subtrees eliminates."""
-        front_of_entry = self.front[self.earlier_rows]
-        height = self.pivots + self.border
-        panel_indices = (self.earlier_rows - self.first_pivots[front_of_entry]) * height[
+    def fronts(self, first_top_row: int) -> tuple[Front, ...]:
+        """All fronts of the tree; `first_top_row`: number of the first row that a front above the subtrees
+        eliminates."""
+        front_of_entry = self.front_of_row[self.earlier_rows]
+        front_heights = self.pivots + self.border
+        panel_indices = (self.earlier_rows - self.first_pivots[front_of_entry]) * front_heights[
             front_of_entry
         ] + self._local_indices(front_of_entry, self.later_rows)
         panel_indices = panel_indices[self.entry_order]
-        entry_offsets = np.searchsorted(front_of_entry[self.entry_order], np.arange(len(height) + 1)).tolist()
-        is_parent_pivot = self.rows_in_parent < self.pivots[self.parent[self.border_front]]
-        num_parent_pivots = np.bincount(self.border_front[is_parent_pivot], minlength=len(height)).tolist()
-        num_subtree_rows = np.bincount(self.border_front[self.border_row < top], minlength=len(height)).tolist()
-        children: list[list[int]] = [[] for _ in height]
-        for child, parent in enumerate(self.parent.tolist()):
-            if parent >= 0:
-                children[parent].append(child)
-        starts, counts = self.border_first.tolist(), self.border.tolist()
+        entry_offsets = np.searchsorted(front_of_entry[self.entry_order], np.arange(len(front_heights) + 1)).tolist()
+        is_parent_pivot = self.rows_in_parent < self.pivots[self.parent_fronts[self.fronts_of_border]]
+        num_parent_pivots = np.bincount(self.fronts_of_border[is_parent_pivot], minlength=len(front_heights)).tolist()
+        num_subtree_rows = np.bincount(
+            self.fronts_of_border[self.border_rows < first_top_row], minlength=len(front_heights)
+        ).tolist()
+        child_lists: list[list[int]] = [[] for _ in front_heights]
+        for child_front, parent_front in enumerate(self.parent_fronts.tolist()):
+            if parent_front >= 0:
+                child_lists[parent_front].append(child_front)
+        border_starts, border_counts = self.border_starts.tolist(), self.border.tolist()
         fronts = []
-        for number, (pivots, first_pivot) in enumerate(
-            zip(self.pivots.tolist(), self.first_pivots.tolist(), strict=True)
-        ):
-            rows = slice(starts[number], starts[number] + counts[number])
-            entries = slice(entry_offsets[number], entry_offsets[number + 1])
+        for k, (pivots, first_pivot) in enumerate(zip(self.pivots.tolist(), self.first_pivots.tolist(), strict=True)):
+            rows = slice(border_starts[k], border_starts[k] + border_counts[k])
+            entry_slice = slice(entry_offsets[k], entry_offsets[k + 1])
             front = Front(
-                pivots, counts[number], first_pivot, self.border_row[rows], entries, panel_indices[entries],
-                tuple(children[number]), self.rows_in_parent[rows], num_parent_pivots[number], num_subtree_rows[number]
+                pivots, border_counts[k], first_pivot, self.border_rows[rows], entry_slice, panel_indices[entry_slice],
+                tuple(child_lists[k]), self.rows_in_parent[rows], num_parent_pivots[k], num_subtree_rows[k]
             )  # fmt: skip
             fronts.append(front)
         return tuple(fronts)
@@ -269,8 +297,8 @@ def _morton_positions(coordinates: np.ndarray) -> np.ndarray:
     near each other in a front, so that the rows of a child are nearly consecutive rows of its parent."""
     bounding_size = max(np.ptp(coordinates, axis=0).max(), np.finfo(float).tiny)
     cells = ((coordinates - coordinates.min(axis=0)) / bounding_size * (2**_COORDINATE_BITS - 1)).astype(np.int64)
-    position = np.zeros(len(cells), dtype=np.int64)
-    for bit in range(_COORDINATE_BITS - 1, -1, -1):
-        for axis in cells.T:
-            position = 2 * position + ((axis >> bit) & 1)
-    return position
+    morton_positions = np.zeros(len(cells), dtype=np.int64)
+    for bit_number in range(_COORDINATE_BITS - 1, -1, -1):
+        for cell_coordinate in cells.T:
+            morton_positions = 2 * morton_positions + ((cell_coordinate >> bit_number) & 1)
+    return morton_positions

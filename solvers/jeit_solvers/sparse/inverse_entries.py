@@ -62,15 +62,19 @@ class Strips(Module):
         strip_of_row = _breadth_first_levels(pattern, longest_axis)
         # Sort the unknowns of a strip by their other coordinates, so that neighbours in space are neighbours in memory.
         sort_order = np.lexsort((*other_axes[::-1], ~selected, strip_of_row))
-        counts = np.bincount(strip_of_row)
+        rows_per_strip = np.bincount(strip_of_row)
         index_in_strip = np.empty(len(strip_of_row), int)
-        index_in_strip[sort_order] = np.arange(len(strip_of_row)) - np.repeat(np.cumsum(counts) - counts, counts)
-        strip_size = int(counts.max())
+        index_in_strip[sort_order] = np.arange(len(strip_of_row)) - np.repeat(
+            np.cumsum(rows_per_strip) - rows_per_strip, rows_per_strip
+        )
+        strip_size = int(rows_per_strip.max())
         num_selected = int(np.bincount(strip_of_row[selected], minlength=1).max())
         num_selected = min(
             -(-max(num_selected, 1) // 8) * 8, strip_size
         )  # rounded to few sizes, because a program is compiled for each size
-        return cls((strip_of_row * strip_size + index_in_strip).astype(np.int32), len(counts), strip_size, num_selected)
+        return cls(
+            (strip_of_row * strip_size + index_in_strip).astype(np.int32), len(rows_per_strip), strip_size, num_selected
+        )
 
     @property
     def place(self) -> Int[np.ndarray, " n"]:
@@ -80,19 +84,19 @@ class Strips(Module):
 
     def max_strip_distance(self, groups: Int[np.ndarray, "g k"]) -> int:
         """Largest difference between the strip numbers of two places in the same row of `groups` (g, k); at least 1."""
-        strips = np.asarray(groups) // self.selected_per_strip
-        return max(1, int((strips.max(axis=1) - strips.min(axis=1)).max()))
+        strip_numbers = np.asarray(groups) // self.selected_per_strip
+        return max(1, int((strip_numbers.max(axis=1) - strip_numbers.min(axis=1)).max()))
 
     def spread(self, rows: Inexact[Array, "n *k"]) -> Inexact[Array, "p *k"]:
         """Reorder `rows` (n, …), one per unknown, to the order of places. Places without an unknown get zeros."""
-        shape = self.num_strips * self.strip_size, *rows.shape[1:]
-        spread = (
-            jnp.zeros(shape, rows.dtype)
+        padded_shape = self.num_strips * self.strip_size, *rows.shape[1:]
+        spread_rows = (
+            jnp.zeros(padded_shape, rows.dtype)
             .at[self.position]
             .set(rows)
-            .reshape(self.num_strips, self.strip_size, *shape[1:])
+            .reshape(self.num_strips, self.strip_size, *padded_shape[1:])
         )
-        return spread[:, : self.selected_per_strip].reshape(-1, *shape[1:])
+        return spread_rows[:, : self.selected_per_strip].reshape(-1, *padded_shape[1:])
 
 
 class NearInverse(Module):
@@ -114,20 +118,22 @@ class NearInverse(Module):
 
     def blocks(self, places: Int[Array, "g k"]) -> Inexact[Array, "g k k"]:
         """Blocks (g, k, k) of the inverse G between the k places of each group."""
-        _, selected, width = self.band.shape
+        _, num_selected, band_width = self.band.shape
         low_rank_blocks = self.left[places] @ jnp.swapaxes(self.right[places], 1, 2)
         if self.band.size >= 2**31:  # places are 32-bit integers, and their products would overflow
             places = places.astype(jnp.int64)
-        row, column = places[:, :, None], places[:, None]
-        row, column = jnp.minimum(row, column), jnp.maximum(row, column)
-        entry_index = row * width + column - row // selected * selected
+        row_places, column_places = places[:, :, None], places[:, None]
+        row_places, column_places = jnp.minimum(row_places, column_places), jnp.maximum(row_places, column_places)
+        entry_index = row_places * band_width + column_places - row_places // num_selected * num_selected
         return self.band.reshape(-1).at[entry_index].get(mode="promise_in_bounds") + low_rank_blocks
 
     def add(self, left: Inexact[Array, "p r"], right: Inexact[Array, "p r"]) -> "NearInverse":
         """Return the sum G + left rightᵀ, which must be symmetric. The rows of `left` and `right` are in the order of
         places."""
-        factors = (jnp.concatenate(factor_pair, axis=1) for factor_pair in ((self.left, left), (self.right, right)))
-        return NearInverse(self.band, *factors)
+        joined_factors = (
+            jnp.concatenate(factor_pair, axis=1) for factor_pair in ((self.left, left), (self.right, right))
+        )
+        return NearInverse(self.band, *joined_factors)
 
 
 @partial(jax.jit, static_argnums=2)
@@ -149,18 +155,18 @@ def near_inverse(strips: Strips, operator: SparseSymmetric, max_distance: int) -
     ```
     """
     strip_size, num_selected = strips.strip_size, strips.selected_per_strip
-    blocks, coupling_blocks = _strip_blocks(strips, operator)
+    diagonal_blocks, coupling_blocks = _strip_blocks(strips, operator)
 
-    def eliminate(schur_update, strip_index):
-        block, coupling = strip_index
-        pivot = symmetric_inverse(block - schur_update)
-        weights = pivot @ coupling
-        return coupling.T @ weights, (pivot, weights)
+    def eliminate_strip(schur_update, strip_index):
+        diagonal_block, coupling_block = strip_index
+        pivot_inverse = symmetric_inverse(diagonal_block - schur_update)
+        coupling_weights = pivot_inverse @ coupling_block
+        return coupling_block.T @ coupling_weights, (pivot_inverse, coupling_weights)
 
     def substitute_strip(following_blocks, strip_index):
-        pivot, weights = strip_index
-        later_blocks = -weights @ following_blocks
-        diagonal_block = pivot - later_blocks[:, :strip_size] @ weights.T
+        pivot_inverse, coupling_weights = strip_index
+        later_blocks = -coupling_weights @ following_blocks
+        diagonal_block = pivot_inverse - later_blocks[:, :strip_size] @ coupling_weights.T
         diagonal_block = (diagonal_block + diagonal_block.T) / 2
         selected_blocks = jnp.concatenate(
             [diagonal_block[:, :num_selected], later_blocks[:, :num_selected], later_blocks[:, strip_size:]], axis=1
@@ -172,9 +178,9 @@ def near_inverse(strips: Strips, operator: SparseSymmetric, max_distance: int) -
         return following_blocks, selected_blocks
 
     zero_block = jnp.zeros((strip_size, strip_size), operator.values.dtype)
-    _, eliminated = jax.lax.scan(eliminate, zero_block, (blocks, coupling_blocks))
+    _, eliminated_strips = jax.lax.scan(eliminate_strip, zero_block, (diagonal_blocks, coupling_blocks))
     zero_block = jnp.zeros((strip_size, strip_size + (max_distance - 1) * num_selected), operator.values.dtype)
-    _, upper_blocks = jax.lax.scan(substitute_strip, zero_block, eliminated, reverse=True)
+    _, upper_blocks = jax.lax.scan(substitute_strip, zero_block, eliminated_strips, reverse=True)
     empty_factors = jnp.zeros((strips.num_strips * num_selected, 0), upper_blocks.dtype)
     return NearInverse(upper_blocks, empty_factors, empty_factors)
 
@@ -182,41 +188,55 @@ def near_inverse(strips: Strips, operator: SparseSymmetric, max_distance: int) -
 def _strip_blocks(strips: Strips, operator: SparseSymmetric):
     """Diagonal blocks A_i and blocks E_i between neighbouring strips, both (num_strips, strip_size, strip_size). Strips
     are padded to equal size with unknowns that are not coupled to others."""
-    shape = strips.num_strips, strips.strip_size, strips.strip_size
-    position = jnp.asarray(strips.position)
-    rows, columns = position[operator.pattern.rows], position[operator.pattern.columns]
-    smaller_indices, larger_indices = jnp.minimum(rows, columns), jnp.maximum(rows, columns)
-    strip, row, column = (
+    block_shape = strips.num_strips, strips.strip_size, strips.strip_size
+    padded_positions = jnp.asarray(strips.position)
+    entry_rows, entry_columns = padded_positions[operator.pattern.rows], padded_positions[operator.pattern.columns]
+    smaller_indices, larger_indices = jnp.minimum(entry_rows, entry_columns), jnp.maximum(entry_rows, entry_columns)
+    strip_of_entry, row_in_strip, column_in_strip = (
         smaller_indices // strips.strip_size,
         smaller_indices % strips.strip_size,
         larger_indices % strips.strip_size,
     )
-    strip_of_diagonal_entry = jnp.where(larger_indices // strips.strip_size == strip, strip, strips.num_strips)
-    coupling_strip = jnp.where(larger_indices // strips.strip_size == strip, strips.num_strips, strip)
-    is_padding = jnp.ones(strips.num_strips * strips.strip_size).at[position].set(0).reshape(shape[:2])
-    blocks = jnp.eye(strips.strip_size, dtype=operator.values.dtype) * is_padding[:, None]
-    blocks = blocks.at[strip_of_diagonal_entry, row, column].set(operator.values, mode="drop")
-    blocks = blocks.at[strip_of_diagonal_entry, column, row].set(operator.values, mode="drop")
-    coupling_blocks = (
-        jnp.zeros(shape, operator.values.dtype).at[coupling_strip, row, column].set(operator.values, mode="drop")
+    strip_of_diagonal_entry = jnp.where(
+        larger_indices // strips.strip_size == strip_of_entry, strip_of_entry, strips.num_strips
     )
-    return blocks, coupling_blocks
+    coupling_strip = jnp.where(larger_indices // strips.strip_size == strip_of_entry, strips.num_strips, strip_of_entry)
+    is_padding = jnp.ones(strips.num_strips * strips.strip_size).at[padded_positions].set(0).reshape(block_shape[:2])
+    diagonal_blocks = jnp.eye(strips.strip_size, dtype=operator.values.dtype) * is_padding[:, None]
+    diagonal_blocks = diagonal_blocks.at[strip_of_diagonal_entry, row_in_strip, column_in_strip].set(
+        operator.values, mode="drop"
+    )
+    diagonal_blocks = diagonal_blocks.at[strip_of_diagonal_entry, column_in_strip, row_in_strip].set(
+        operator.values, mode="drop"
+    )
+    coupling_blocks = (
+        jnp.zeros(block_shape, operator.values.dtype)
+        .at[coupling_strip, row_in_strip, column_in_strip]
+        .set(operator.values, mode="drop")
+    )
+    return diagonal_blocks, coupling_blocks
 
 
 def _breadth_first_levels(pattern: SparsityPattern, coordinate: np.ndarray) -> Int[np.ndarray, " n"]:
     """Levels (n,) of a breadth-first search that starts where `coordinate` (n,) is smallest, in each connected
     component."""
-    rows, columns = np.asarray(pattern.rows), np.asarray(pattern.columns)
-    graph = csr_array((np.ones(len(rows), np.float32), (rows, columns)), shape=(pattern.size, pattern.size))
-    graph = graph + graph.T
-    level, level_number = np.full(pattern.size, -1), 0
+    entry_rows, entry_columns = np.asarray(pattern.rows), np.asarray(pattern.columns)
+    pattern_graph = csr_array(
+        (np.ones(len(entry_rows), np.float32), (entry_rows, entry_columns)), shape=(pattern.size, pattern.size)
+    )
+    pattern_graph = pattern_graph + pattern_graph.T
+    node_levels, level_number = np.full(pattern.size, -1), 0
     is_in_frontier = np.zeros(pattern.size, bool)
-    while (is_unvisited := level < 0).any():
+    while (is_unvisited := node_levels < 0).any():
         if not is_in_frontier.any():
             first_node = np.flatnonzero(is_unvisited)[coordinate[is_unvisited].argmin()]
-            neighbours = graph.indices[graph.indptr[first_node] : graph.indptr[first_node + 1]]
-            is_in_frontier = is_unvisited & (coordinate <= (coordinate[first_node] + coordinate[neighbours].max()) / 2)
-        level[is_in_frontier] = level_number
+            neighbour_nodes = pattern_graph.indices[
+                pattern_graph.indptr[first_node] : pattern_graph.indptr[first_node + 1]
+            ]
+            is_in_frontier = is_unvisited & (
+                coordinate <= (coordinate[first_node] + coordinate[neighbour_nodes].max()) / 2
+            )
+        node_levels[is_in_frontier] = level_number
         level_number += 1
-        is_in_frontier = (graph @ is_in_frontier.astype(np.float32) > 0) & (level < 0)
-    return level
+        is_in_frontier = (pattern_graph @ is_in_frontier.astype(np.float32) > 0) & (node_levels < 0)
+    return node_levels

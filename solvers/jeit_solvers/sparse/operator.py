@@ -169,26 +169,29 @@ class NumpySolver(MatrixSolver):
 
     def solve_columns(self, state: SparseSymmetric, columns: Inexact[Array, "n k"]) -> Inexact[Array, "n k"]:
         """Solutions (n, k) for k right-hand sides `columns`."""
-        pattern, dtype = state.pattern, jnp.result_type(state.values, columns)
-        shape = jax.ShapeDtypeStruct(columns.shape, dtype)
+        pattern, result_dtype = state.pattern, jnp.result_type(state.values, columns)
+        result_shape = jax.ShapeDtypeStruct(columns.shape, result_dtype)
 
-        def solve_with_pattern(pattern: SparsityPattern, values: Any, columns: Any) -> np.ndarray:
-            solutions = self.solve_in_numpy(pattern, np.asarray(values), np.asarray(columns))
-            return solutions.astype(dtype, copy=False)
+        def solve_with_pattern(pattern: SparsityPattern, matrix_values: Any, side_columns: Any) -> np.ndarray:
+            column_solutions = self.solve_in_numpy(pattern, np.asarray(matrix_values), np.asarray(side_columns))
+            return column_solutions.astype(result_dtype, copy=False)
 
         if has_values(pattern):  # constants, not stored in the compiled program because they are large
             host_pattern = on_host(pattern)
             if has_values(state, columns):
                 return host.asarray(solve_with_pattern(host_pattern, state.values, columns))
             return call_numpy(
-                lambda values, columns: solve_with_pattern(host_pattern, values, columns), shape, state.values, columns
+                lambda matrix_values, side_columns: solve_with_pattern(host_pattern, matrix_values, side_columns),
+                result_shape,
+                state.values,
+                columns,
             )
 
-        def solve_flattened(indices: np.ndarray, values: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        def solve_flattened(indices: np.ndarray, matrix_values: np.ndarray, side_columns: np.ndarray) -> np.ndarray:
             traced_pattern = SparsityPattern(indices, pattern.layout, pattern.size)  # pyright: ignore[reportArgumentType]
-            return solve_with_pattern(traced_pattern, values, columns)
+            return solve_with_pattern(traced_pattern, matrix_values, side_columns)
 
-        return call_numpy(solve_flattened, shape, pattern.indices, state.values, columns)
+        return call_numpy(solve_flattened, result_shape, pattern.indices, state.values, columns)
 
     def compute(
         self, state: SparseSymmetric, vector: Inexact[Array, " n"], options: dict[str, Any]
@@ -216,12 +219,12 @@ class LastMatrixCache:
         """Return the result of `compute` for the matrix with the given values (nnz,), from the cache if the last call
         was for the same matrix. `key` distinguishes sparsity patterns; with `keeps_result` False the result is not
         cached."""
-        digest = hashlib.blake2b(np.ascontiguousarray(values).tobytes(), digest_size=16).digest()
-        key += values.dtype.str.encode() + digest
-        cached = self._last_result  # another thread may replace it meanwhile
-        if cached is not None and cached[0] == key:
-            return cached[1]
-        self._last_result = cached = None  # frees the memory for the next result
-        result = compute()
-        self._last_result = (key, result) if keeps_result else None
-        return result
+        values_digest = hashlib.blake2b(np.ascontiguousarray(values).tobytes(), digest_size=16).digest()
+        key += values.dtype.str.encode() + values_digest
+        last_result = self._last_result  # another thread may replace it meanwhile
+        if last_result is not None and last_result[0] == key:
+            return last_result[1]
+        self._last_result = last_result = None  # frees the memory for the next result
+        new_result = compute()
+        self._last_result = (key, new_result) if keeps_result else None
+        return new_result

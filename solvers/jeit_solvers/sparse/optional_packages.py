@@ -35,9 +35,9 @@ _MAX_COLUMNS = 16
 # Maximum number of unknowns of the coarsest level; the matrix of this level is inverted.
 _MAX_COARSEST_SIZE = 500
 # The smoother is a Chebyshev polynomial of degree 2, which damps the spectrum of the scaled matrix between an eighth of
-# its upper bound and the bound. `_WEIGHTS` are the reciprocals of the polynomial's roots.
-_MIDDLE, _HALF = (1 + 1 / 8) / 2, (1 - 1 / 8) / 2
-_WEIGHTS = tuple(1 / (_MIDDLE + sign * _HALF * np.sqrt(0.5)) for sign in (1, -1))
+# its upper bound and the bound. `_RELAXATION_WEIGHTS` are the reciprocals of the polynomial's roots.
+_SPECTRUM_MIDDLE, _SPECTRUM_HALF_WIDTH = (1 + 1 / 8) / 2, (1 - 1 / 8) / 2
+_RELAXATION_WEIGHTS = tuple(1 / (_SPECTRUM_MIDDLE + sign * _SPECTRUM_HALF_WIDTH * np.sqrt(0.5)) for sign in (1, -1))
 
 
 class MultigridLevel(NamedTuple):
@@ -104,29 +104,33 @@ class Multigrid(NumpySolver):
 
     def solve_in_numpy(self, pattern: SparsityPattern, values: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Solutions (n, k) for right-hand sides `columns` (n, k); NaN where the iteration failed."""
-        key = pattern_key(pattern)
-        matrix_hierarchy = _LAST_HIERARCHY.get_or_compute(key, values, lambda: hierarchy(pattern.to_scipy(values)))
-        dtype = np.result_type(values, columns, float)
-        right_hand_sides = np.ascontiguousarray(columns, dtype)
+        hierarchy_key = pattern_key(pattern)
+        matrix_hierarchy = _LAST_HIERARCHY.get_or_compute(
+            hierarchy_key, values, lambda: hierarchy(pattern.to_scipy(values))
+        )
+        result_dtype = np.result_type(values, columns, float)
+        right_hand_sides = np.ascontiguousarray(columns, result_dtype)
         if matrix_hierarchy.levels is None:
-            return np.full(right_hand_sides.shape, np.nan, dtype)
+            return np.full(right_hand_sides.shape, np.nan, result_dtype)
         if np.iscomplexobj(right_hand_sides) and not np.iscomplexobj(values):
             right_hand_sides = right_hand_sides.view(float)  # real and imaginary parts are columns of their own
-        solution = np.empty_like(right_hand_sides)
+        column_solutions = np.empty_like(right_hand_sides)
 
-        def solve(column_slice: slice) -> None:
-            group = np.ascontiguousarray(right_hand_sides[:, column_slice])
-            solution[:, column_slice] = _conjugate_gradients(matrix_hierarchy, group, self.tolerance, self.max_steps)
+        def solve_column_group(column_slice: slice) -> None:
+            column_group = np.ascontiguousarray(right_hand_sides[:, column_slice])
+            column_solutions[:, column_slice] = _conjugate_gradients(
+                matrix_hierarchy, column_group, self.tolerance, self.max_steps
+            )
 
         num_columns_at_once = max(1, min(_MAX_COLUMNS, -(-right_hand_sides.shape[1] // number_of_cores())))
         on_cores(
-            solve,
+            solve_column_group,
             [
-                slice(start, start + num_columns_at_once)
-                for start in range(0, right_hand_sides.shape[1], num_columns_at_once)
+                slice(first_column, first_column + num_columns_at_once)
+                for first_column in range(0, right_hand_sides.shape[1], num_columns_at_once)
             ],
         )
-        return solution.view(dtype)
+        return column_solutions.view(result_dtype)
 
 
 def multigrid_is_installed() -> bool:
@@ -136,8 +140,8 @@ def multigrid_is_installed() -> bool:
 
 def hierarchy(matrix: csr_array) -> MultigridHierarchy:
     """Build the multigrid levels for a symmetric matrix (n, n) with positive definite real part."""
-    diagonal = matrix.diagonal()
-    if not (np.isfinite(matrix.data).all() and (diagonal.real > 0).all()):
+    matrix_diagonal = matrix.diagonal()
+    if not (np.isfinite(matrix.data).all() and (matrix_diagonal.real > 0).all()):
         return MultigridHierarchy(matrix, None)
     pyamg_solver = importlib.import_module("pyamg").smoothed_aggregation_solver(
         matrix.real.tocsr(),
@@ -148,54 +152,65 @@ def hierarchy(matrix: csr_array) -> MultigridHierarchy:
         postsmoother=None,
         max_coarse=_MAX_COARSEST_SIZE,
     )
-    return MultigridHierarchy(matrix, [_build_level(level) for level in pyamg_solver.levels])
+    return MultigridHierarchy(matrix, [_build_level(pyamg_level) for pyamg_level in pyamg_solver.levels])
 
 
 def _build_level(pyamg_level: Any) -> MultigridLevel:
-    matrix = csr_array(pyamg_level.A)
-    row_sums = abs(matrix).sum(axis=1).reshape(-1, 1)
-    scale = (1 / np.where(row_sums > 0, row_sums, 1)).astype(
+    level_matrix = csr_array(pyamg_level.A)
+    row_sums = abs(level_matrix).sum(axis=1).reshape(-1, 1)
+    inverse_row_sums = (1 / np.where(row_sums > 0, row_sums, 1)).astype(
         np.float32
     )  # for rows of zeros, which PyAMG creates for isolated nodes
     if not hasattr(pyamg_level, "P"):
         return MultigridLevel(
-            matrix, scale, inverse=np.linalg.pinv(matrix.toarray(), hermitian=True).astype(np.float32)
+            level_matrix,
+            inverse_row_sums,
+            inverse=np.linalg.pinv(level_matrix.toarray(), hermitian=True).astype(np.float32),
         )
-    prolongation = csr_array(pyamg_level.P).astype(np.float32)
-    return MultigridLevel(matrix.astype(np.float32), scale, prolongation, csr_array(prolongation.T))
+    prolongation_matrix = csr_array(pyamg_level.P).astype(np.float32)
+    return MultigridLevel(
+        level_matrix.astype(np.float32), inverse_row_sums, prolongation_matrix, csr_array(prolongation_matrix.T)
+    )
 
 
-def _v_cycle(levels: list[MultigridLevel], right_hand_side: np.ndarray) -> np.ndarray:
+def _v_cycle(multigrid_levels: list[MultigridLevel], right_hand_side: np.ndarray) -> np.ndarray:
     """Apply one multigrid V-cycle, started at zero, to right-hand sides (n, k)."""
-    level, *coarser = levels
-    if level.inverse is not None:
-        return level.inverse @ right_hand_side
-    first_weight, second_weight = _WEIGHTS
-    solution = np.float32(first_weight) * level.scale * right_hand_side
-    _relax(level, solution, right_hand_side, second_weight)
-    residual = level.matrix @ solution
+    finest_level, *coarser_levels = multigrid_levels
+    if finest_level.inverse is not None:
+        return finest_level.inverse @ right_hand_side
+    first_weight, second_weight = _RELAXATION_WEIGHTS
+    cycle_solution = np.float32(first_weight) * finest_level.scale * right_hand_side
+    _relax_once(finest_level, cycle_solution, right_hand_side, second_weight)
+    residual = finest_level.matrix @ cycle_solution
     np.subtract(right_hand_side, residual, out=residual)
-    solution += level.prolongation @ _v_cycle(coarser, level.restriction @ residual)
-    for weight in (second_weight, first_weight):
-        _relax(level, solution, right_hand_side, weight)
-    return solution
+    cycle_solution += finest_level.prolongation @ _v_cycle(coarser_levels, finest_level.restriction @ residual)
+    for relaxation_weight in (second_weight, first_weight):
+        _relax_once(finest_level, cycle_solution, right_hand_side, relaxation_weight)
+    return cycle_solution
 
 
-def _relax(level: MultigridLevel, solution: np.ndarray, right_hand_side: np.ndarray, weight: float) -> None:
-    """Smooth a solution (n, k): add the residual, scaled by `weight` and the inverse row sums of the matrix."""
-    change = level.matrix @ solution
-    np.subtract(right_hand_side, change, out=change)
-    change *= np.float32(weight) * level.scale
-    solution += change
+def _relax_once(
+    multigrid_level: MultigridLevel, solution: np.ndarray, right_hand_side: np.ndarray, relaxation_weight: float
+) -> None:
+    """Smooth a solution (n, k): add the residual, scaled by `relaxation_weight` and the inverse row sums of the
+    matrix."""
+    solution_change = multigrid_level.matrix @ solution
+    np.subtract(right_hand_side, solution_change, out=solution_change)
+    solution_change *= np.float32(relaxation_weight) * multigrid_level.scale
+    solution += solution_change
 
 
-def _precondition(levels: list[MultigridLevel], residual: np.ndarray, column_norms: np.ndarray) -> np.ndarray:
+def _apply_v_cycle(
+    multigrid_levels: list[MultigridLevel], residual: np.ndarray, column_norms: np.ndarray
+) -> np.ndarray:
     """Apply a multigrid V-cycle to residuals (n, k). The residuals are first divided by their `column_norms` (k,),
     because single precision has a limited range."""
-    scale = np.where(column_norms > 0, column_norms, 1) / np.sqrt(len(residual))
+    residual_scales = np.where(column_norms > 0, column_norms, 1) / np.sqrt(len(residual))
     single_precision = np.complex64 if np.iscomplexobj(residual) else np.float32
-    scaled = np.multiply(residual, 1 / scale, out=np.empty(residual.shape, single_precision), casting="unsafe")
-    return _v_cycle(levels, scaled.view(np.float32)).view(single_precision) * scale
+    scaled_residual = np.multiply(
+        residual, 1 / residual_scales, out=np.empty(residual.shape, single_precision), casting="unsafe"
+    )
+    return _v_cycle(multigrid_levels, scaled_residual.view(np.float32)).view(single_precision) * residual_scales
 
 
 def _conjugate_gradients(
@@ -209,38 +224,48 @@ def _conjugate_gradients(
         right_hand_side.copy(),
         _column_norms(right_hand_side),
     )
-    preconditioned = _precondition(hierarchy.levels, residual, column_norms)
-    direction, weight = preconditioned.copy(), _column_products(residual, preconditioned)
-    max_norm, max_error = tolerance * column_norms, tolerance * _column_norms(preconditioned)
+    preconditioned_residual = _apply_v_cycle(hierarchy.levels, residual, column_norms)
+    search_direction, residual_weights = (
+        preconditioned_residual.copy(),
+        _column_products(residual, preconditioned_residual),
+    )
+    max_norm, max_error = tolerance * column_norms, tolerance * _column_norms(preconditioned_residual)
     is_converged = column_norms == 0
     for _ in range(max_steps):
-        product = hierarchy.matrix @ direction
-        curvature = _column_products(direction, product)
-        if not (np.iscomplexobj(curvature) or (curvature[~is_converged] > 0).all()):  # not positive definite
+        direction_product = hierarchy.matrix @ search_direction
+        direction_curvatures = _column_products(search_direction, direction_product)
+        # The matrix is not positive definite.
+        if not (np.iscomplexobj(direction_curvatures) or (direction_curvatures[~is_converged] > 0).all()):
             break
-        length = np.divide(weight, curvature, out=np.zeros_like(weight), where=~is_converged)
-        product *= length
-        residual -= product
-        solution += np.multiply(direction, length, out=product)
+        step_lengths = np.divide(
+            residual_weights, direction_curvatures, out=np.zeros_like(residual_weights), where=~is_converged
+        )
+        direction_product *= step_lengths
+        residual -= direction_product
+        solution += np.multiply(search_direction, step_lengths, out=direction_product)
         column_norms = _column_norms(residual)
-        preconditioned = _precondition(hierarchy.levels, residual, column_norms)
-        last_weight, weight = weight, _column_products(residual, preconditioned)
-        is_converged |= (column_norms <= max_norm) & (_column_norms(preconditioned) <= max_error)
-        if is_converged.all() or not np.isfinite(weight).all():
+        preconditioned_residual = _apply_v_cycle(hierarchy.levels, residual, column_norms)
+        last_weight, residual_weights = residual_weights, _column_products(residual, preconditioned_residual)
+        is_converged |= (column_norms <= max_norm) & (_column_norms(preconditioned_residual) <= max_error)
+        if is_converged.all() or not np.isfinite(residual_weights).all():
             break
-        direction *= np.divide(weight, last_weight, out=np.zeros_like(weight), where=~is_converged)
-        direction += preconditioned
+        search_direction *= np.divide(
+            residual_weights, last_weight, out=np.zeros_like(residual_weights), where=~is_converged
+        )
+        search_direction += preconditioned_residual
     solution[:, ~is_converged] = np.nan
     return solution
 
 
-def _column_products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    return np.einsum("nk,nk->k", left, right)
+def _column_products(left_columns: np.ndarray, right_columns: np.ndarray) -> np.ndarray:
+    return np.einsum("nk,nk->k", left_columns, right_columns)
 
 
 def _column_norms(columns: Any) -> np.ndarray:
-    squares = _column_products(columns.real, columns.real)
-    return np.sqrt(squares + _column_products(columns.imag, columns.imag) if np.iscomplexobj(columns) else squares)
+    squared_norms = _column_products(columns.real, columns.real)
+    return np.sqrt(
+        squared_norms + _column_products(columns.imag, columns.imag) if np.iscomplexobj(columns) else squared_norms
+    )
 
 
 _LAST_HIERARCHY = LastMatrixCache()
@@ -278,10 +303,10 @@ class Pardiso(NumpySolver):
 
     def solve_in_numpy(self, pattern: SparsityPattern, values: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Solutions (n, k) for the right-hand sides `columns` (n, k)."""
-        factor = _LAST_PARDISO_FACTOR.get_or_compute(
+        pardiso_factor = _LAST_PARDISO_FACTOR.get_or_compute(
             pattern_key(pattern), values, lambda: _PardisoFactor(csr_array(pattern.to_scipy(values)))
         )
-        return factor.solve(columns)
+        return pardiso_factor.solve(columns)
 
 
 class _PardisoFactor:
@@ -291,40 +316,44 @@ class _PardisoFactor:
         self.is_complex = np.iscomplexobj(matrix)
         if self.is_complex:
             # The equations (A + iB)(x + iy) = f + ig in real form, with the second row negated.
-            real, imaginary = matrix.real, matrix.imag
-            matrix = csr_array(block_array([[real, -imaginary], [-imaginary, -real]]))
+            real_part, imaginary_part = matrix.real, matrix.imag
+            matrix = csr_array(block_array([[real_part, -imaginary_part], [-imaginary_part, -real_part]]))
         upper_triangle = csr_matrix(triu(matrix, format="csr"), dtype=np.float64)
         upper_triangle.sort_indices()
-        package = importlib.import_module("pypardiso")
+        pypardiso_package = importlib.import_module("pypardiso")
         self.upper_triangle = upper_triangle
-        self.solver = package.PyPardisoSolver(
+        self.solver = pypardiso_package.PyPardisoSolver(
             mtype=_INDEFINITE_MATRIX_TYPE if self.is_complex else _DEFINITE_MATRIX_TYPE
         )
-        self.failure: type[Exception] = package.pardiso_wrapper.PyPardisoError
-        self.lock = Lock()  # a solver serves one thread at a time
+        self.failure: type[Exception] = pypardiso_package.pardiso_wrapper.PyPardisoError
+        self.solver_lock = Lock()  # a solver serves one thread at a time
         weakref.finalize(self, self.solver.free_memory, everything=True)
         try:
             self.solver.factorize(upper_triangle)
-            self.failed = not np.isfinite(upper_triangle.data).all()
+            self.has_failed = not np.isfinite(upper_triangle.data).all()
         except self.failure:
-            self.failed = True
+            self.has_failed = True
 
     def solve(self, columns: np.ndarray) -> np.ndarray:
         """Solutions (n, k) for right-hand sides `columns`; NaN if the matrix could not be factorised."""
         is_complex_input = np.iscomplexobj(columns)
-        if self.failed:
+        if self.has_failed:
             return np.full(columns.shape, np.nan, complex if self.is_complex or is_complex_input else float)
         if not self.is_complex:
             column_blocks = [np.real(columns), np.imag(columns)] if is_complex_input else [columns]
-            solution = self._solve(np.hstack(column_blocks))
+            real_solution = self._solve(np.hstack(column_blocks))
             num_columns = columns.shape[1]
-            return solution[:, :num_columns] + 1j * solution[:, num_columns:] if is_complex_input else solution
-        solution = self._solve(np.vstack([np.real(columns), -np.imag(columns)]))
-        num_rows = len(solution) // 2
-        return solution[:num_rows] + 1j * solution[num_rows:]
+            return (
+                real_solution[:, :num_columns] + 1j * real_solution[:, num_columns:]
+                if is_complex_input
+                else real_solution
+            )
+        real_solution = self._solve(np.vstack([np.real(columns), -np.imag(columns)]))
+        num_rows = len(real_solution) // 2
+        return real_solution[:num_rows] + 1j * real_solution[num_rows:]
 
     def _solve(self, columns: np.ndarray) -> np.ndarray:
-        with self.lock:
+        with self.solver_lock:
             return self.solver.solve(self.upper_triangle, np.asfortranarray(columns, np.float64))
 
 

@@ -93,7 +93,7 @@ def factorise(plan: FactorisationPlan, values: Inexact[Array, " nnz"]) -> Factor
         )
     if isinstance(values, np.ndarray):
         return _factorise_in_numpy(plan.layout, plan.indices, values)
-    compute_factor = in_turn(partial(_factorise, plan.layout))
+    compute_factor = in_turn(partial(_compiled_factorise, plan.layout))
     return compute_factor(plan.indices, values)
 
 
@@ -101,28 +101,28 @@ def _factorise_stages(layout: IndexLayout, indices: Int[Array, " total"], values
     stages, _ = layout.content
     dtype = values.dtype
     extended_values = jnp.concatenate([values, jnp.ones(1, dtype)])
-    inverses, lowers, schur_complements = [], [], []
+    inverses, lower_blocks, schur_complements = [], [], []
     for stage in stages:
         pivots, border = stage.pivots, stage.border
         panel = stage.entries.apply(indices, extended_values)
-        corner = jnp.zeros(stage.batch * border * border, dtype)
+        schur_corner = jnp.zeros(stage.batch * border * border, dtype)
         for link in stage.links:
-            schur = schur_complements[link.source].reshape(-1)
-            panel += link.panel.apply(indices, schur)
-            corner += link.corner.apply(indices, schur)
+            child_schur = schur_complements[link.source].reshape(-1)
+            panel += link.panel.apply(indices, child_schur)
+            schur_corner += link.corner.apply(indices, child_schur)
         panel = panel.reshape(stage.batch, pivots + border, pivots)
         inverse = inverse_cholesky(panel[:, :pivots])
-        lower_block = panel[:, pivots:] @ _transposed(inverse)
+        lower_block = panel[:, pivots:] @ _transpose(inverse)
         inverses.append(inverse)
-        lowers.append(lower_block)
-        corner = corner.reshape(stage.batch, border, border)
-        corner -= lower_block @ _transposed(lower_block)
-        schur_complements.append(corner)
-    return Factor(tuple(inverses), tuple(lowers))
+        lower_blocks.append(lower_block)
+        schur_corner = schur_corner.reshape(stage.batch, border, border)
+        schur_corner -= lower_block @ _transpose(lower_block)
+        schur_complements.append(schur_corner)
+    return Factor(tuple(inverses), tuple(lower_blocks))
 
 
 # Compiled separately, so that a second program with the same plan does not trace the factorisation again.
-_factorise = jax.jit(_factorise_stages, static_argnums=0)
+_compiled_factorise = jax.jit(_factorise_stages, static_argnums=0)
 
 
 def _factorise_in_numpy(
@@ -134,15 +134,18 @@ def _factorise_in_numpy(
     extended_values = np.concatenate([values, np.ones(1, values.dtype)])
     inverses, lowers, schur_complements = [], [], []
     for stage in stages:
-        batch, pivots, border = stage.batch, stage.pivots, stage.border
-        panel = np.zeros((batch, pivots + border, pivots), values.dtype)
-        corner = np.zeros((batch, border, border), values.dtype)
-        inverse, lower_blocks = np.empty_like(panel, shape=(batch, pivots, pivots)), np.empty_like(panel[:, pivots:])
+        num_fronts, pivots, border = stage.batch, stage.pivots, stage.border
+        panel = np.zeros((num_fronts, pivots + border, pivots), values.dtype)
+        corner = np.zeros((num_fronts, border, border), values.dtype)
+        inverse, lower_blocks = (
+            np.empty_like(panel, shape=(num_fronts, pivots, pivots)),
+            np.empty_like(panel[:, pivots:]),
+        )
         eliminate_slice = partial(
             _eliminate_fronts, stage, indices, extended_values, schur_complements, panel, corner, inverse, lower_blocks
         )
-        is_large = batch * (pivots + border) ** 2 > _MIN_PARALLEL_ENTRIES
-        on_cores(eliminate_slice, parts_for_cores(batch) if is_large else [slice(0, batch)])
+        is_large = num_fronts * (pivots + border) ** 2 > _MIN_PARALLEL_ENTRIES
+        on_cores(eliminate_slice, parts_for_cores(num_fronts) if is_large else [slice(0, num_fronts)])
         inverses.append(inverse)
         lowers.append(lower_blocks)
         schur_complements.append(corner)
@@ -156,22 +159,22 @@ def _eliminate_fronts(
     all earlier stages."""
 
     def add_contributions(padded_sum, contributions, target):
-        size = target[0].size
+        target_size = target[0].size
         padded_sum.add_range(
-            indices, contributions, target.reshape(-1), front_slice.start * size, front_slice.stop * size
+            indices, contributions, target.reshape(-1), front_slice.start * target_size, front_slice.stop * target_size
         )
 
     add_contributions(stage.entries, extended_values, panel)
     for link in stage.links:
-        schur = schur_complements[link.source].reshape(-1)
-        add_contributions(link.panel, schur, panel)
-        add_contributions(link.corner, schur, corner)
+        child_schur = schur_complements[link.source].reshape(-1)
+        add_contributions(link.panel, child_schur, panel)
+        add_contributions(link.corner, child_schur, corner)
     inverse[front_slice] = inverse_cholesky(panel[front_slice, : stage.pivots])
-    np.matmul(panel[front_slice, stage.pivots :], _transposed(inverse[front_slice]), out=lower_blocks[front_slice])
+    np.matmul(panel[front_slice, stage.pivots :], _transpose(inverse[front_slice]), out=lower_blocks[front_slice])
     num_fronts_at_once = max(1, _NUM_ENTRIES_UPDATED_AT_ONCE // max(stage.border**2, 1))
     for first_front in range(front_slice.start, front_slice.stop, num_fronts_at_once):
         update_slice = slice(first_front, min(first_front + num_fronts_at_once, front_slice.stop))
-        corner[update_slice] -= lower_blocks[update_slice] @ _transposed(lower_blocks[update_slice])
+        corner[update_slice] -= lower_blocks[update_slice] @ _transpose(lower_blocks[update_slice])
 
 
 def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
@@ -194,19 +197,19 @@ def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Arr
     vectors = _check_columns(plan, right_hand_sides, "solve")
     if isinstance(vectors, np.ndarray):
         return _solve_stages(plan.layout, plan.indices, factor, vectors).reshape(right_hand_sides.shape)
-    compute_solution = differentiable_batches(partial(_solve, plan.layout), _solve_batch)
+    compute_solution = differentiable_batches(partial(_compiled_solve, plan.layout), _solve_batch)
     return compute_solution(plan.indices, factor, vectors).reshape(right_hand_sides.shape)
 
 
 def _solve_stages(
     layout: IndexLayout, indices: Int[Array, " total"], factor: Factor, vectors: Inexact[Array, "n k"]
 ) -> Inexact[Array, "n k"]:
-    stages, solution = layout.content
+    stages, solution_indices = layout.content
     reduced_vectors = _forward_stages(layout, indices, factor, vectors)
-    return _backward_stages(stages, indices, factor, reduced_vectors)[solution.read(indices)]
+    return _backward_stages(stages, indices, factor, reduced_vectors)[solution_indices.read(indices)]
 
 
-_solve = jax.jit(_solve_stages, static_argnums=0)
+_compiled_solve = jax.jit(_solve_stages, static_argnums=0)
 
 
 def _solve_batch(batchable, unbatched, axis_size, batched, indices, factor, vectors):
@@ -214,9 +217,9 @@ def _solve_batch(batchable, unbatched, axis_size, batched, indices, factor, vect
     of factors one by one."""
     if any(jax.tree.leaves(batched[:2])):
         return map_one_by_one(batchable, unbatched, axis_size, batched, indices, factor, vectors)
-    size, count = vectors.shape[1:]
-    columns = jnp.moveaxis(vectors, 0, 1).reshape(size, axis_size * count)
-    return jnp.moveaxis(batchable(indices, factor, columns).reshape(size, axis_size, count), 1, 0)
+    matrix_size, num_columns = vectors.shape[1:]
+    joined_columns = jnp.moveaxis(vectors, 0, 1).reshape(matrix_size, axis_size * num_columns)
+    return jnp.moveaxis(batchable(indices, factor, joined_columns).reshape(matrix_size, axis_size, num_columns), 1, 0)
 
 
 def half_solve(
@@ -241,9 +244,11 @@ def half_solve(
     ```
     """
     vectors = _check_columns(plan, right_hand_sides, "half_solve")
-    forward = _forward_stages if isinstance(vectors, np.ndarray) else _compiled_forward
-    reduced_vectors = forward(plan.layout, plan.indices, factor, vectors)
-    return namespace(vectors).concatenate([rows.reshape(-1, rows.shape[-1]) for rows in reduced_vectors])
+    forward_function = _forward_stages if isinstance(vectors, np.ndarray) else _compiled_forward
+    reduced_vectors = forward_function(plan.layout, plan.indices, factor, vectors)
+    return namespace(vectors).concatenate(
+        [stage_rows.reshape(-1, stage_rows.shape[-1]) for stage_rows in reduced_vectors]
+    )
 
 
 def quadratic_form(
@@ -323,42 +328,42 @@ def _inverse_entries(
     stages, _ = layout.content
     xp, dtype = namespace(factor), factor.inverses[0].dtype
     entries = xp.zeros(num_entries + 2, dtype)  # one extra for padded pivots, and one for positions outside the pattern
-    first_child = {stage.parent: number for number, stage in reversed(list(enumerate(stages))) if stage.border}
-    fronts: dict[int, Inexact[Array, "batch height height"]] = {}
-    for number in reversed(range(len(stages))):
-        stage, inverse = stages[number], factor.inverses[number]
-        pivot_block = _transposed(inverse) @ inverse
+    first_child = {stage.parent: k for k, stage in reversed(list(enumerate(stages))) if stage.border}
+    front_blocks: dict[int, Inexact[Array, "batch height height"]] = {}
+    for k in reversed(range(len(stages))):
+        stage, inverse = stages[k], factor.inverses[k]
+        pivot_block = _transpose(inverse) @ inverse
         front_block = pivot_block
         if stage.border:
-            parent_blocks = fronts[stage.parent]
-            corner = _border_block(parent_blocks, stage.above.read(indices))
-            weights = factor.lowers[number] @ inverse
-            border_columns = corner @ weights
-            pivot_block = pivot_block + _transposed(weights) @ border_columns
+            parent_blocks = front_blocks[stage.parent]
+            border_block = _border_block(parent_blocks, stage.above.read(indices))
+            elimination_weights = factor.lowers[k] @ inverse
+            border_columns = border_block @ elimination_weights
+            pivot_block = pivot_block + _transpose(elimination_weights) @ border_columns
             panel = xp.concatenate([pivot_block, -border_columns], axis=1)
             front_block = xp.concatenate(
-                [panel, xp.concatenate([-_transposed(border_columns), corner], axis=1)], axis=2
+                [panel, xp.concatenate([-_transpose(border_columns), border_block], axis=1)], axis=2
             )
         entries = stage.entries.replace_by_sums(indices, front_block[:, :, : stage.pivots].reshape(-1), entries)
-        if number in first_child:
-            fronts[number] = front_block
-        if stage.border and first_child[stage.parent] == number:
-            del fronts[stage.parent]  # no front further down needs the entries of the parent
+        if k in first_child:
+            front_blocks[k] = front_block
+        if stage.border and first_child[stage.parent] == k:
+            del front_blocks[stage.parent]  # no front further down needs the entries of the parent
     return entries[:num_entries]
 
 
-def _border_block(above: Inexact[Array, "parents height height"], rows: Int[Array, "batch border"]):
+def _border_block(parent_rows: Inexact[Array, "parents height height"], rows: Int[Array, "batch border"]):
     """Entries of the inverse between the border rows of child fronts, read from the parents' fronts; zero for
     padding."""
-    height = above.shape[-1]
-    front_slot, local_index = rows // height, rows % height
+    height = parent_rows.shape[-1]
+    front_slot, index_in_front = rows // height, rows % height
     # Padding gets the index after the last entry.
-    flat_indices = (front_slot[:, :, None] * height + local_index[:, :, None]) * height + local_index[:, None, :]
-    is_border_row = rows < above.shape[0] * height
-    flat_indices = namespace(above).where(
-        is_border_row[:, :, None] & is_border_row[:, None, :], flat_indices, above.size
+    flat_indices = (front_slot[:, :, None] * height + index_in_front[:, :, None]) * height + index_in_front[:, None, :]
+    is_border_row = rows < parent_rows.shape[0] * height
+    flat_indices = namespace(parent_rows).where(
+        is_border_row[:, :, None] & is_border_row[:, None, :], flat_indices, parent_rows.size
     )
-    return gather_or_zero(above.reshape(-1), flat_indices)
+    return gather_or_zero(parent_rows.reshape(-1), flat_indices)
 
 
 _compiled_inverse_entries = jax.jit(_inverse_entries, static_argnums=(0, 1))
@@ -367,20 +372,20 @@ _compiled_inverse_entries = jax.jit(_inverse_entries, static_argnums=(0, 1))
 def _backward_solve(
     layout: IndexLayout, indices: Int[Array, " total"], factor: Factor, rows: Inexact[Array, "rows k"]
 ) -> Inexact[Array, "n k"]:
-    stages, solution = layout.content
+    stages, solution_indices = layout.content
     stage_ends = np.cumsum([stage.batch * stage.pivots for stage in stages])
     stage_rows = namespace(rows).split(rows, stage_ends[:-1])
     stage_rows = [
         rows_of_stage.reshape(stage.batch, stage.pivots, -1)
         for rows_of_stage, stage in zip(stage_rows, stages, strict=True)
     ]
-    return _backward_stages(stages, indices, factor, stage_rows)[solution.read(indices)]
+    return _backward_stages(stages, indices, factor, stage_rows)[solution_indices.read(indices)]
 
 
 _compiled_backward_solve = jax.jit(_backward_solve, static_argnums=0)
 
 
-def _transposed(matrices: Inexact[Array, "batch a b"]) -> Inexact[Array, "batch b a"]:
+def _transpose(matrices: Inexact[Array, "batch a b"]) -> Inexact[Array, "batch b a"]:
     return namespace(matrices).swapaxes(matrices, -1, -2)
 
 
@@ -401,19 +406,21 @@ def _forward_stages(
     """Product of L^-1 with the vectors (n, k), stage by stage. The pivot rows of a front receive the updates from its
     children."""
     stages, _ = layout.content
-    count = vectors.shape[1]
-    reduced_vectors, updates = [], []
+    num_columns = vectors.shape[1]
+    reduced_vectors, stage_updates = [], []
     for stage, inverse, lower_block in zip(stages, factor.inverses, factor.lowers, strict=True):
-        rows = gather_or_zero(vectors, stage.right_hand_side.read(indices))
-        child_updates = [link.rows.apply(indices, updates[link.source].reshape(-1, count)) for link in stage.links]
-        child_updates = [update.reshape(stage.batch, -1, count) for update in child_updates]
-        rows = sum((update[:, : stage.pivots] for update in child_updates), rows)
-        zero = namespace(vectors).zeros((), vectors.dtype)
+        pivot_rows = gather_or_zero(vectors, stage.right_hand_side.read(indices))
+        child_updates = [
+            link.rows.apply(indices, stage_updates[link.source].reshape(-1, num_columns)) for link in stage.links
+        ]
+        child_updates = [child_update.reshape(stage.batch, -1, num_columns) for child_update in child_updates]
+        pivot_rows = sum((child_update[:, : stage.pivots] for child_update in child_updates), pivot_rows)
+        zero_scalar = namespace(vectors).zeros((), vectors.dtype)
         border_update = functools.reduce(
-            operator.add, [update[:, stage.pivots :] for update in child_updates] or [zero]
+            operator.add, [child_update[:, stage.pivots :] for child_update in child_updates] or [zero_scalar]
         )
-        reduced_vectors.append(inverse @ rows)
-        updates.append(border_update - lower_block @ reduced_vectors[-1])
+        reduced_vectors.append(inverse @ pivot_rows)
+        stage_updates.append(border_update - lower_block @ reduced_vectors[-1])
     return reduced_vectors
 
 
@@ -428,16 +435,16 @@ def _backward_stages(
 ) -> Inexact[Array, "rows k"]:
     """Product of L^-T with the vectors `reduced_vectors`, computed from the root down; returns the rows at the pivots
     of all stages. The solution at the border of a front is read from the parent front."""
-    count, xp = reduced_vectors[0].shape[-1], namespace(reduced_vectors)
+    num_columns, xp = reduced_vectors[0].shape[-1], namespace(reduced_vectors)
     fronts: dict[int, Inexact[Array, "rows k"]] = {}
     pivot_values = []
-    for number in reversed(range(len(stages))):
-        stage, pivot_residual = stages[number], reduced_vectors[number]
-        border_values = xp.zeros((stage.batch, 0, count), pivot_residual.dtype)
+    for k in reversed(range(len(stages))):
+        stage, pivot_residual = stages[k], reduced_vectors[k]
+        border_values = xp.zeros((stage.batch, 0, num_columns), pivot_residual.dtype)
         if stage.border:
             border_values = gather_or_zero(fronts[stage.parent], stage.above.read(indices))
-            pivot_residual = pivot_residual - _transposed(factor.lowers[number]) @ border_values
-        pivots = _transposed(factor.inverses[number]) @ pivot_residual
-        pivot_values.append(pivots.reshape(-1, count))
-        fronts[number] = xp.concatenate([pivots, border_values], axis=1).reshape(-1, count)
+            pivot_residual = pivot_residual - _transpose(factor.lowers[k]) @ border_values
+        pivot_solution = _transpose(factor.inverses[k]) @ pivot_residual
+        pivot_values.append(pivot_solution.reshape(-1, num_columns))
+        fronts[k] = xp.concatenate([pivot_solution, border_values], axis=1).reshape(-1, num_columns)
     return xp.concatenate(pivot_values[::-1])

@@ -45,29 +45,29 @@ class SparsityPattern(Module):
     @property
     def num_entries(self) -> int:
         """Number of stored entries, nnz: the diagonal and the entries below it."""
-        return self._slots.shape[1]
+        return self._entry_slots.shape[1]
 
     @property
     def rows(self) -> Int[Array, " nnz"]:
         """Row of every stored entry, greater than or equal to its column."""
-        return self._slots.read(self.indices)[0]
+        return self._entry_slots.read(self.indices)[0]
 
     @property
     def columns(self) -> Int[Array, " nnz"]:
         """Column of every stored entry."""
-        return self._slots.read(self.indices)[1]
+        return self._entry_slots.read(self.indices)[1]
 
     @property
     def num_groups(self) -> int:
         """Number of groups of elements, each of which `assemble` takes as an argument."""
-        return len(self._assembly)
+        return len(self._assembly_maps)
 
     @property
-    def _slots(self) -> IndexSlot:
+    def _entry_slots(self) -> IndexSlot:
         return self.layout.content[0]
 
     @property
-    def _assembly(self) -> tuple[AssemblyMap, ...]:
+    def _assembly_maps(self) -> tuple[AssemblyMap, ...]:
         return self.layout.content[1]
 
     @classmethod
@@ -86,27 +86,29 @@ class SparsityPattern(Module):
         size = _checked_size(size)
         if len(groups) == 0:
             raise ValueError("from_elements: `groups` is empty; give at least one (m, k) array of node numbers.")
-        row_lists, column_lists, shapes = [], [], []
-        for number, group in enumerate(groups):
-            elements = _checked_integers(group, f"from_elements: `groups[{number}]`")
-            if elements.ndim != 2:
+        row_lists, column_lists, group_shapes = [], [], []
+        for group_number, group in enumerate(groups):
+            group_elements = _checked_integers(group, f"from_elements: `groups[{group_number}]`")
+            if group_elements.ndim != 2:
                 raise ValueError(
-                    f"from_elements: `groups[{number}]` must have shape (m, k), one row of node numbers to an element; "
-                    f"got {elements.shape}."
+                    f"from_elements: `groups[{group_number}]` must have shape (m, k), one row of node numbers to an "
+                    f"element; got {group_elements.shape}."
                 )
-            _check_range(elements, size, f"from_elements: `groups[{number}]`")
-            sorted_elements = np.sort(elements, axis=1)
+            _check_range(group_elements, size, f"from_elements: `groups[{group_number}]`")
+            sorted_elements = np.sort(group_elements, axis=1)
             repeated_indices = np.flatnonzero((sorted_elements[:, 1:] == sorted_elements[:, :-1]).any(axis=1))
             if repeated_indices.size:
                 raise ValueError(
-                    f"from_elements: element {repeated_indices[0]} of `groups[{number}]` names a node twice: "
-                    f"{elements[repeated_indices[0]].tolist()}. Remove degenerate elements from the mesh."
+                    f"from_elements: element {repeated_indices[0]} of `groups[{group_number}]` names a node twice: "
+                    f"{group_elements[repeated_indices[0]].tolist()}. Remove degenerate elements from the mesh."
                 )
-            first_corners, second_corners = np.tril_indices(elements.shape[1])
-            row_lists.append(elements[:, first_corners].T.ravel())
-            column_lists.append(elements[:, second_corners].T.ravel())
-            shapes.append(elements.shape)
-        return cls._from_contributions(row_lists, column_lists, shapes, size, "from_elements", "belong to no element")
+            first_corners, second_corners = np.tril_indices(group_elements.shape[1])
+            row_lists.append(group_elements[:, first_corners].T.ravel())
+            column_lists.append(group_elements[:, second_corners].T.ravel())
+            group_shapes.append(group_elements.shape)
+        return cls._from_contributions(
+            row_lists, column_lists, group_shapes, size, "from_elements", "belong to no element"
+        )
 
     @classmethod
     def from_entries(cls, rows: Any, columns: Any, size: int) -> Self:
@@ -143,50 +145,60 @@ class SparsityPattern(Module):
         full_matrix.sum_duplicates()
         if not np.isfinite(full_matrix.data).all():
             raise ValueError("from_matrix: `matrix` has entries that are NaN or infinite; remove them first.")
-        asymmetry = abs(full_matrix - full_matrix.T)
+        asymmetric_part = abs(full_matrix - full_matrix.T)
         max_magnitude = abs(full_matrix).max() if full_matrix.nnz else 0.0
-        if asymmetry.nnz and asymmetry.max() > 1e-12 * max_magnitude:
+        if asymmetric_part.nnz and asymmetric_part.max() > 1e-12 * max_magnitude:
             raise ValueError(
-                f"from_matrix: `matrix` is not symmetric: |A - A^T| is up to {asymmetry.max():.3g}, "
+                f"from_matrix: `matrix` is not symmetric: |A - A^T| is up to {asymmetric_part.max():.3g}, "
                 f"and its largest entry is {max_magnitude:.3g}. Give both triangles, or (matrix + matrix.T) / 2 if the "
                 "difference is noise."
             )
-        entries = coo_array(full_matrix)
-        rows, columns = entries.coords
-        is_lower = rows >= columns
-        pattern = cls.from_entries(rows[is_lower], columns[is_lower], matrix.shape[0])
-        return pattern, pattern.assemble(jnp.asarray(entries.data[is_lower]))
+        matrix_entries = coo_array(full_matrix)
+        entry_rows, entry_columns = matrix_entries.coords
+        is_lower = entry_rows >= entry_columns
+        pattern = cls.from_entries(entry_rows[is_lower], entry_columns[is_lower], matrix.shape[0])
+        return pattern, pattern.assemble(jnp.asarray(matrix_entries.data[is_lower]))
 
     @classmethod
-    def _from_contributions(cls, row_lists, column_lists, shapes, size, caller_name, reason) -> Self:
+    def _from_contributions(
+        cls, row_lists, column_lists, group_shapes, matrix_size, caller_name, missing_row_reason
+    ) -> Self:
         """Pattern of the unique entries of all groups of contributions; it also stores the index of the entry of each
         contribution."""
-        keys = []
+        entry_keys = []
         for rows, columns in zip(row_lists, column_lists, strict=True):
-            larger_indices, below = np.maximum(rows, columns), np.minimum(rows, columns)
+            larger_indices, smaller_indices = np.maximum(rows, columns), np.minimum(rows, columns)
             # Entries on the diagonal get negative keys, so that these entries come first, in the order of rows.
-            keys.append(np.where(larger_indices == below, larger_indices - size, larger_indices * size + below))
-        unique, entry_of_value = np.unique(np.concatenate(keys), return_inverse=True)
-        has_diagonal_entry = np.zeros(size, dtype=bool)
-        has_diagonal_entry[unique[unique < 0] + size] = True
+            entry_keys.append(
+                np.where(
+                    larger_indices == smaller_indices,
+                    larger_indices - matrix_size,
+                    larger_indices * matrix_size + smaller_indices,
+                )
+            )
+        unique_keys, entry_of_value = np.unique(np.concatenate(entry_keys), return_inverse=True)
+        has_diagonal_entry = np.zeros(matrix_size, dtype=bool)
+        has_diagonal_entry[unique_keys[unique_keys < 0] + matrix_size] = True
         if not has_diagonal_entry.all():
             missing_rows = np.flatnonzero(~has_diagonal_entry)
             raise ValueError(
-                f"{caller_name}: {missing_rows.size} of {size} rows {reason}, the first are "
+                f"{caller_name}: {missing_rows.size} of {matrix_size} rows {missing_row_reason}, the first are "
                 f"{missing_rows[:5].tolist()}. A matrix with this pattern cannot be positive definite: leave these "
                 "unknowns out, and number the rest 0..n-1."
             )
-        below = unique[size:]
-        rows = np.concatenate([np.arange(size), below // size])
-        columns = np.concatenate([np.arange(size), below % size])
-        ends_of_groups = np.cumsum([key.size for key in keys])
-        store = IndexStore()
-        entries = store.add(np.stack([rows, columns]))
-        maps = tuple(
-            AssemblyMap.create(store, entries_of_group, size, unique.size, shape)
-            for entries_of_group, shape in zip(np.split(entry_of_value, ends_of_groups[:-1]), shapes, strict=True)
+        smaller_indices = unique_keys[matrix_size:]
+        rows = np.concatenate([np.arange(matrix_size), smaller_indices // matrix_size])
+        columns = np.concatenate([np.arange(matrix_size), smaller_indices % matrix_size])
+        ends_of_groups = np.cumsum([group_keys.size for group_keys in entry_keys])
+        index_store = IndexStore()
+        entry_slot = index_store.add(np.stack([rows, columns]))
+        assembly_maps = tuple(
+            AssemblyMap.create(index_store, entries_of_group, matrix_size, unique_keys.size, group_shape)
+            for entries_of_group, group_shape in zip(
+                np.split(entry_of_value, ends_of_groups[:-1]), group_shapes, strict=True
+            )
         )
-        return cls(store.pack(), IndexLayout(entries, maps), size)
+        return cls(index_store.pack(), IndexLayout(entry_slot, assembly_maps), matrix_size)
 
     def assemble(self, *element_matrices: Inexact[Array, "..."] | None) -> Inexact[Array, " nnz"]:
         """Add up element matrices to the values (nnz,) of the matrix.
@@ -197,24 +209,24 @@ class SparsityPattern(Module):
         complex. Raises `ValueError` if the number of arguments differs from the number of groups, or if all arguments
         are None.
         """
-        if len(element_matrices) != len(self._assembly):
+        if len(element_matrices) != len(self._assembly_maps):
             raise ValueError(
-                f"assemble: this pattern has {len(self._assembly)} groups of elements, "
+                f"assemble: this pattern has {len(self._assembly_maps)} groups of elements, "
                 f"and {len(element_matrices)} arrays were given; use None for a group that adds nothing."
             )
-        contributions = [
-            group.apply(self.indices, _convert_to_numeric(matrices), f"assemble: argument {number}")
-            for number, (group, matrices) in enumerate(zip(self._assembly, element_matrices, strict=True))
+        group_contributions = [
+            group.apply(self.indices, _convert_to_numeric(matrices), f"assemble: argument {argument_number}")
+            for argument_number, (group, matrices) in enumerate(zip(self._assembly_maps, element_matrices, strict=True))
             if matrices is not None
         ]
-        if not contributions:
+        if not group_contributions:
             raise ValueError("assemble: every group is None, so there is nothing to assemble.")
-        return sum(contributions[1:], start=contributions[0])
+        return sum(group_contributions[1:], start=group_contributions[0])
 
     def entries_between(self, values: Inexact[Array, " nnz"], group: int = 0) -> Inexact[Array, "pairs m"]:
         """Entries of the matrix between the nodes of each element of a group, packed as for `assemble`: (k (k + 1) / 2,
         m), rows in the order of `numpy.tril_indices(k)`."""
-        return self._assembly[group].read_back(self.indices, values)
+        return self._assembly_maps[group].read_back(self.indices, values)
 
     def diagonal(self, values: Inexact[Array, " nnz"]) -> Inexact[Array, " n"]:
         """Diagonal of the matrix (n,)."""
@@ -222,26 +234,29 @@ class SparsityPattern(Module):
 
     def multiply(self, values: Inexact[Array, " nnz"], vectors: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
         """The product A x for one vector (n,) or several (n, k)."""
-        expand = (...,) + (None,) * (vectors.ndim - 1)
-        lower_values = values[self.size :][expand]
-        rows, columns = self.rows[self.size :], self.columns[self.size :]
-        result = values[: self.size][expand] * vectors
-        result = result.at[rows].add(lower_values * vectors[columns])
-        return result.at[columns].add(lower_values * vectors[rows])
+        expanded_axes = (...,) + (None,) * (vectors.ndim - 1)
+        lower_values = values[self.size :][expanded_axes]
+        lower_rows, lower_columns = self.rows[self.size :], self.columns[self.size :]
+        matrix_product = values[: self.size][expanded_axes] * vectors
+        matrix_product = matrix_product.at[lower_rows].add(lower_values * vectors[lower_columns])
+        return matrix_product.at[lower_columns].add(lower_values * vectors[lower_rows])
 
     def to_dense(self, values: Inexact[Array, " nnz"]) -> Inexact[Array, "n n"]:
         """The matrix as a dense array (n, n)."""
-        dense = jnp.zeros((self.size, self.size), values.dtype)
-        return dense.at[self.rows, self.columns].set(values).at[self.columns, self.rows].set(values)
+        dense_matrix = jnp.zeros((self.size, self.size), values.dtype)
+        return dense_matrix.at[self.rows, self.columns].set(values).at[self.columns, self.rows].set(values)
 
     def quadratic_form(
         self, values: Inexact[np.ndarray, " nnz"], vectors: Inexact[np.ndarray, "n k"]
     ) -> Inexact[np.ndarray, "k k"]:
         """The product xᵀ A x for several vectors (n, k), in NumPy."""
-        below = slice(self.size, None)
-        row_ends = np.searchsorted(np.asarray(self.rows)[below], np.arange(self.size + 1))  # rows are in order
-        columns = np.asarray(self.columns)[below]
-        below_diagonal = csr_array((values[below], columns, row_ends), shape=(self.size, self.size))
+        below_diagonal_slice = slice(self.size, None)
+        # Rows are in order.
+        row_ends = np.searchsorted(np.asarray(self.rows)[below_diagonal_slice], np.arange(self.size + 1))
+        lower_columns = np.asarray(self.columns)[below_diagonal_slice]
+        below_diagonal = csr_array(
+            (values[below_diagonal_slice], lower_columns, row_ends), shape=(self.size, self.size)
+        )
         product_with_lower_triangle = vectors.T @ (below_diagonal @ vectors + values[: self.size, None] / 2 * vectors)
         return product_with_lower_triangle + product_with_lower_triangle.T
 
@@ -249,20 +264,23 @@ class SparsityPattern(Module):
         """The matrix as a SciPy sparse array (n, n), both triangles."""
         values = np.asarray(values)
         rows, columns = np.asarray(self.rows), np.asarray(self.columns)
-        below = slice(self.size, None)
-        coordinates = (np.concatenate([rows, columns[below]]), np.concatenate([columns, rows[below]]))
-        data = np.concatenate([values, values[below]])
-        return csr_array(coo_array((data, coordinates), shape=(self.size, self.size)))
+        below_diagonal_slice = slice(self.size, None)
+        entry_coordinates = (
+            np.concatenate([rows, columns[below_diagonal_slice]]),
+            np.concatenate([columns, rows[below_diagonal_slice]]),
+        )
+        entry_values = np.concatenate([values, values[below_diagonal_slice]])
+        return csr_array(coo_array((entry_values, entry_coordinates), shape=(self.size, self.size)))
 
 
 def _convert_to_numeric(values: Any) -> Any:
     return values if isinstance(values, np.ndarray) else jnp.asarray(values)
 
 
-def _checked_size(size: Any) -> int:
-    if not isinstance(size, int | np.integer) or isinstance(size, bool) or size < 1:
-        raise ValueError(f"`size` must be a positive integer, the number of rows; got {size!r}.")
-    return int(size)
+def _checked_size(matrix_size: Any) -> int:
+    if not isinstance(matrix_size, int | np.integer) or isinstance(matrix_size, bool) or matrix_size < 1:
+        raise ValueError(f"`size` must be a positive integer, the number of rows; got {matrix_size!r}.")
+    return int(matrix_size)
 
 
 def _checked_integers(array: Any, name: str) -> np.ndarray:
@@ -272,11 +290,11 @@ def _checked_integers(array: Any, name: str) -> np.ndarray:
     return array.astype(np.int64)
 
 
-def _check_range(indices: np.ndarray, size: int, name: str) -> None:
-    if indices.size and (indices.min() < 0 or indices.max() >= size):
+def _check_range(indices: np.ndarray, num_unknowns: int, name: str) -> None:
+    if indices.size and (indices.min() < 0 or indices.max() >= num_unknowns):
         raise ValueError(
-            f"{name} holds indices from {indices.min()} to {indices.max()}, outside 0..{size - 1} "
-            f"for `size` = {size}. Are they counted from 1?"
+            f"{name} holds indices from {indices.min()} to {indices.max()}, outside 0..{num_unknowns - 1} "
+            f"for `size` = {num_unknowns}. Are they counted from 1?"
         )
 
 
@@ -296,12 +314,12 @@ class AssemblyMap(NamedTuple):
     ) -> "AssemblyMap":
         """Create the map of a group. `entry`: index of the matrix entry of each packed value (pairs, m), row by row, or
         of each value (m,)."""
-        source = np.arange(entry.size)
+        packed_sources = np.arange(entry.size)
         is_on_diagonal = entry < size
         return cls(
-            PaddedSum.create(store, entry[is_on_diagonal], source[is_on_diagonal], size, entry.size),
+            PaddedSum.create(store, entry[is_on_diagonal], packed_sources[is_on_diagonal], size, entry.size),
             PaddedSum.create(
-                store, entry[~is_on_diagonal] - size, source[~is_on_diagonal], num_entries - size, entry.size
+                store, entry[~is_on_diagonal] - size, packed_sources[~is_on_diagonal], num_entries - size, entry.size
             ),
             shape,
         )
@@ -310,31 +328,34 @@ class AssemblyMap(NamedTuple):
         self, indices: Int[Array, " total"], matrices: Inexact[Array, "..."], name: str
     ) -> Inexact[Array, " nnz"]:
         """Contribution of the group's element matrices to the entries of the matrix; see `SparsityPattern.assemble`."""
-        flat = self._packed(matrices, name).reshape(-1)
-        return namespace(flat).concatenate([self.diagonal.apply(indices, flat), self.below.apply(indices, flat)])
+        packed_values = self._packed_matrices(matrices, name).reshape(-1)
+        return namespace(packed_values).concatenate(
+            [self.diagonal.apply(indices, packed_values), self.below.apply(indices, packed_values)]
+        )
 
     def read_back(self, indices: Int[Array, " total"], values: Inexact[Array, " nnz"]) -> Inexact[Array, "..."]:
         """Read the matrix entry to which each packed value is added; see `SparsityPattern.entries_between`."""
-        packed = (len(np.tril_indices(self.shape[1])[0]), self.shape[0]) if len(self.shape) > 1 else self.shape
-        size = self.diagonal.gather.shape[1]
-        packed_indices = namespace(values).zeros(math.prod(packed) + 1, values.dtype)
-        packed_indices = self.diagonal.replace_by_sums(indices, values[:size], packed_indices)
-        return self.below.replace_by_sums(indices, values[size:], packed_indices)[:-1].reshape(packed)
+        packed_shape = (len(np.tril_indices(self.shape[1])[0]), self.shape[0]) if len(self.shape) > 1 else self.shape
+        num_entries = self.diagonal.gather.shape[1]
+        packed_indices = namespace(values).zeros(math.prod(packed_shape) + 1, values.dtype)
+        packed_indices = self.diagonal.replace_by_sums(indices, values[:num_entries], packed_indices)
+        return self.below.replace_by_sums(indices, values[num_entries:], packed_indices)[:-1].reshape(packed_shape)
 
-    def _packed(self, matrices: Inexact[Array, "..."], name: str) -> Inexact[Array, "..."]:
+    def _packed_matrices(self, matrices: Inexact[Array, "..."], name: str) -> Inexact[Array, "..."]:
         """Element matrices as packed lower triangles, with one row of m values for each entry of a triangle."""
         if len(self.shape) == 1:
             if matrices.shape != self.shape:
                 raise ValueError(f"{name} must be the entries' values, shape {self.shape}; got {matrices.shape}.")
             return matrices
-        count, nodes = self.shape
-        first_corners, second_corners = np.tril_indices(nodes)
-        if matrices.shape == (first_corners.size, count):
+        num_elements, nodes_per_element = self.shape
+        first_corners, second_corners = np.tril_indices(nodes_per_element)
+        if matrices.shape == (first_corners.size, num_elements):
             return matrices
-        if matrices.shape != (count, nodes, nodes):
+        if matrices.shape != (num_elements, nodes_per_element, nodes_per_element):
             raise ValueError(
-                f"{name} must hold {count} symmetric matrices, shape {(count, nodes, nodes)}, or their packed lower "
-                f"triangles, shape {(first_corners.size, count)}; got {matrices.shape}."
+                f"{name} must hold {num_elements} symmetric matrices, shape "
+                f"{(num_elements, nodes_per_element, nodes_per_element)}, or their packed lower "
+                f"triangles, shape {(first_corners.size, num_elements)}; got {matrices.shape}."
             )
         return namespace(matrices).stack(
             [matrices[:, i, j] for i, j in zip(first_corners, second_corners, strict=True)]
