@@ -40,9 +40,9 @@ def small_maps():
     sizes, to limit compilation."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(learn, "DEPTH_MAP_SHAPE", SHAPE)
-        patch.setattr(learn, "_PLACES_PER_SIDE", 5)
-        patch.setattr(linear_channels, "_PLACES_PER_SIDE", 5)
-        patch.setattr(linear_channels, "_MAX_BODIES", 1)
+        patch.setattr(learn, "_BALL_PLACES_PER_SIDE", 5)
+        patch.setattr(linear_channels, "_BALL_PLACES_PER_SIDE", 5)
+        patch.setattr(linear_channels, "_MAX_SIMULTANEOUS_BODIES", 1)
         padded = voltage_changes._padded_size
         patch.setattr(voltage_changes, "_padded_size", lambda count, ratio: np.maximum(padded(count, ratio), 64))
         changes = shared_changes()

@@ -21,9 +21,9 @@ from jeit.touch.contacts import Contact, ImageNoise, find_contacts
 from jeit.touch.contacts.finder import AbstractFinder
 
 # Minimum number of different loads.
-_MIN_LOADS = 3
+_MIN_NUM_LOADS = 3
 # Minimum number of touches with each load.
-_MIN_REPETITIONS = 3
+_MIN_NUM_REPETITIONS = 3
 # Fractions of the maximum response between which rise and fall times are measured.
 _RISE_START_FRACTION, _RISE_END_FRACTION = 0.1, 0.9
 
@@ -66,17 +66,23 @@ def weber_ratio(load: ArrayLike, response: ArrayLike) -> tuple[Float[np.ndarray,
     load, response = _check_pair("load", load, "response", response)
     if (load <= 0).any():
         raise ValueError("load must be positive, in newtons.")
-    loads, load_indices, counts = np.unique(load, return_inverse=True, return_counts=True)
-    if len(loads) < _MIN_LOADS or counts.min() < _MIN_REPETITIONS:
+    distinct_loads, load_indices, repetition_counts = np.unique(load, return_inverse=True, return_counts=True)
+    if len(distinct_loads) < _MIN_NUM_LOADS or repetition_counts.min() < _MIN_NUM_REPETITIONS:
         raise ValueError(
-            f"load: give {_MIN_LOADS} loads or more, each {_MIN_REPETITIONS} times or more; there are {len(loads)}, "
-            f"one of them {counts.min()} times."
+            f"load: give {_MIN_NUM_LOADS} loads or more, each {_MIN_NUM_REPETITIONS} times or more; there are "
+            f"{len(distinct_loads)}, one of them {repetition_counts.min()} times."
         )
-    mean_responses = np.bincount(load_indices, response) / counts
-    deviations = np.sqrt(np.bincount(load_indices, (response - mean_responses[load_indices]) ** 2) / (counts - 1))
-    slopes = np.gradient(mean_responses, loads) * (1.0 if mean_responses[-1] >= mean_responses[0] else -1.0)
+    mean_responses = np.bincount(load_indices, response) / repetition_counts
+    response_deviations = np.sqrt(
+        np.bincount(load_indices, (response - mean_responses[load_indices]) ** 2) / (repetition_counts - 1)
+    )
+    response_slopes = np.gradient(mean_responses, distinct_loads) * (
+        1.0 if mean_responses[-1] >= mean_responses[0] else -1.0
+    )
     with np.errstate(divide="ignore"):
-        return loads, np.where(slopes > 0, deviations / (np.maximum(slopes, 0.0) * loads), np.inf)
+        return distinct_loads, np.where(
+            response_slopes > 0, response_deviations / (np.maximum(response_slopes, 0.0) * distinct_loads), np.inf
+        )
 
 
 def point_localisation(place: ArrayLike, found: ArrayLike) -> Localisation:
@@ -89,12 +95,14 @@ def point_localisation(place: ArrayLike, found: ArrayLike) -> Localisation:
     found = real_array("found", found, "metres, as many as places, NaN where nothing was found")
     if place.ndim != 2 or place.shape != found.shape or not np.isfinite(place).all():
         raise ValueError(f"place and found must be (n, 2) or (n, 3); they have shapes {place.shape}, {found.shape}.")
-    errors = np.linalg.norm(found - place, axis=1)
-    is_found = np.isfinite(errors)
+    place_errors = np.linalg.norm(found - place, axis=1)
+    is_found = np.isfinite(place_errors)
     if not is_found.any():
         raise ValueError("found: every row is NaN; no touch was found.")
-    errors = errors[is_found]
-    return Localisation(float(errors.mean()), float(errors.std()), float(errors.max()), float(1 - is_found.mean()))
+    place_errors = place_errors[is_found]
+    return Localisation(
+        float(place_errors.mean()), float(place_errors.std()), float(place_errors.max()), float(1 - is_found.mean())
+    )
 
 
 def detection_threshold(amount: ArrayLike, detected: ArrayLike) -> float:
@@ -112,17 +120,20 @@ def detection_threshold(amount: ArrayLike, detected: ArrayLike) -> float:
     if detected.dtype.kind != "b":
         raise ValueError(f"detected must be true or false for each trial; it is {detected.dtype}.")
     amount, detected = _check_pair("amount", amount, "detected", detected.astype(float))
-    amounts, amount_indices, counts = np.unique(amount, return_inverse=True, return_counts=True)
-    detection_rates = isotonic_regression(np.bincount(amount_indices, detected) / counts, weights=counts).x
+    distinct_amounts, amount_indices, trial_counts = np.unique(amount, return_inverse=True, return_counts=True)
+    detection_rates = isotonic_regression(np.bincount(amount_indices, detected) / trial_counts, weights=trial_counts).x
     first_index = int(np.argmax(detection_rates >= 0.5))
     if detection_rates[first_index] < 0.5:
         return float("inf")
     if not first_index:
-        return float(amounts[0])
-    fraction = (0.5 - detection_rates[first_index - 1]) / (
+        return float(distinct_amounts[0])
+    interpolation_fraction = (0.5 - detection_rates[first_index - 1]) / (
         detection_rates[first_index] - detection_rates[first_index - 1]
     )
-    return float(amounts[first_index - 1] + fraction * (amounts[first_index] - amounts[first_index - 1]))
+    return float(
+        distinct_amounts[first_index - 1]
+        + interpolation_fraction * (distinct_amounts[first_index] - distinct_amounts[first_index - 1])
+    )
 
 
 def contact_area(area: ArrayLike, found: ArrayLike) -> ContactArea:
@@ -155,8 +166,8 @@ def response_times(seconds: ArrayLike, response: ArrayLike) -> tuple[float, floa
         raise ValueError(
             "response is nowhere positive; give the response to a touch, with the sign that makes it positive."
         )
-    rise_start, rise_end = (
-        int(np.argmax(response >= share * max_response)) for share in (_RISE_START_FRACTION, _RISE_END_FRACTION)
+    rise_start_index, rise_end_index = (
+        int(np.argmax(response >= fraction * max_response)) for fraction in (_RISE_START_FRACTION, _RISE_END_FRACTION)
     )
     fall_start_index = len(response) - 1 - int(np.argmax(response[::-1] >= _RISE_END_FRACTION * max_response))
     is_below_rise_start = response[fall_start_index:] < _RISE_START_FRACTION * max_response
@@ -165,7 +176,7 @@ def response_times(seconds: ArrayLike, response: ArrayLike) -> tuple[float, floa
         if is_below_rise_start.any()
         else float("inf")
     )
-    return float(seconds[rise_end] - seconds[rise_start]), fall_time
+    return float(seconds[rise_end_index] - seconds[rise_start_index]), fall_time
 
 
 def _check_pair(
@@ -181,9 +192,9 @@ def _check_pair(
             f"{first_name} and {second_name} must be (n,), as many; they have shapes {first_values.shape}, "
             f"{second_values.shape}."
         )
-    for name, values in ((first_name, first_values), (second_name, second_values)):
-        if not np.isfinite(values).all():
-            raise ValueError(f"{name} has NaN or infinite values.")
+    for argument_name, argument_values in ((first_name, first_values), (second_name, second_values)):
+        if not np.isfinite(argument_values).all():
+            raise ValueError(f"{argument_name} has NaN or infinite values.")
     return first_values, second_values
 
 
@@ -287,66 +298,74 @@ def touch_attributes(
         raise ValueError(f"press must be a function from touches to frames (n, M); it is {describe(press)}.")
     check_kind("linear", linear, LinearReconstruction, "linear images, such as of one_step(...)")
     check_kind("finder", finder, AbstractFinder, "a finder, such as CellFinder(mesh)")
-    for name, value in (("within", within), ("load", load), ("diameter", diameter)):
-        if not (is_number(value) and value > 0):
-            raise ValueError(f"{name} must be positive; it is {describe(value)}.")
+    for option_name, option_value in (("within", within), ("load", load), ("diameter", diameter)):
+        if not (is_number(option_value) and option_value > 0):
+            raise ValueError(f"{option_name} must be positive; it is {describe(option_value)}.")
     centre = real_array("middle", middle, "(x, y) in metres")
     if centre.shape != (2,):
         raise ValueError(f"middle must be (x, y) in metres; it has shape {centre.shape}.")
-    random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-    report = progress or (lambda message: None)
-    report("untouched frames")
+    generator = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    report_progress = progress or (lambda message: None)
+    report_progress("untouched frames")
     untouched = _check_frames(press([[] for _ in range(_NUM_UNTOUCHED_FRAMES)]), _NUM_UNTOUCHED_FRAMES, linear)
-    reference, noise = untouched.mean(axis=0), ImageNoise.of_frames(linear, untouched)
+    reference, image_noise = untouched.mean(axis=0), ImageNoise.of_frames(linear, untouched)
 
     def find_in_frames(frames: np.ndarray) -> list[list[Contact]]:
-        return [find_contacts(finder, image, noise) for image in np.asarray(linear.image(frames - reference))]
+        return [find_contacts(finder, image, image_noise) for image in np.asarray(linear.image(frames - reference))]
 
     def detect_touches(touches: Sequence[Sequence[DiscTouch]]) -> list[list[Contact]]:
         return find_in_frames(_check_frames(press(touches), len(touches), linear))
 
-    report("Weber ratio")
-    loads = np.repeat(load * _RELATIVE_LOADS, _NUM_REPETITIONS)
-    loads_applied, weber = weber_ratio(
-        loads,
+    report_progress("Weber ratio")
+    applied_loads = np.repeat(load * _RELATIVE_LOADS, _NUM_REPETITIONS)
+    distinct_loads, weber_ratios = weber_ratio(
+        applied_loads,
         [
             _strongest_peak(contacts)
-            for contacts in detect_touches([[DiscTouch(centre, disc_load, diameter)] for disc_load in loads])
+            for contacts in detect_touches([[DiscTouch(centre, disc_load, diameter)] for disc_load in applied_loads])
         ],
     )
-    report("localisation")
-    places = centre + (within * np.sqrt(random.uniform(size=_NUM_PLACES)))[:, None] * _random_directions(
-        random, _NUM_PLACES
+    report_progress("localisation")
+    true_places = centre + (within * np.sqrt(generator.uniform(size=_NUM_PLACES)))[:, None] * _random_directions(
+        generator, _NUM_PLACES
     )
-    contacts_of_touches = detect_touches([[DiscTouch(place, load, diameter)] for place in places])
+    contacts_of_touches = detect_touches([[DiscTouch(place, load, diameter)] for place in true_places])
     localisation = point_localisation(
-        places, np.array([_strongest_centroid(contacts) for contacts in contacts_of_touches])
+        true_places, np.array([_strongest_centroid(contacts) for contacts in contacts_of_touches])
     )
-    report("two points")
-    separations = np.repeat(_RELATIVE_SEPARATIONS * diameter, _NUM_TRIALS)
-    half_separations = separations[:, None] / 2 * _random_directions(random, len(separations))
+    report_progress("two points")
+    point_separations = np.repeat(_RELATIVE_SEPARATIONS * diameter, _NUM_TRIALS)
+    half_separations = point_separations[:, None] / 2 * _random_directions(generator, len(point_separations))
     contacts_of_touches = detect_touches(
-        [[DiscTouch(centre + sign * offset, load, diameter) for sign in (-1, 1)] for offset in half_separations]
+        [
+            [DiscTouch(centre + direction_sign * half_separation, load, diameter) for direction_sign in (-1, 1)]
+            for half_separation in half_separations
+        ]
     )
-    two_points = detection_threshold(separations, np.array([len(contacts) > 1 for contacts in contacts_of_touches]))
-    report("contact area")
+    two_points = detection_threshold(
+        point_separations, np.array([len(contacts) > 1 for contacts in contacts_of_touches])
+    )
+    report_progress("contact area")
     relative_diameters = np.repeat(_RELATIVE_DIAMETERS, _NUM_REPETITIONS)
     contacts_of_touches = detect_touches(
-        [[DiscTouch(centre, load * ratio**2, ratio * diameter)] for ratio in relative_diameters]
+        [
+            [DiscTouch(centre, load * relative_diameter**2, relative_diameter * diameter)]
+            for relative_diameter in relative_diameters
+        ]
     )
-    area = contact_area(
+    fitted_area = contact_area(
         np.pi / 4 * (relative_diameters * diameter) ** 2,
         [contacts[0].area if contacts else 0.0 for contacts in contacts_of_touches],
     )
     rise_time = fall_time = None
     if recording is not None:
-        report("times")
+        report_progress("times")
         seconds = real_array("recording", recording[0], "seconds (T,), and frames (T, M)")
         frames = _check_frames(recording[1], len(np.atleast_1d(seconds)), linear)
         rise_time, fall_time = response_times(
             seconds, [_strongest_peak(contacts) for contacts in find_in_frames(frames)]
         )
-    return TouchAttributes(loads_applied, weber, localisation, two_points, area, rise_time, fall_time)
+    return TouchAttributes(distinct_loads, weber_ratios, localisation, two_points, fitted_area, rise_time, fall_time)
 
 
 def _check_frames(
@@ -364,10 +383,10 @@ def _check_frames(
     return frames
 
 
-def _random_directions(random: np.random.Generator, count: int) -> Float[np.ndarray, "n 2"]:
-    """Draw `count` random unit vectors."""
-    angle = random.uniform(0, 2 * np.pi, count)
-    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+def _random_directions(generator: np.random.Generator, num_directions: int) -> Float[np.ndarray, "n 2"]:
+    """Draw `num_directions` random unit vectors."""
+    direction_angles = generator.uniform(0, 2 * np.pi, num_directions)
+    return np.stack([np.cos(direction_angles), np.sin(direction_angles)], axis=1)
 
 
 def _strongest_peak(contacts: list[Contact]) -> float:

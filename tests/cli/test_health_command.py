@@ -120,7 +120,7 @@ def cut(tmp_path_factory):
 
 def test_a_cut_is_located_on_a_described_skin(cut, run, tmp_path, monkeypatch):
     """On a mesh with edges twice as long as usual, from fewer starting paths: the cut is located to a centimetre."""
-    for name, value in (("_EDGE_LENGTH", 0.025), ("_NUM_OPTIMISED_STARTS", 1), ("_NUM_DIRECTIONS", 4)):
+    for name, value in (("_RELATIVE_EDGE_LENGTH", 0.025), ("_NUM_OPTIMISED_CUTS", 1), ("_NUM_CUT_DIRECTIONS", 4)):
         monkeypatch.setattr(f"jeit.touch.health.cut_path.{name}", value)
     status, output, error = run(
         *("touch", "health", cut / "cut.npz", "--healthy", cut / "healthy.npz", "--skin", cut / "skin.toml"),

@@ -94,19 +94,19 @@ def classify_recording(
 
     make_folder(output, SOUND_LABEL_FILES)
     console = plain_console()
-    with Steps(console, quiet=quiet) as step:
-        step("read")
+    with Steps(console, quiet=quiet) as show_step:
+        show_step("read")
         listener = Listener.read(model)
         microphone_calibration = None if calibration is None else Calibration.load(calibration)
         sounds = read_recording(recording)
         if not isinstance(sounds, Recording):
             raise ValueError(f"{recording.name}: it holds intensities; sounds can be classified only in samples.")
-        step("listen")
-        labels = listener.classify(sounds, calibration=microphone_calibration)
-        step("write")
-        write_sound_labels(labels, output, model=str(model))
+        show_step("listen")
+        sound_labels = listener.classify(sounds, calibration=microphone_calibration)
+        show_step("write")
+        write_sound_labels(sound_labels, output, model=str(model))
     if not quiet:
-        _print_summary(console, labels)
+        _print_summary(console, sound_labels)
         print_written_files(console, output / "events.csv", "report.json", "timeline.png")
 
 
@@ -177,10 +177,10 @@ def fit(
     console = plain_console()
     # Folder of unfinished trainings, deleted at the end.
     training_folder = output / "training"
-    with Steps(console, quiet=quiet) as step:
-        step("read")
-        labelled_clips = read_clips(clips, progress=step.report)
-        step("learn")
+    with Steps(console, quiet=quiet) as show_step:
+        show_step("read")
+        labelled_clips = read_clips(clips, progress=show_step.report)
+        show_step("learn")
         with naming_options_in_errors({"method": "--method", "labels": "FOLDER-BY-CLASS"}):
             listener = Listener.fit(
                 labelled_clips,
@@ -189,49 +189,57 @@ def fit(
                 key=jax.random.key(seed),
                 batches=batches or MAX_TRAINING_BATCHES,
                 folder=training_folder,
-                progress=step.report,
+                progress=show_step.report,
             )
-        step("write")
+        show_step("write")
         write_listener(listener, output)
         shutil.rmtree(training_folder, ignore_errors=True)
     if quiet:
         return
-    channels = counted(listener.channels, "channel")
-    rows = [
-        ("clips", f"{counted(len(labelled_clips), 'clip')} of {len(listener.names)} classes, {channels}"),
+    channels_text = counted(listener.channels, "channel")
+    table_rows = [
+        ("clips", f"{counted(len(labelled_clips), 'clip')} of {len(listener.names)} classes, {channels_text}"),
         ("sound", f"up to {listener.highest:g} Hz"),
         ("loudness", "counts" if listener.loudness else "ignored"),
         ("method", listener.method),
         ("held out", summary(listener)),
     ]
-    rows += [("note", note) for note in listener.notes]
+    table_rows += [("note", note) for note in listener.notes]
     console.print()
-    console.print(name_value_table(f"Learnt from {listener.name}", rows))
+    console.print(name_value_table(f"Learnt from {listener.name}", table_rows))
     print_written_files(console, output / "listener.jeit", "report.json", "learning.png")
 
 
-def _print_summary(console, result: "SoundLabels") -> None:
+def _print_summary(console, sound_labels: "SoundLabels") -> None:
     """Print the class of the whole recording, and a line for each sound in it."""
     from rich.table import Table
 
     from jeit.cli.console import name_value_table
 
-    name, probability = result.whole
-    description = f"{name}, {100 * probability:.0f} %" if name else "nothing"
-    rows = [("windows", str(len(result))), ("as a whole", description), *(("note", note) for note in result.notes)]
+    recording_class, class_probability = sound_labels.whole
+    class_text = f"{recording_class}, {100 * class_probability:.0f} %" if recording_class else "nothing"
+    table_rows = [
+        ("windows", str(len(sound_labels))),
+        ("as a whole", class_text),
+        *(("note", note) for note in sound_labels.notes),
+    ]
     console.print()
-    console.print(name_value_table(result.name, rows))
+    console.print(name_value_table(sound_labels.name, table_rows))
     console.print()
-    has_positions = result.position is not None
-    names = ("sound", "from / s", "to / s", "sure / %", *(("x / mm", "y / mm") if has_positions else ()))
-    table = Table(*names, box=None, padding=(0, 2, 0, 0))
-    for column in table.columns[1:]:
-        column.justify = "right"
-    for event in result.events:
+    has_positions = sound_labels.position is not None
+    column_names = ("sound", "from / s", "to / s", "sure / %", *(("x / mm", "y / mm") if has_positions else ()))
+    sound_table = Table(*column_names, box=None, padding=(0, 2, 0, 0))
+    for table_column in sound_table.columns[1:]:
+        table_column.justify = "right"
+    for event in sound_labels.events:
         position_cells = (
-            [""] * (2 * has_positions) if event.place is None else [f"{1e3 * value:z.1f}" for value in event.place[:2]]
+            [""] * (2 * has_positions)
+            if event.place is None
+            else [f"{1e3 * coordinate:z.1f}" for coordinate in event.place[:2]]
         )
-        certainty = f"{100 * event.probability:.0f}" if event.name else ""
-        table.add_row(event.name or "quiet", f"{event.start:.2f}", f"{event.end:.2f}", certainty, *position_cells)
-    console.print(table)
+        certainty_text = f"{100 * event.probability:.0f}" if event.name else ""
+        sound_table.add_row(
+            event.name or "quiet", f"{event.start:.2f}", f"{event.end:.2f}", certainty_text, *position_cells
+        )
+    console.print(sound_table)
     console.print()

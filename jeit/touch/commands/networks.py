@@ -25,8 +25,8 @@ class _FrameFile(NamedTuple):
     """
 
     frames: "Float[np.ndarray, 'F M']"
-    numbers: "Int[np.ndarray, ' F']"
-    reference: "Float[np.ndarray, 'r M'] | None"
+    frame_numbers: "Int[np.ndarray, ' F']"
+    untouched_frames: "Float[np.ndarray, 'r M'] | None"
 
 
 def image_by_network(
@@ -65,66 +65,78 @@ def image_by_network(
         raise ValueError(f"--model is for --method network, not {method or 'the default'}; leave one out.")
     if model is None:
         raise ValueError("--method network needs --model, the folder of 'jeit learn image'.")
-    if ineffective_options := [name for name, value in unused_options.items() if value is not None]:
+    if ineffective_options := [
+        option_name for option_name, option_value in unused_options.items() if option_value is not None
+    ]:
         raise ValueError(f"--{ineffective_options[0]} has no use with --method network; leave it out.")
-    data, reference, kind, description = inputs
+    frames_path, reference, file_kind, description_path = inputs
     console = plain_console()
-    with StreamStopper() as stopping, Steps(console, quiet=quiet) as step:
+    with StreamStopper() as stream_stopper, Steps(console, quiet=quiet) as show_step:
         make_folder(output, DEPTH_FILES)
-        step("read")
-        skin = None
-        if description is not None and describes_skin(description):
-            skin, description = read_described_skin(description), None
-        network = read_network(model, skin=skin)
-        is_read_as_table = skin is not None
+        show_step("read")
+        described_skin = None
+        if description_path is not None and describes_skin(description_path):
+            described_skin, description_path = read_described_skin(description_path), None
+        network = read_network(model, skin=described_skin)
+        is_read_as_table = described_skin is not None
         base_frames = (
             None
             if reference is None
-            else _read_frame_file("--reference", reference, kind, description, network, None, is_table=is_read_as_table)
+            else _read_frame_file(
+                "--reference", reference, file_kind, description_path, network, None, is_table=is_read_as_table
+            )
         )
         untouched_frames = None if base_frames is None else base_frames.frames
-        if data == "-":
-            frames, numbers = parse_frames(sys.stdin), None
+        if frames_path == "-":
+            frames, frame_numbers = parse_frames(sys.stdin), None
         else:
             frame_index = None if streamed else 0 if frame is None else frame
             frame_file = _read_frame_file(
                 "DATA",
-                data,
-                kind,
-                description,
+                frames_path,
+                file_kind,
+                description_path,
                 network,
                 frame_index,
                 is_table=is_read_as_table,
                 format_example=reference,
             )
-            frames, numbers, untouched_frames = (
+            frames, frame_numbers, untouched_frames = (
                 frame_file.frames,
-                frame_file.numbers,
-                frame_file.reference if untouched_frames is None else untouched_frames,
+                frame_file.frame_numbers,
+                frame_file.untouched_frames if untouched_frames is None else untouched_frames,
             )
         if untouched_frames is None:
             raise ValueError("--reference: give a file of frames of the untouched skin.")
-        reference_frame = resting_frame(untouched_frames, str(reference or data))
-        step("image")
-        frame_counter = FrameCounter(step, None if numbers is None else len(numbers))
+        reference_frame = resting_frame(untouched_frames, str(reference or frames_path))
+        show_step("image")
+        frame_counter = FrameCounter(show_step, None if frame_numbers is None else len(frame_numbers))
 
         def print_refused_frame(frame_depth: "FrameDepth") -> None:
             frame_counter.count_frame()
             if frame_depth.depth is None and not quiet:
                 console.print(f"  frame {frame_depth.number}: refused. {frame_depth.reason}", soft_wrap=True)
 
-        frame_depths = stream_depths(network, stopping.frames_until_signal(frames), reference_frame)
-        if numbers is not None:
-            frame_depths = (item._replace(number=int(numbers[item.number])) for item in frame_depths)
-        drawing = stopping.drawing_reporter(PICTURES, step)
-        with stopping.exit_after_signal(frame_counter, "frames.csv", "depth.npz"):
-            summary = write_depths(
-                frame_depths, network, output, name=str(data), progress=print_refused_frame, drawing=drawing
+        frame_depths = stream_depths(network, stream_stopper.frames_until_signal(frames), reference_frame)
+        if frame_numbers is not None:
+            frame_depths = (
+                numbered_depth._replace(number=int(frame_numbers[numbered_depth.number]))
+                for numbered_depth in frame_depths
+            )
+        report_drawing = stream_stopper.drawing_reporter(PICTURES, show_step)
+        with stream_stopper.exit_after_signal(frame_counter, "frames.csv", "depth.npz"):
+            written_depths = write_depths(
+                frame_depths,
+                network,
+                output,
+                name=str(frames_path),
+                progress=print_refused_frame,
+                drawing=report_drawing,
             )
     if quiet:
         return
-    deepest_frame, latency = summary.deepest, 1e3 * np.median(summary.latency)
-    console.print(f"\n{counted(summary.imaged, 'frame')} imaged, median {latency:.2f} ms each")
+    deepest_frame, median_latency_ms = written_depths.deepest, 1e3 * np.median(written_depths.latency)
+    console.print(f"\n{counted(written_depths.imaged, 'frame')} imaged, median {median_latency_ms:.2f} ms each")
     if deepest_frame.depth > network.floor:
         x, y = 1e3 * deepest_frame.middle
         console.print(
@@ -137,16 +149,16 @@ def image_by_network(
 
 def _read_frame_file(
     option: str,
-    path: Path,
-    kind: str | None,
+    frames_path: Path,
+    file_kind: str | None,
     description: str | None,
     network: "ImageNetwork",
-    frame: int | str | None,
+    wanted_frame: int | str | None,
     *,
     is_table: bool,
     format_example: Path | None = None,
 ) -> _FrameFile:
-    """Read all frames of a file, or only the frame with the number `frame`.
+    """Read all frames of a file, or only the frame with the number `wanted_frame`.
 
     A table without a description, or any file if `is_table`, has one frame in each row, with its channels in the order
     of the network. Its units and columns are those of the file `format_example` if that file has a description, unless
@@ -160,31 +172,37 @@ def _read_frame_file(
     from jeit.imaging.stream_preparation import frames_of
     from jeit.touch.networks.depth_maps import check_measured
 
-    has_description = kind is not None or description is not None or table.find_description(path) is not None
-    if is_table or (table.recognises(path) and not has_description):
+    has_description = (
+        file_kind is not None or description is not None or table.find_description(frames_path) is not None
+    )
+    if is_table or (table.recognises(frames_path) and not has_description):
         description_file = None if format_example is None or is_table else table.find_description(format_example)
-        recording = read_frame_recording(path, None if description_file is None else load_description(description_file))
+        recording = read_frame_recording(
+            frames_path, None if description_file is None else load_description(description_file)
+        )
         frames, untouched_frames = recording.frames, recording.reference
         if frames.shape[1] != network.made_for["channels"]:
             raise ValueError(
-                f"'{path}' has {frames.shape[1]} channels, and the network was trained for "
+                f"'{frames_path}' has {frames.shape[1]} channels, and the network was trained for "
                 f"{network.made_for['channels']}; train one for these."
             )
-        numbers = np.arange(len(frames))
-        if frame is not None:
-            if not (isinstance(frame, int) and -len(frames) <= frame < len(frames)):
-                raise ValueError(f"--frame must be a number from 0 to {len(frames) - 1}; it is {frame!r}.")
-            numbers = numbers[[frame]]
-        return _FrameFile(frames[numbers], numbers, untouched_frames)
-    measurement = read_file(option, path, kind, description)
+        frame_numbers = np.arange(len(frames))
+        if wanted_frame is not None:
+            if not (isinstance(wanted_frame, int) and -len(frames) <= wanted_frame < len(frames)):
+                raise ValueError(f"--frame must be a number from 0 to {len(frames) - 1}; it is {wanted_frame!r}.")
+            frame_numbers = frame_numbers[[wanted_frame]]
+        return _FrameFile(frames[frame_numbers], frame_numbers, untouched_frames)
+    measurement = read_file(option, frames_path, file_kind, description)
     check_measured(network, measurement)
-    names, numbers = measurement.frame_names, np.arange(measurement.num_frames)
-    untouched_frames = frames_of(measurement.frame("reference")) if "reference" in names else None
+    frame_names, frame_numbers = measurement.frame_names, np.arange(measurement.num_frames)
+    untouched_frames = frames_of(measurement.frame("reference")) if "reference" in frame_names else None
     frames = frames_of(measurement)
-    if frame is not None:
-        frames = frames_of(measurement.frame(frame))
-        numbers = numbers[[names.index(frame) if isinstance(frame, str) else frame]]
-    return _FrameFile(frames, numbers, untouched_frames)
+    if wanted_frame is not None:
+        frames = frames_of(measurement.frame(wanted_frame))
+        frame_numbers = frame_numbers[
+            [frame_names.index(wanted_frame) if isinstance(wanted_frame, str) else wanted_frame]
+        ]
+    return _FrameFile(frames, frame_numbers, untouched_frames)
 
 
 learn = typer.Typer(name="learn", help="Train networks on simulated touches of a described skin.")
@@ -243,13 +261,13 @@ def image(
     require_extra("cluster", "a store of simulated touches")
     make_folder(output, LEARNT_FILES)
     console = plain_console()
-    with ExitStack() as stack:
-        step = stack.enter_context(Steps(console, quiet=quiet))
-        step("read")
+    with ExitStack() as exit_stack:
+        show_step = exit_stack.enter_context(Steps(console, quiet=quiet))
+        show_step("read")
         with naming_options_in_errors({"path": "skin"}):
             described_skin = read_described_skin(skin)
-        client = None if scheduler is None else stack.enter_context(connect_to_scheduler(scheduler))
-        step("learn")
+        dask_client = None if scheduler is None else exit_stack.enter_context(connect_to_scheduler(scheduler))
+        show_step("learn")
         learnt = learn_images(
             described_skin,
             output,
@@ -257,25 +275,32 @@ def image(
             design=design,
             touches=touches,
             seed=seed,
-            client=client,
-            progress=step.report,
+            client=dask_client,
+            progress=show_step.report,
         )
-        step("write")
+        show_step("write")
         write_learnt_images(learnt, output)
     if quiet:
         return
     place_errors = learnt.standing.place
-    rows = [
+    table_rows = [
         ("network", f"{learnt.network.design}, {learnt.network.made_for['channels']} channels"),
         *(
-            (name, f"{training.reason}, best after {training.course.steps[training.course.best]} batches")
-            for name, training in learnt.courses.items()
+            (
+                stage_name,
+                f"{training_result.reason}, best after {training_result.course.steps[training_result.course.best]} "
+                "batches",
+            )
+            for stage_name, training_result in learnt.courses.items()
         ),
         ("touches never seen", f"{100 * learnt.standing.explained:.1f} % of squared depth explained"),
         ("a ball of 15 mm", f"{1e3 * place_errors['mean']:.2f} ± {1e3 * place_errors['sd']:.2f} mm off"),
         ("its greatest depth", f"estimated as {learnt.standing.deepest:.2f} of the true one"),
-        ("time", ", ".join(f"{name} {seconds:.0f} s" for name, seconds in learnt.seconds.items())),
+        (
+            "time",
+            ", ".join(f"{stage_name} {stage_seconds:.0f} s" for stage_name, stage_seconds in learnt.seconds.items()),
+        ),
     ]
     console.print()
-    console.print(name_value_table(f"Learnt of {skin.name}", rows))
+    console.print(name_value_table(f"Learnt of {skin.name}", table_rows))
     print_written_files(console, output / "network.jeit", "report.json", "learning.png")

@@ -22,9 +22,9 @@ touch.command()(health)
 
 
 # Number of nodes of the mesh for images. Contacts are located more precisely than the size of the mesh's cells.
-_NUM_NODES = 400
+_NUM_MESH_NODES = 400
 # Assumed frame rate of a recording without times, frames/s.
-_DEFAULT_RATE = 10.0
+_DEFAULT_FRAME_RATE = 10.0
 # Maximum number of touches that are printed.
 _MAX_PRINTED_TOUCHES = 30
 
@@ -87,36 +87,41 @@ def contacts(
         raise ValueError(f"--weakest must be between 0 and 1; it is {weakest:g}.")
     make_folder(output, CONTACT_FILES)
     console = plain_console()
-    with Steps(console, quiet=quiet) as step:
-        step("read")
+    with Steps(console, quiet=quiet) as show_step:
+        show_step("read")
         with naming_options_in_errors({"description": "--skin"}):
             description = load_description(skin)
         recording_of_frames = read_frame_recording(recording, description)
-        seconds = recording_of_frames.seconds
-        if seconds is None:
-            seconds = np.arange(len(recording_of_frames.frames)) / (rate or _DEFAULT_RATE)
+        frame_times = recording_of_frames.seconds
+        if frame_times is None:
+            frame_times = np.arange(len(recording_of_frames.frames)) / (rate or _DEFAULT_FRAME_RATE)
         with naming_options_in_errors({"untouched": "--untouched"}):
             untouched_voltages = (
-                untouched_frames(recording_of_frames, seconds, untouched)
+                untouched_frames(recording_of_frames, frame_times, untouched)
                 if reference is None
                 else read_frame_recording(reference, description).frames
             )
-        step("prepare")
-        images = TouchImages.prepare(description, untouched_voltages, progress=step.report)
-        step("find")
+        show_step("prepare")
+        touch_images = TouchImages.prepare(description, untouched_voltages, progress=show_step.report)
+        show_step("find")
         recorded_contacts = find_recorded_contacts(
-            images, recording_of_frames.frames, seconds, untouched_voltages, sign=-1 if lowers else 1, weakest=weakest
+            touch_images,
+            recording_of_frames.frames,
+            frame_times,
+            untouched_voltages,
+            sign=-1 if lowers else 1,
+            weakest=weakest,
         )
-        step("write")
-        write_contacts(recorded_contacts, images, output, name=recording.name)
+        show_step("write")
+        write_contacts(recorded_contacts, touch_images, output, name=recording.name)
     if quiet:
         return
-    console.print(f"\n{counted(len(seconds), 'frame')}: {counted(len(recorded_contacts.touches), 'touch')}")
+    console.print(f"\n{counted(len(frame_times), 'frame')}: {counted(len(recorded_contacts.touches), 'touch')}")
     if recording_of_frames.seconds is None and rate is None:
-        console.print(f"  note: no times are known: {_DEFAULT_RATE:g} frames a second are assumed; see --rate")
+        console.print(f"  note: no times are known: {_DEFAULT_FRAME_RATE:g} frames a second are assumed; see --rate")
     for note in recorded_contacts.notes:
         console.print(f"  note: {note}", soft_wrap=True)
-    _print_touches(console, recorded_contacts.touches, images.background)
+    _print_touches(console, recorded_contacts.touches, touch_images.background)
     print_written_files(console, output / "contacts.csv", "report.json", "contacts.png")
 
 
@@ -175,38 +180,41 @@ def fit(
     require_extra("learn", "learning a skin")
     make_folder(output, SKIN_FILES)
     console = plain_console()
-    with Steps(console, quiet=quiet) as step:
-        step("read")
+    with Steps(console, quiet=quiet) as show_step:
+        show_step("read")
         recorded_presses = read_presses(presses)
-        model = None
+        forward_model = None
         if description is not None:
             skin_description = load_description(description)
-            model = skin_description.model(
-                presses, num_points=None if isinstance(skin_description.domain, OwnMesh) else _NUM_NODES
+            forward_model = skin_description.model(
+                presses, num_points=None if isinstance(skin_description.domain, OwnMesh) else _NUM_MESH_NODES
             )
-        step("learn")
+        show_step("learn")
         with naming_options_in_errors(
             {"num_channels": "--channels", "per_session": "--per-session", "model": "--description"}
         ):
-            skin = LearntSkin.fit(
+            learnt_skin = LearntSkin.fit(
                 recorded_presses,
                 method=method or "auto",
-                model=model,
+                model=forward_model,
                 num_channels=channels,
                 per_session=per_session,
-                progress=step.report,
+                progress=show_step.report,
             )
-        step("write")
-        write_learnt_skin(skin, output)
+        show_step("write")
+        write_learnt_skin(learnt_skin, output)
     if quiet:
         return
     num_presses, num_channels = recorded_presses.frames.shape
-    rows = [("presses", f"{num_presses} of {num_channels} channels")]
-    for name, standing in skin.standing.items():
-        rows += [(f"{name}: method", standing.method), (f"{name}, held out", summary(name, standing))]
+    table_rows = [("presses", f"{num_presses} of {num_channels} channels")]
+    for quantity_name, standing in learnt_skin.standing.items():
+        table_rows += [
+            (f"{quantity_name}: method", standing.method),
+            (f"{quantity_name}, held out", summary(quantity_name, standing)),
+        ]
     console.print()
-    console.print(name_value_table(f"Learnt from {recorded_presses.name}", rows))
-    _print_notes(console, skin.notes)
+    console.print(name_value_table(f"Learnt from {recorded_presses.name}", table_rows))
+    _print_notes(console, learnt_skin.notes)
     print_written_files(console, output / "skin.skops", "report.json", "learning.png")
 
 
@@ -242,24 +250,24 @@ def predict(
 
     make_folder(output, TOUCH_FILES)
     console = plain_console()
-    with Steps(console, quiet=quiet) as step:
-        step("read")
-        learnt, arguments = read_skin(skin), read_frames(frames)
-        step("predict")
-        touches = learnt.predict(**arguments)
-        step("write")
+    with Steps(console, quiet=quiet) as show_step:
+        show_step("read")
+        learnt_skin, frame_arrays = read_skin(skin), read_frames(frames)
+        show_step("predict")
+        touches = learnt_skin.predict(**frame_arrays)
+        show_step("write")
         write_touches(touches, output, skin=str(skin), name=frames.name)
     if quiet:
         return
-    descriptions = [counted(len(touches), "frame"), f"{int(touches.unlike.sum())} unlike any learnt from"]
+    summary_texts = [counted(len(touches), "frame"), f"{int(touches.unlike.sum())} unlike any learnt from"]
     if touches.position is not None and touches.position_std is not None:
         has_place = np.isfinite(touches.position).all(axis=1)
-        descriptions.append(f"{int(has_place.sum())} with a place")
+        summary_texts.append(f"{int(has_place.sum())} with a place")
         if has_place.any():
-            descriptions[-1] += (
+            summary_texts[-1] += (
                 f", standard deviation {1e3 * np.median(touches.position_std[has_place]):.3g} mm (median)"
             )
-    console.print("\n" + "; ".join(descriptions))
+    console.print("\n" + "; ".join(summary_texts))
     _print_notes(console, touches.notes)
     print_written_files(console, output / "touches.csv", "report.json", "touches.png")
 
@@ -268,19 +276,23 @@ def _print_touches(console, touches, background: float) -> None:
     """Print when and where each touch begins and ends, and its strongest change relative to the background."""
     from rich.table import Table
 
-    names = ("touch", "from / s", "to / s", "first place / mm", "last place / mm", "strongest change")
-    table = Table(*names, box=None, padding=(0, 2, 0, 0))
-    for column in table.columns:
-        column.justify = "right"
-    for path in touches[:_MAX_PRINTED_TOUCHES]:
-        positions_mm = [f"({1e3 * x:+.1f}, {1e3 * y:+.1f})" for x, y in path.position[[0, -1]]]
-        peak = path.peak[abs(path.peak).argmax()] / background
-        table.add_row(
-            str(path.number), f"{path.onset:.2f}", f"{path.offset:.2f}", *positions_mm, f"{100 * peak:+.0f} %"
+    column_names = ("touch", "from / s", "to / s", "first place / mm", "last place / mm", "strongest change")
+    touch_table = Table(*column_names, box=None, padding=(0, 2, 0, 0))
+    for table_column in touch_table.columns:
+        table_column.justify = "right"
+    for touch_path in touches[:_MAX_PRINTED_TOUCHES]:
+        positions_mm = [f"({1e3 * x:+.1f}, {1e3 * y:+.1f})" for x, y in touch_path.position[[0, -1]]]
+        relative_peak = touch_path.peak[abs(touch_path.peak).argmax()] / background
+        touch_table.add_row(
+            str(touch_path.number),
+            f"{touch_path.onset:.2f}",
+            f"{touch_path.offset:.2f}",
+            *positions_mm,
+            f"{100 * relative_peak:+.0f} %",
         )
     if touches:
         console.print()
-        console.print(table)
+        console.print(touch_table)
     if len(touches) > _MAX_PRINTED_TOUCHES:
         console.print(f"  {len(touches) - _MAX_PRINTED_TOUCHES} more in report.json")
 

@@ -70,16 +70,20 @@ def health(
     from jeit.touch.reports.skin_health import HEALTH_FILES, write_health
 
     check_positive(
-        {name: value for name, value in {"--rate": rate, "--patience": patience}.items() if value is not None}
+        {
+            option_name: option_value
+            for option_name, option_value in {"--rate": rate, "--patience": patience}.items()
+            if option_value is not None
+        }
     )
     make_folder(output, HEALTH_FILES)
     console = plain_console()
-    with Steps(console, quiet=quiet) as step:
-        step("read")
+    with Steps(console, quiet=quiet) as show_step:
+        show_step("read")
         with naming_options_in_errors({"description": "--skin"}):
             description = None if skin is None else load_description(skin)
         healthy_recording, checked_recording = (
-            read_frame_recording(path, description) for path in (healthy, recording)
+            read_frame_recording(recording_path, description) for recording_path in (healthy, recording)
         )
         if checked_recording.frames.shape[1] != healthy_recording.frames.shape[1]:
             raise ValueError(
@@ -88,46 +92,53 @@ def health(
             )
         if (checked_recording.seconds is None) != (healthy_recording.seconds is None) and rate is None:
             raise ValueError("--rate: only one of the recordings says when its frames came; give the frames a second.")
-        step("learn")
+        show_step("learn")
         healthy_state = learn_health(
-            healthy_recording, description, sign=-1 if lowers else 1, rate=rate, patience=patience, progress=step.report
+            healthy_recording,
+            description,
+            sign=-1 if lowers else 1,
+            rate=rate,
+            patience=patience,
+            progress=show_step.report,
         )
-        step("watch")
-        seconds = seconds_of(checked_recording, rate)
-        times = np.arange(len(checked_recording.frames), dtype=float) if seconds is None else seconds
+        show_step("watch")
+        recorded_times = seconds_of(checked_recording, rate)
+        frame_times = (
+            np.arange(len(checked_recording.frames), dtype=float) if recorded_times is None else recorded_times
+        )
         with naming_options_in_errors({"frames": f"'{recording}'"}):
             doubt_texts = doubts_of(healthy_state, healthy_recording, checked_recording.frames)
-        state = healthy_state
-        for first_frame in range(0, len(times), _FRAMES_PER_MESSAGE):
-            step.report(f"{first_frame:,} of {counted(len(times), 'frame')}")
-            state = watch(
-                state,
+        skin_state = healthy_state
+        for first_frame in range(0, len(frame_times), _FRAMES_PER_MESSAGE):
+            show_step.report(f"{first_frame:,} of {counted(len(frame_times), 'frame')}")
+            skin_state = watch(
+                skin_state,
                 checked_recording.frames[first_frame : first_frame + _FRAMES_PER_MESSAGE],
-                times[first_frame : first_frame + _FRAMES_PER_MESSAGE],
+                frame_times[first_frame : first_frame + _FRAMES_PER_MESSAGE],
             )
-        step("write")
+        show_step("write")
         write_health(
-            state,
-            times,
+            skin_state,
+            frame_times,
             checked_recording.frames,
             output,
             name=recording.name,
-            timed=seconds is not None,
+            timed=recorded_times is not None,
             notes=doubt_texts,
         )
     if quiet:
         return
-    unit = "frame" if seconds is None else "s"
-    console.print(f"\n{counted(state.frames, 'frame')}: {counted(len(state.events), 'event')}")
-    for note in doubt_texts:
-        console.print(f"  note: {note}", soft_wrap=True)
-    for event in state.events:
+    time_unit = "frame" if recorded_times is None else "s"
+    console.print(f"\n{counted(skin_state.frames, 'frame')}: {counted(len(skin_state.events), 'event')}")
+    for doubt_text in doubt_texts:
+        console.print(f"  note: {doubt_text}", soft_wrap=True)
+    for event in skin_state.events:
         electrode_text = "" if event.electrode is None else f" {event.electrode + 1}"
         length_text = "" if event.path is None else f", {1e3 * event.length:.0f} ± {1e3 * event.deviation:.0f} mm long"
-        time_text = f"{unit} {event.time:.0f}" if seconds is None else f"{event.time:.2f} s"
+        time_text = f"{time_unit} {event.time:.0f}" if recorded_times is None else f"{event.time:.2f} s"
         console.print(
             f"  {time_text}: {event.kind}{electrode_text}{length_text}, {event.status}. {event.reason}", soft_wrap=True
         )
-    if (held_event := state.held) is not None:
+    if (held_event := skin_state.held) is not None:
         console.print(f"  held at the end: {held_event.reason}", soft_wrap=True)
     print_written_files(console, output / "events.csv", "report.json", "health.png")

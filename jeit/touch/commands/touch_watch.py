@@ -55,28 +55,34 @@ def gestures(
     require_extra("learn", "learning gestures")
     make_folder(output, GESTURE_FILES)
     console = plain_console()
-    with Steps(console, quiet=quiet) as step:
-        step("read")
+    with Steps(console, quiet=quiet) as show_step:
+        show_step("read")
         with naming_options_in_errors({"which": "--skin", "description": "--skin"}):
             description = load_description(skin)
         gesture_set = GestureSet.read(recordings)
-        step("learn")
-        learnt = learn_gestures(description, gesture_set, method=method or "auto", progress=step.report)
-        step("write")
+        show_step("learn")
+        learnt = learn_gestures(description, gesture_set, method=method or "auto", progress=show_step.report)
+        show_step("write")
         write_gestures(learnt, output, name=recordings.name)
     if quiet:
         return
-    model, standing = learnt.model, learnt.model.standing
+    gesture_model, standing = learnt.model, learnt.model.standing
     num_people = len(set(gesture_set.person.tolist()))
-    rows = [("recordings", f"{len(gesture_set)}, of {num_people} {'people' if num_people > 1 else 'person'}")]
-    rows += [("gestures", ", ".join(model.names)), ("classifier", f"{model.method} on {model.form}")]
+    table_rows = [("recordings", f"{len(gesture_set)}, of {num_people} {'people' if num_people > 1 else 'person'}")]
+    table_rows += [
+        ("gestures", ", ".join(gesture_model.names)),
+        ("classifier", f"{gesture_model.method} on {gesture_model.form}"),
+    ]
     if standing is not None:
         is_correct = standing.held_out == standing.right
-        accuracies = ", ".join(f"{name} {100 * is_correct[standing.right == name].mean():.0f}" for name in model.names)
-        rows.append(("right, held out", f"{100 * is_correct.mean():.1f} % ({accuracies})"))
-    rows += [("note", note) for note in model.notes]
+        accuracies_text = ", ".join(
+            f"{gesture_name} {100 * is_correct[standing.right == gesture_name].mean():.0f}"
+            for gesture_name in gesture_model.names
+        )
+        table_rows.append(("right, held out", f"{100 * is_correct.mean():.1f} % ({accuracies_text})"))
+    table_rows += [("note", note) for note in gesture_model.notes]
     console.print()
-    console.print(name_value_table(f"Learnt from {recordings.name}", rows))
+    console.print(name_value_table(f"Learnt from {recordings.name}", table_rows))
     print_written_files(console, output / "gestures.skops", "report.json", "gestures.png")
 
 
@@ -142,31 +148,33 @@ def watch(
     require_extra("learn", "naming gestures")
     check_positive({"--untouched": untouched, "--patience": patience} | ({} if rate is None else {"--rate": rate}))
     console = plain_console()
-    with StreamStopper() as stopping:
+    with StreamStopper() as stream_stopper:
         make_folder(output, WATCH_FILES)
-        with Steps(console, quiet=quiet) as step:
-            step("read")
+        with Steps(console, quiet=quiet) as show_step:
+            show_step("read")
             with naming_options_in_errors({"description": "--skin"}):
                 description = load_description(skin)
-            model = GestureModel.read(gestures)
+            gesture_model = GestureModel.read(gestures)
             untouched_frames = None if reference is None else read_frame_recording(reference, description).frames
-            default_rate = 60.0 if model.reading is None else model.reading.rate
+            default_rate = 60.0 if gesture_model.reading is None else gesture_model.reading.rate
             live_frames = None
             if stream == "-":
                 live_frames = LiveFrames(parse_frames(sys.stdin), rate, default_rate)
                 if untouched_frames is None:
-                    step(f"untouched, for {untouched:g} s")
+                    show_step(f"untouched, for {untouched:g} s")
                     untouched_frames = live_frames.initial_frames(untouched)
                 frames, frame_rate = live_frames, live_frames.measured_rate
             else:
                 frames, untouched_frames, frame_rate = _read_recording(
                     Path(stream), description, untouched_frames, untouched, rate or default_rate
                 )
-            step("prepare")
-            images = TouchImages.prepare(
-                description, untouched_frames, replace(TOUCH_IMAGES, as_is=as_is), progress=step.report
+            show_step("prepare")
+            touch_images = TouchImages.prepare(
+                description, untouched_frames, replace(TOUCH_IMAGES, as_is=as_is), progress=show_step.report
             )
-            touch_watch = TouchWatch.create(images, model, untouched_frames, rate=frame_rate, patience=patience)
+            touch_watch = TouchWatch.create(
+                touch_images, gesture_model, untouched_frames, rate=frame_rate, patience=patience
+            )
         for note in () if quiet else touch_watch.notes:
             console.print(f"  note: {note}", soft_wrap=True)
 
@@ -183,7 +191,7 @@ def watch(
                 console.print(_describe_touch(touch))
 
         written_watch = write_watch(
-            touch_watch.follow(stopping.frames_until_signal(frames)),
+            touch_watch.follow(stream_stopper.frames_until_signal(frames)),
             touch_watch,
             output,
             name=stream,
@@ -191,7 +199,7 @@ def watch(
         )
     if not quiet:
         _print_summary(console, written_watch, live_frames, output)
-    if stopping.signal == signal.SIGTERM:
+    if stream_stopper.signal == signal.SIGTERM:
         raise typer.Exit(128 + signal.SIGTERM)
 
 
@@ -202,7 +210,9 @@ def _print_summary(console, written_watch, live_frames, output: Path) -> None:
     from jeit.arguments import counted
     from jeit.cli.console import print_written_files
 
-    frame_counts = ", ".join(f"{number} {status}" for status, number in sorted(written_watch.counts.items()))
+    frame_counts = ", ".join(
+        f"{frame_count} {frame_status}" for frame_status, frame_count in sorted(written_watch.counts.items())
+    )
     num_unlike_touches = sum(touch.unlike for touch in written_watch.touches)
     console.print(f"\n{counted(len(written_watch.seconds), 'frame')}: {frame_counts}")
     console.print(
@@ -220,29 +230,31 @@ def _print_summary(console, written_watch, live_frames, output: Path) -> None:
     print_written_files(console, output / "events.csv", "paths.csv", "report.json", "timeline.png")
 
 
-def _read_recording(path: Path, description, untouched, untouched_duration: float, rate: float):
+def _read_recording(
+    recording_path: Path, description, untouched_voltages, untouched_duration: float, frame_rate: float
+):
     """Read a recording: return its frames with their times, the frames of the untouched skin, and the frame rate."""
     import numpy as np
 
     from jeit.data import read_frame_recording
     from jeit.touch import untouched_frames
 
-    recording = read_frame_recording(path, description)
-    seconds = recording.seconds
-    if seconds is None:
-        seconds = np.arange(len(recording.frames)) / rate
-    elif len(seconds) > 1 and np.median(np.diff(seconds)) > 0:
-        rate = 1 / float(np.median(np.diff(seconds)))
-    if untouched is None:
+    recording = read_frame_recording(recording_path, description)
+    frame_times = recording.seconds
+    if frame_times is None:
+        frame_times = np.arange(len(recording.frames)) / frame_rate
+    elif len(frame_times) > 1 and np.median(np.diff(frame_times)) > 0:
+        frame_rate = 1 / float(np.median(np.diff(frame_times)))
+    if untouched_voltages is None:
         with naming_options_in_errors({"untouched": "--untouched"}):
-            untouched = untouched_frames(recording, seconds, untouched_duration)
-    return zip(seconds.tolist(), recording.frames, strict=True), untouched, rate
+            untouched_voltages = untouched_frames(recording, frame_times, untouched_duration)
+    return zip(frame_times.tolist(), recording.frames, strict=True), untouched_voltages, frame_rate
 
 
 def _describe_touch(touch) -> str:
     time_course = touch.touch.course
     x, y = 1e3 * time_course.centroid[int(time_course.peak.argmax())]
-    name = "unlike any" if touch.unlike else f"{touch.gesture:<12}{100 * touch.probability:3.0f} %"
-    name += ", held" if touch.held else ", cut off" if touch.touch.cut_off else ""
-    duration = touch.touch.offset - touch.touch.onset
-    return f"  {touch.touch.onset:8.2f} s  {duration:5.2f} s  {name:<18} ({x:+.0f}, {y:+.0f}) mm"
+    gesture_text = "unlike any" if touch.unlike else f"{touch.gesture:<12}{100 * touch.probability:3.0f} %"
+    gesture_text += ", held" if touch.held else ", cut off" if touch.touch.cut_off else ""
+    touch_duration = touch.touch.offset - touch.touch.onset
+    return f"  {touch.touch.onset:8.2f} s  {touch_duration:5.2f} s  {gesture_text:<18} ({x:+.0f}, {y:+.0f}) mm"

@@ -14,9 +14,9 @@ from jeit.mesh.geodesic import Triangles
 from jeit.touch.contacts.finder import AbstractFinder, Contact, ImageNoise, check_finder, check_share
 
 # Number of standard deviations beyond which a Gaussian is treated as zero.
-_CUTOFF_DEVIATIONS = 3.0
+_SMOOTHING_CUTOFF_DEVIATIONS = 3.0
 # Default smoothing length, divided by the square root of the mesh's area.
-_RELATIVE_SMOOTHING = 0.03
+_RELATIVE_SMOOTHING_LENGTH = 0.03
 
 
 def gaussian_means(mesh: Mesh, length: float | None) -> sparse.csr_array:
@@ -26,20 +26,24 @@ def gaussian_means(mesh: Mesh, length: float | None) -> sparse.csr_array:
     of the Gaussian, metres; None: 3 % of the square root of the mesh's area; 0: no smoothing. Raises `ValueError` if
     `length` is negative, or not less than the square root of the mesh's area.
     """
-    centres, areas = np.asarray(centroids(mesh)), np.asarray(measures(mesh))
-    skin_size = float(np.sqrt(areas.sum()))
-    length = _RELATIVE_SMOOTHING * skin_size if length is None else length
+    cell_centres, cell_areas = np.asarray(centroids(mesh)), np.asarray(measures(mesh))
+    skin_size = float(np.sqrt(cell_areas.sum()))
+    length = _RELATIVE_SMOOTHING_LENGTH * skin_size if length is None else length
     if not (is_number(length) and 0 <= length < skin_size):
         raise ValueError(
             f"smoothing must be metres, zero or more and less than the skin is wide ({skin_size:.3g} m); it is "
             f"{describe(length)}."
         )
     if not length:
-        return sparse.csr_array(sparse.diags_array(np.ones(len(areas))))
-    tree = KDTree(centres)
-    distances = tree.sparse_distance_matrix(tree, _CUTOFF_DEVIATIONS * length, output_type="coo_matrix")
-    weights = np.exp(-((distances.data / length) ** 2) / 2) * areas[distances.col]
-    weighted_sums = sparse.csr_array((weights, (distances.row, distances.col)), shape=distances.shape)
+        return sparse.csr_array(sparse.diags_array(np.ones(len(cell_areas))))
+    cell_tree = KDTree(cell_centres)
+    cell_distances = cell_tree.sparse_distance_matrix(
+        cell_tree, _SMOOTHING_CUTOFF_DEVIATIONS * length, output_type="coo_matrix"
+    )
+    gaussian_weights = np.exp(-((cell_distances.data / length) ** 2) / 2) * cell_areas[cell_distances.col]
+    weighted_sums = sparse.csr_array(
+        (gaussian_weights, (cell_distances.row, cell_distances.col)), shape=cell_distances.shape
+    )
     return sparse.csr_array(sparse.diags_array(1 / weighted_sums.sum(axis=1)) @ weighted_sums)
 
 
@@ -52,19 +56,19 @@ def outline_of_cells(points: Float[np.ndarray, "n d"], cells: Int[np.ndarray, "c
     edges = np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]])
     _, edge_numbers, edge_counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     following_nodes: dict[int, list[int]] = {}
-    for start, end in edges[edge_counts[edge_numbers] == 1].tolist():
-        following_nodes.setdefault(start, []).append(end)
-    longest_loop: list[int] = []
+    for start_node, end_node in edges[edge_counts[edge_numbers] == 1].tolist():
+        following_nodes.setdefault(start_node, []).append(end_node)
+    longest_boundary_loop: list[int] = []
     while following_nodes:
-        loop = [next(iter(following_nodes))]
-        while loop[-1] in following_nodes:
-            next_nodes = following_nodes[loop[-1]]
-            last_node = loop[-1]
-            loop.append(next_nodes.pop())
+        boundary_loop = [next(iter(following_nodes))]
+        while boundary_loop[-1] in following_nodes:
+            next_nodes = following_nodes[boundary_loop[-1]]
+            last_node = boundary_loop[-1]
+            boundary_loop.append(next_nodes.pop())
             if not next_nodes:
                 del following_nodes[last_node]
-        longest_loop = max(longest_loop, loop[:-1], key=len)
-    return points[longest_loop]
+        longest_boundary_loop = max(longest_boundary_loop, boundary_loop[:-1], key=len)
+    return points[longest_boundary_loop]
 
 
 class CellFinder(AbstractFinder):
@@ -133,8 +137,12 @@ class CellFinder(AbstractFinder):
         invalid smoothing length, and thresholds that are not from 0 to below 1.
         """
         check_finder(mesh, sign, floor, flat=False)
-        for name, value in (("level", level), ("least_peak", least_peak), ("least_prominence", least_prominence)):
-            check_share(name, value)
+        for option_name, option_value in (
+            ("level", level),
+            ("least_peak", least_peak),
+            ("least_prominence", least_prominence),
+        ):
+            check_share(option_name, option_value)
         self.cells, self.points = np.asarray(mesh.cells), np.asarray(mesh.points)
         self.centres, self.areas = np.asarray(centroids(mesh)), np.asarray(measures(mesh))
         self.surface = Triangles.of(mesh) if mesh.is_surface else None
@@ -147,27 +155,34 @@ class CellFinder(AbstractFinder):
         """Find the contacts in an image; see `find_contacts`."""
         change, clear_change = self.above_noise(change, noise)
         basin_peaks = watershed_basins(clear_change, self.shared, min_value=0.0, least_prominence=self.least_prominence)
-        peaks = np.unique(basin_peaks[basin_peaks >= 0])
-        strong_peaks = peaks[change[peaks] >= self.least_peak * change[peaks].max(initial=0.0)]
-        return [self._describe_contact(change, noise, peak, basin_peaks == peak) for peak in strong_peaks.tolist()]
+        peak_cells = np.unique(basin_peaks[basin_peaks >= 0])
+        strong_peak_cells = peak_cells[change[peak_cells] >= self.least_peak * change[peak_cells].max(initial=0.0)]
+        return [
+            self._describe_contact(change, noise, peak_cell, basin_peaks == peak_cell)
+            for peak_cell in strong_peak_cells.tolist()
+        ]
 
-    def _describe_contact(self, change: np.ndarray, noise: ImageNoise, peak: int, is_in_basin: np.ndarray) -> Contact:
-        level = self.level * change[peak]
-        region = np.flatnonzero(is_in_basin & (change >= level))
-        areas, centres = self.areas[region], self.centres[region]
-        weights = areas * (change[region] - level)
-        centroid = weights @ centres / weights.sum()
+    def _describe_contact(
+        self, change: np.ndarray, noise: ImageNoise, peak_cell: int, is_in_basin: np.ndarray
+    ) -> Contact:
+        contact_level = self.level * change[peak_cell]
+        contact_cells = np.flatnonzero(is_in_basin & (change >= contact_level))
+        contact_cell_areas, contact_cell_centres = self.areas[contact_cells], self.centres[contact_cells]
+        centroid_weights = contact_cell_areas * (change[contact_cells] - contact_level)
+        contact_centroid = centroid_weights @ contact_cell_centres / centroid_weights.sum()
         # Derivative of the centroid Σ a (v − level v_peak) x / Σ a (v − level v_peak) with respect to the values v.
         centroid_derivative = np.zeros(self.centres.shape)
-        centroid_derivative[region] = areas[:, None] * (centres - centroid) / weights.sum()
-        centroid_derivative[peak] -= self.level * centroid_derivative[region].sum(axis=0)
+        centroid_derivative[contact_cells] = (
+            contact_cell_areas[:, None] * (contact_cell_centres - contact_centroid) / centroid_weights.sum()
+        )
+        centroid_derivative[peak_cell] -= self.level * centroid_derivative[contact_cells].sum(axis=0)
         if self.surface is not None:
-            centroid = self.surface.nearest(centroid[None]).points[0]
+            contact_centroid = self.surface.nearest(contact_centroid[None]).points[0]
         return Contact(
-            centroid=centroid,
-            area=float(areas.sum()),
-            peak=float(change[peak]),
-            integral=float(areas @ change[region]),
-            contour=outline_of_cells(self.points, self.cells[region]),
+            centroid=contact_centroid,
+            area=float(contact_cell_areas.sum()),
+            peak=float(change[peak_cell]),
+            integral=float(contact_cell_areas @ change[contact_cells]),
+            contour=outline_of_cells(self.points, self.cells[contact_cells]),
             deviation=noise.distance(self.smoothing.T @ centroid_derivative),
         )

@@ -18,11 +18,11 @@ from jeit_solvers.module import Module
 # Minimum number of frames for estimating the standard deviation.
 _MIN_NUM_FRAMES = 10
 # Ratio of the standard deviation of normal noise to its median absolute value.
-_DEVIATION_PER_MEDIAN = 1.4826
+_DEVIATION_PER_MEDIAN_MAGNITUDE = 1.4826
 # Number of standard deviations beyond which cells are removed.
 _CLIPPING_DEVIATIONS = 3.0
 # Ratio of the standard deviation of all cells to that of the cells that remain, for normal noise.
-_CLIPPED_DEVIATION = 1.0136
+_CLIPPING_CORRECTION = 1.0136
 # Maximum number of rounds of clipping.
 _MAX_CLIPPING_ROUNDS = 20
 
@@ -50,16 +50,16 @@ class ImageNoise(Module):
         Raises `ValueError` for deviations that are negative or not finite, and a factor with a different number of
         cells.
         """
-        requirement = "an array (m,), one number a cell, zero or more and finite, in the unit of the image"
-        check_kind("deviation", self.deviation, (np.ndarray, jax.Array), requirement)
-        deviation = real_array("deviation", self.deviation, requirement)
+        requirement_text = "an array (m,), one number a cell, zero or more and finite, in the unit of the image"
+        check_kind("deviation", self.deviation, (np.ndarray, jax.Array), requirement_text)
+        deviation = real_array("deviation", self.deviation, requirement_text)
         if deviation.ndim != 1:
-            raise ValueError(f"deviation must be {requirement}; it has shape {deviation.shape}.")
+            raise ValueError(f"deviation must be {requirement_text}; it has shape {deviation.shape}.")
         if not (np.isfinite(deviation).all() and (deviation >= 0).all()):
-            raise ValueError(f"deviation must be {requirement}; some of it is negative or not finite.")
+            raise ValueError(f"deviation must be {requirement_text}; some of it is negative or not finite.")
         if self.factor is not None and np.shape(self.factor)[1:] != deviation.shape:
-            shape = np.shape(self.factor)
-            raise ValueError(f"factor has shape {shape}; give (r, {deviation.size}), a column for each cell.")
+            factor_shape = np.shape(self.factor)
+            raise ValueError(f"factor has shape {factor_shape}; give (r, {deviation.size}), a column for each cell.")
 
     @classmethod
     def of_frames(cls, reconstruction: LinearReconstruction, frames: Float[np.ndarray, "n M"]) -> "ImageNoise":
@@ -79,7 +79,7 @@ class ImageNoise(Module):
         if (frames == frames[0]).all():
             raise ValueError("frames are all the same and show no noise. Give what was read, not copies of a frame.")
         noise_images = np.asarray(reconstruction.image(frames - frames.mean(axis=0)))
-        return cls._from_factor(noise_images / np.sqrt(len(frames) - 1))
+        return cls._from_covariance_factor(noise_images / np.sqrt(len(frames) - 1))
 
     @classmethod
     def of_images(cls, images: Float[np.ndarray, "n m"]) -> "ImageNoise":
@@ -93,7 +93,7 @@ class ImageNoise(Module):
             )
         if (images == images[0]).all():
             raise ValueError("images are all the same and show no noise. Give those of frames that were read.")
-        return cls._from_factor((images - images.mean(axis=0)) / np.sqrt(len(images) - 1))
+        return cls._from_covariance_factor((images - images.mean(axis=0)) / np.sqrt(len(images) - 1))
 
     @classmethod
     def of_channels(cls, reconstruction: LinearReconstruction, deviation: ArrayLike) -> "ImageNoise":
@@ -109,7 +109,9 @@ class ImageNoise(Module):
             raise ValueError(f"deviation has shape {deviation.shape}; give one number, or ({num_channels},), volts.")
         if not (np.isfinite(deviation).all() and (deviation >= 0).all() and deviation.any()):
             raise ValueError("deviation must be finite, zero or more, and not zero for all channels, in volts.")
-        return cls._from_factor(np.broadcast_to(deviation, num_channels)[:, None] * np.asarray(reconstruction.matrix).T)
+        return cls._from_covariance_factor(
+            np.broadcast_to(deviation, num_channels)[:, None] * np.asarray(reconstruction.matrix).T
+        )
 
     @classmethod
     def of_image(cls, image: Float[np.ndarray, " m"]) -> "ImageNoise":
@@ -120,14 +122,19 @@ class ImageNoise(Module):
         noise; weak contacts beside strong contacts are therefore missed. Cells that are noisier than most are mistaken
         for contacts. Raises `ValueError` for an image that is not (m,), finite and real.
         """
-        values = np.asarray(image)
-        if values.ndim != 1 or not values.size or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+        image_values = np.asarray(image)
+        if (
+            image_values.ndim != 1
+            or not image_values.size
+            or image_values.dtype.kind not in "iuf"
+            or not np.isfinite(image_values).all()
+        ):
             raise ValueError("image must be real and finite, one value a cell (m,).")
-        return cls(np.full(values.shape, _clipped_deviation(values)))
+        return cls(np.full(image_values.shape, _clipped_deviation(image_values)))
 
     @classmethod
-    def _from_factor(cls, factor: np.ndarray) -> "ImageNoise":
-        return cls(np.sqrt((factor**2).sum(axis=0)), factor)
+    def _from_covariance_factor(cls, covariance_factor: np.ndarray) -> "ImageNoise":
+        return cls(np.sqrt((covariance_factor**2).sum(axis=0)), covariance_factor)
 
     def distance(self, slope: Float[np.ndarray, "m 2"]) -> float:
         """Compute the root mean square displacement, metres, of a position that is computed from a noisy image.
@@ -149,20 +156,20 @@ class ImageNoise(Module):
         return np.sqrt(((smoothing @ self.factor.T) ** 2).sum(axis=1))
 
 
-def _clipped_deviation(values: Float[np.ndarray, " m"]) -> float:
+def _clipped_deviation(cell_values: Float[np.ndarray, " m"]) -> float:
     """Compute the standard deviation of values (m,) without outliers, beyond three standard deviations of the median.
 
     To identify outliers, the standard deviation is estimated from the median absolute deviation.
     """
-    remaining_values = values
+    remaining_values = cell_values
     for _ in range(_MAX_CLIPPING_ROUNDS):
-        median = np.median(remaining_values)
-        robust_deviation = _DEVIATION_PER_MEDIAN * np.median(np.abs(remaining_values - median))
-        unclipped_values = values[np.abs(values - median) <= _CLIPPING_DEVIATIONS * robust_deviation]
+        median_value = np.median(remaining_values)
+        robust_deviation = _DEVIATION_PER_MEDIAN_MAGNITUDE * np.median(np.abs(remaining_values - median_value))
+        unclipped_values = cell_values[np.abs(cell_values - median_value) <= _CLIPPING_DEVIATIONS * robust_deviation]
         if len(unclipped_values) == len(remaining_values):
             break
         remaining_values = unclipped_values
-    return float(_CLIPPED_DEVIATION * remaining_values.std())
+    return float(_CLIPPING_CORRECTION * remaining_values.std())
 
 
 class Contact(Module):
@@ -277,17 +284,17 @@ def signed_image(finder: AbstractFinder, image) -> Float[np.ndarray, " m"]:
 
     Raises `ValueError` unless the image is real, finite, and on the finder's mesh.
     """
-    values = np.asarray(image)
-    if values.shape != (finder.num_cells,):
+    image_values = np.asarray(image)
+    if image_values.shape != (finder.num_cells,):
         raise ValueError(
-            f"image has shape {values.shape}; give one value for each of the {finder.num_cells} cells of the finder's "
-            "mesh. Was it reconstructed on another?"
+            f"image has shape {image_values.shape}; give one value for each of the {finder.num_cells} cells of the "
+            "finder's mesh. Was it reconstructed on another?"
         )
-    if values.dtype.kind not in "iuf":
-        raise ValueError(f"image must be real; it is {values.dtype}.")
-    if not np.isfinite(values).all():
+    if image_values.dtype.kind not in "iuf":
+        raise ValueError(f"image must be real; it is {image_values.dtype}.")
+    if not np.isfinite(image_values).all():
         raise ValueError("image has NaN or infinite values; reconstruct it from unmasked channels first.")
-    return finder.sign * values
+    return finder.sign * image_values
 
 
 def check_finder(mesh: Mesh, sign: int, floor: float, *, flat: bool = True) -> None:

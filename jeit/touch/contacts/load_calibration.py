@@ -92,54 +92,57 @@ class LoadCalibration(Module):
             check_kind(f"contacts[{contact_index}]", contact, Contact, "a Contact, as of find_contacts")
         if not (np.isfinite(loads).all() and (loads > 0).all() and np.ptp(loads) > 0):
             raise ValueError("loads must be positive, in newtons, and not all the same.")
-        peaks = np.array([contact.peak for contact in contacts])
-        if abs(np.sign(peaks).sum()) != len(peaks):
+        contact_peaks = np.array([contact.peak for contact in contacts])
+        if abs(np.sign(contact_peaks).sum()) != len(contact_peaks):
             raise ValueError("contacts: their peaks must all be of one sign, and none zero.")
         centre = real_array("centre", centre, "(x, y) in metres")
         if centre.shape != (2,) or not np.isfinite(centre).all():
             raise ValueError(f"centre must be (x, y) in metres, finite; it is {centre.tolist()}.")
-        distances = np.array([np.linalg.norm(contact.centroid - centre) for contact in contacts]) / radius
-        max_width = max(float(np.sqrt(contact.area)) for contact in contacts)
-        if not (distances.max() < _MAX_RELATIVE_DISTANCE and max_width > _MIN_RELATIVE_WIDTH * radius):
-            max_distance_mm = 1e3 * radius * distances.max()
+        relative_distances = np.array([np.linalg.norm(contact.centroid - centre) for contact in contacts]) / radius
+        max_contact_width = max(float(np.sqrt(contact.area)) for contact in contacts)
+        if not (relative_distances.max() < _MAX_RELATIVE_DISTANCE and max_contact_width > _MIN_RELATIVE_WIDTH * radius):
+            max_contact_distance_mm = 1e3 * radius * relative_distances.max()
             raise ValueError(
-                f"radius is {1e3 * radius:g} mm, and contacts lie up to {max_distance_mm:.3g} mm from the centre, and "
-                f"are {1e3 * max_width:.2g} mm wide; give the skin's radius, and its centre, in metres."
+                f"radius is {1e3 * radius:g} mm, and contacts lie up to {max_contact_distance_mm:.3g} mm from the "
+                "centre, and "
+                f"are {1e3 * max_contact_width:.2g} mm wide; give the skin's radius, and its centre, in metres."
             )
-        log_peaks = np.log(np.abs(peaks))
+        log_peaks = np.log(np.abs(contact_peaks))
         initial_parameters = np.array([log_peaks.max(), 0.0, 0.0, np.log(np.median(loads))])
 
-        def residuals(parameters):
-            return _log_peak(parameters, distances, loads) - log_peaks
+        def log_peak_residuals(parameters):
+            return _log_peak(parameters, relative_distances, loads) - log_peaks
 
         # Weak priors, each with the weight of a thousandth of a reading, for parameters that the places or loads of the
         # contacts do not determine.
         prior_weights = np.sqrt(1e-3) * np.array([0.0, 0.3, 0.3, 0.3])
         least_squares_result = least_squares(
             lambda parameters: np.concatenate(
-                [residuals(parameters), prior_weights * (parameters - initial_parameters)]
+                [log_peak_residuals(parameters), prior_weights * (parameters - initial_parameters)]
             ),
             initial_parameters,
         )
         if not least_squares_result.success:
             raise ValueError(f"contacts and loads: no curve fits them ({least_squares_result.message}).")
-        scatter = float(
-            np.sqrt((residuals(least_squares_result.x) ** 2).sum() / (len(loads) - len(initial_parameters)))
+        log_peak_scatter = float(
+            np.sqrt((log_peak_residuals(least_squares_result.x) ** 2).sum() / (len(loads) - len(initial_parameters)))
         )
-        covariance = scatter**2 * np.linalg.inv(least_squares_result.jac.T @ least_squares_result.jac)
-        highest = float((loads / (loads + np.exp(least_squares_result.x[3]))).max())
+        parameter_covariance = log_peak_scatter**2 * np.linalg.inv(
+            least_squares_result.jac.T @ least_squares_result.jac
+        )
+        max_saturation = float((loads / (loads + np.exp(least_squares_result.x[3]))).max())
         load_range = float(loads.min()), float(loads.max())
-        sign = int(np.sign(peaks[0]))
+        peak_sign = int(np.sign(contact_peaks[0]))
         return cls(
             centre,
             float(radius),
             least_squares_result.x,
-            covariance,
-            sign,
-            scatter,
+            parameter_covariance,
+            peak_sign,
+            log_peak_scatter,
             load_range,
-            float(distances.max()),
-            highest,
+            float(relative_distances.max()),
+            max_saturation,
         )
 
     def load(self, contact: Contact) -> LoadEstimate:
@@ -156,14 +159,16 @@ class LoadCalibration(Module):
                 f"contact: its peak {describe(contact.peak)} is not {'positive' if self.sign > 0 else 'negative'}, as "
                 "those calibrated are; it is no load. Give the finder the sign that it had for calibration."
             )
-        distance = float(np.linalg.norm(contact.centroid - self.centre)) / self.radius
-        if distance > self.farthest + 0.05:
+        relative_distance = float(np.linalg.norm(contact.centroid - self.centre)) / self.radius
+        if relative_distance > self.farthest + 0.05:
             raise ValueError(
-                f"contact is {1e3 * distance * self.radius:.1f} mm from the middle, and calibrated contacts reach "
-                f"{1e3 * self.farthest * self.radius:.1f} mm; calibrate with loads farther out."
+                f"contact is {1e3 * relative_distance * self.radius:.1f} mm from the middle, and calibrated "
+                f"contacts reach {1e3 * self.farthest * self.radius:.1f} mm; calibrate with loads farther out."
             )
-        log_scale, quadratic, quartic, log_half_saturation_load = self.parameters
-        saturation = abs(contact.peak) / np.exp(log_scale + quadratic * distance**2 + quartic * distance**4)
+        log_scale, quadratic_coefficient, quartic_coefficient, log_half_saturation_load = self.parameters
+        saturation = abs(contact.peak) / np.exp(
+            log_scale + quadratic_coefficient * relative_distance**2 + quartic_coefficient * relative_distance**4
+        )
         # A peak less than two standard deviations above the calibrated peaks is no evidence of a larger load.
         if saturation > min(self.highest * np.exp(2 * self.scatter), max(self.highest, _MAX_SATURATION)):
             raise ValueError(
@@ -173,19 +178,23 @@ class LoadCalibration(Module):
         force = float(np.exp(log_half_saturation_load) * saturation / (1 - saturation))
         # Derivatives of log F with respect to log peak: 1 / (1 − saturation); with respect to log s, b and c: −1 / (1 −
         # saturation), times the derivative of log peak; with respect to log F½: 1.
-        sensitivity = 1 / (1 - saturation)
-        derivatives = np.array([-sensitivity, -sensitivity * distance**2, -sensitivity * distance**4, 1.0])
-        variance = derivatives @ self.covariance @ derivatives + (sensitivity * self.scatter) ** 2
-        return LoadEstimate(force, force * float(np.sqrt(variance)))
+        load_sensitivity = 1 / (1 - saturation)
+        log_load_derivatives = np.array(
+            [-load_sensitivity, -load_sensitivity * relative_distance**2, -load_sensitivity * relative_distance**4, 1.0]
+        )
+        log_load_variance = (
+            log_load_derivatives @ self.covariance @ log_load_derivatives + (load_sensitivity * self.scatter) ** 2
+        )
+        return LoadEstimate(force, force * float(np.sqrt(log_load_variance)))
 
 
-def _log_peak(parameters, distance, loads):
-    """Compute the logarithms of the peaks of contacts at the relative distances ρ = `distance` under `loads`,
+def _log_peak(parameters, relative_distances, loads):
+    """Compute the logarithms of the peaks of contacts at the relative distances ρ = `relative_distances` under `loads`,
     newtons."""
-    log_scale, quadratic, quartic, log_half_saturation_load = parameters
+    log_scale, quadratic_coefficient, quartic_coefficient, log_half_saturation_load = parameters
     return (
         log_scale
-        + quadratic * distance**2
-        + quartic * distance**4
+        + quadratic_coefficient * relative_distances**2
+        + quartic_coefficient * relative_distances**4
         + np.log(loads / (loads + np.exp(log_half_saturation_load)))
     )

@@ -33,7 +33,7 @@ from jeit.touch.contacts.finder import (
 from jeit_solvers.module import Module
 
 # Width in pixels of the band along a contact's edge in which noise may add cells to the contact, or remove them.
-_EDGE_WIDTH = 15
+_CONTOUR_BAND_WIDTH = 15
 # Maximum number of pixels along a side: more would need much memory, and no image has as many cells.
 _MAX_PIXELS = 4096
 
@@ -114,10 +114,11 @@ class RasterFinder(AbstractFinder):
         """
         _import_opencv()
         check_finder(mesh, sign, floor)
-        for name, value, min_width in (("block", block, 3), ("opening", opening, 1)):
-            if not (isinstance(value, int) and value >= min_width and value % 2):
+        for option_name, option_value, min_width in (("block", block, 3), ("opening", opening, 1)):
+            if not (isinstance(option_value, int) and option_value >= min_width and option_value % 2):
                 raise ValueError(
-                    f"{name} must be an odd number of pixels from {min_width} up; it is {describe(value)}."
+                    f"{option_name} must be an odd number of pixels from {min_width} up; it is "
+                    f"{describe(option_value)}."
                 )
         if not (isinstance(pixels, int) and 16 <= pixels <= _MAX_PIXELS):
             raise ValueError(f"pixels must be a whole number from 16 to {_MAX_PIXELS}; it is {describe(pixels)}.")
@@ -131,23 +132,25 @@ class RasterFinder(AbstractFinder):
     def find(self, change, noise):
         """Find the contacts in an image; see `find_contacts`."""
         _, clear_change = self.above_noise(change, noise)
-        return self._stages(change, noise).contacts if clear_change.any() else []
+        return self._compute_stages(change, noise).contacts if clear_change.any() else []
 
     def stages(self, image: Float[np.ndarray, " m"], noise: ImageNoise | None = None) -> RasterStages:
         """Compute the grey levels, threshold, opening and contacts of an image (m,); arguments and errors: see
         `find_contacts`."""
         change = signed_image(self, image)
-        stages = self._stages(change, noise_or_estimate(change, noise))
-        region_and_contacts = self.sign * stages.region, restore_sign(self, stages.contacts)
-        return eqx.tree_at(lambda results: (results.region, results.contacts), stages, region_and_contacts)
+        raster_stages = self._compute_stages(change, noise_or_estimate(change, noise))
+        region_and_contacts = self.sign * raster_stages.region, restore_sign(self, raster_stages.contacts)
+        return eqx.tree_at(
+            lambda shown_stages: (shown_stages.region, shown_stages.contacts), raster_stages, region_and_contacts
+        )
 
-    def _stages(self, change: Float[np.ndarray, " m"], noise: ImageNoise) -> RasterStages:
+    def _compute_stages(self, change: Float[np.ndarray, " m"], noise: ImageNoise) -> RasterStages:
         """Compute the results of all steps for a `change` (m,) whose sign makes contacts positive."""
         opencv = _import_opencv()
         cell_indices = np.asarray(self.raster.cell)
         is_on_skin = cell_indices >= 0
         change, clear_change = self.above_noise(change, noise)
-        region, clear_change = (
+        region_changes, clear_change = (
             np.where(is_on_skin, change[cell_indices], np.nan),
             np.where(is_on_skin, clear_change[cell_indices], 0.0),
         )
@@ -159,7 +162,7 @@ class RasterFinder(AbstractFinder):
         block_size = (self.block, self.block)
         skin_weights = np.maximum(opencv.GaussianBlur(is_on_skin * 1.0, block_size, 0), 1e-12)
         local_means = opencv.GaussianBlur(grey_levels * 1.0, block_size, 0) / skin_weights
-        threshold = opencv.adaptiveThreshold(
+        threshold_mask = opencv.adaptiveThreshold(
             np.where(is_on_skin, grey_levels, local_means).astype(np.uint8),
             255,
             opencv.ADAPTIVE_THRESH_GAUSSIAN_C,
@@ -167,65 +170,88 @@ class RasterFinder(AbstractFinder):
             self.block,
             -self.constant,
         ) * is_on_skin.astype(np.uint8)
-        ellipse = opencv.getStructuringElement(opencv.MORPH_ELLIPSE, (self.opening, self.opening))
-        opened_mask = opencv.morphologyEx(threshold, opencv.MORPH_OPEN, ellipse)
+        opening_kernel = opencv.getStructuringElement(opencv.MORPH_ELLIPSE, (self.opening, self.opening))
+        opened_mask = opencv.morphologyEx(threshold_mask, opencv.MORPH_OPEN, opening_kernel)
         contours, _ = opencv.findContours(opened_mask, opencv.RETR_EXTERNAL, opencv.CHAIN_APPROX_NONE)
         membership_noise = self._membership_noise(
             cell_indices[is_on_skin], (grey_levels - local_means - self.constant)[is_on_skin] * max_change / 255, noise
         )
         contacts = [
-            self._contact(opencv, region, contour[:, 0], membership_noise, skin_weights, clear_change > 0, noise)
+            self._describe_contact(
+                opencv, region_changes, contour[:, 0], membership_noise, skin_weights, clear_change > 0, noise
+            )
             for contour in contours
         ]
         sorted_contacts = sorted(
             (contact for contact in contacts if contact is not None), key=lambda contact: -contact.peak
         )
-        return RasterStages(region, grey_levels, threshold > 0, opened_mask > 0, sorted_contacts, self.raster.extent)
+        return RasterStages(
+            region_changes, grey_levels, threshold_mask > 0, opened_mask > 0, sorted_contacts, self.raster.extent
+        )
 
-    def _contact(
-        self, opencv, region, contour: np.ndarray, membership_noise: tuple, skin_weights, is_clear, noise: ImageNoise
+    def _describe_contact(
+        self,
+        opencv,
+        region_changes,
+        contour: np.ndarray,
+        membership_noise: tuple,
+        skin_weights,
+        is_above_noise,
+        noise: ImageNoise,
     ) -> Contact | None:
         """Describe the contact that a contour (k, 2) of columns and rows encloses.
 
         Returns None if the contour encloses no pixel of the skin. `membership_noise`: see `_membership_noise`;
-        `skin_weights` (rows, columns): weight of the skin's pixels in the local means; `is_clear` (rows, columns):
-        whether pixels are above the noise floor.
+        `skin_weights` (rows, columns): weight of the skin's pixels in the local means; `is_above_noise` (rows,
+        columns): whether pixels are above the noise floor.
         """
-        filled_contour = np.zeros(region.shape, np.uint8)
+        filled_contour = np.zeros(region_changes.shape, np.uint8)
         opencv.drawContours(filled_contour, [contour[:, None]], -1, 1, opencv.FILLED)
-        is_inside = (filled_contour > 0) & np.isfinite(region)
-        if not is_inside.any():
+        is_inside_contour = (filled_contour > 0) & np.isfinite(region_changes)
+        if not is_inside_contour.any():
             return None
         pixel_centres = self.raster.pixel_centres()
-        centroid, area = pixel_centres[is_inside].mean(axis=0), float(self.raster.pixel_area * is_inside.sum())
-        (value_slopes, independent_deviations), block_size = membership_noise, (self.block, self.block)
+        centroid, contact_area = (
+            pixel_centres[is_inside_contour].mean(axis=0),
+            float(self.raster.pixel_area * is_inside_contour.sum()),
+        )
+        (membership_slopes, independent_deviations), block_size = membership_noise, (self.block, self.block)
         # Cells join and leave a contact only at its edge: all pixels inside the contour belong to the contact, whatever
         # their grey levels.
-        ellipse = opencv.getStructuringElement(opencv.MORPH_ELLIPSE, (_EDGE_WIDTH, _EDGE_WIDTH))
-        is_edge = (opencv.dilate(filled_contour, ellipse) > opencv.erode(filled_contour, ellipse)) & np.isfinite(region)
+        band_kernel = opencv.getStructuringElement(opencv.MORPH_ELLIPSE, (_CONTOUR_BAND_WIDTH, _CONTOUR_BAND_WIDTH))
+        is_near_contour = (
+            opencv.dilate(filled_contour, band_kernel) > opencv.erode(filled_contour, band_kernel)
+        ) & np.isfinite(region_changes)
         cell_indices = np.asarray(self.raster.cell)
-        centroid_shifts = np.where(is_edge[..., None], (pixel_centres - centroid) * self.raster.pixel_area / area, 0.0)
-        dependent_shifts = np.where(is_edge, value_slopes[cell_indices], 0.0)[..., None] * centroid_shifts
+        centroid_shifts = np.where(
+            is_near_contour[..., None], (pixel_centres - centroid) * self.raster.pixel_area / contact_area, 0.0
+        )
+        dependent_shifts = np.where(is_near_contour, membership_slopes[cell_indices], 0.0)[..., None] * centroid_shifts
         # Noise also shifts the threshold, which depends on the local mean of the pixels.
         mean_shifts = opencv.GaussianBlur(
             (dependent_shifts / skin_weights[..., None]).astype(np.float32), block_size, 0
         )
-        centroid_derivative = self._sum_over_cells(dependent_shifts - mean_shifts * is_clear[..., None])
-        displacements = (
+        centroid_derivative = self._sum_over_cells(dependent_shifts - mean_shifts * is_above_noise[..., None])
+        centroid_displacements = (
             noise.distance(self.smoothing.T @ centroid_derivative),
             np.linalg.norm(independent_deviations[:, None] * self._sum_over_cells(centroid_shifts)),
         )
-        column, row = contour.T
-        change = region[is_inside]
-        integral = float(self.raster.pixel_area * change.sum())
+        contour_columns, contour_rows = contour.T
+        contact_changes = region_changes[is_inside_contour]
+        contact_integral = float(self.raster.pixel_area * contact_changes.sum())
         return Contact(
-            centroid, area, float(change.max()), integral, pixel_centres[row, column], float(np.hypot(*displacements))
+            centroid,
+            contact_area,
+            float(contact_changes.max()),
+            contact_integral,
+            pixel_centres[contour_rows, contour_columns],
+            float(np.hypot(*centroid_displacements)),
         )
 
-    def _sum_over_cells(self, values: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "m 2"]:
+    def _sum_over_cells(self, pixel_pairs: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "m 2"]:
         """Sum values of pixels over the pixels of each cell."""
         cell_indices = np.asarray(self.raster.cell)
-        pixel_cells, pixel_values = cell_indices[cell_indices >= 0], values[cell_indices >= 0].T
+        pixel_cells, pixel_values = cell_indices[cell_indices >= 0], pixel_pairs[cell_indices >= 0].T
         return np.stack(
             [np.bincount(pixel_cells, component_values, minlength=self.num_cells) for component_values in pixel_values],
             axis=-1,
@@ -245,10 +271,15 @@ class RasterFinder(AbstractFinder):
         """
         num_pixels = np.bincount(cell_indices, minlength=self.num_cells)
         mean_excess = np.bincount(cell_indices, pixel_excess, minlength=self.num_cells) / np.maximum(num_pixels, 1)
-        deviation = np.maximum(noise.smoothed(self.smoothing), np.finfo(float).tiny)
-        normalised_excess = mean_excess / deviation
-        probability, density = ndtr(normalised_excess), np.exp(-(normalised_excess**2) / 2) / np.sqrt(2 * np.pi)
-        return density / deviation, np.sqrt(np.maximum(probability * (1 - probability) - density**2, 0.0))
+        cell_deviations = np.maximum(noise.smoothed(self.smoothing), np.finfo(float).tiny)
+        normalised_excess = mean_excess / cell_deviations
+        membership_probability, normal_density = (
+            ndtr(normalised_excess),
+            np.exp(-(normalised_excess**2) / 2) / np.sqrt(2 * np.pi),
+        )
+        return normal_density / cell_deviations, np.sqrt(
+            np.maximum(membership_probability * (1 - membership_probability) - normal_density**2, 0.0)
+        )
 
 
 def _import_opencv() -> Any:

@@ -71,8 +71,10 @@ class _TrackedTouch(Module):
     def path(self) -> TouchPath:
         """Return the path of the touch until the last frame."""
         times, contacts = zip(*self.observations, strict=True)
-        columns = ([getattr(contact, name) for contact in contacts] for name in ("centroid", "peak", "area"))
-        return TouchPath(self.number, np.array(times), *map(np.array, columns))
+        contact_fields = (
+            [getattr(contact, field_name) for contact in contacts] for field_name in ("centroid", "peak", "area")
+        )
+        return TouchPath(self.number, np.array(times), *map(np.array, contact_fields))
 
 
 class ContactTracker(Module):
@@ -129,60 +131,70 @@ class ContactTracker(Module):
         if not (is_number(time) and time > self.time):
             raise ValueError(f"time must be later than the frame before, {self.time:g} s; it is {describe(time)}.")
         check_kind("contacts", contacts, (list, tuple, np.ndarray), "a list of them, those of one frame")
-        for number, contact in enumerate(contacts):
-            check_kind(f"contacts[{number}]", contact, Contact, "a Contact, as of find_contacts")
-        interval = time - self.time
+        for checked_index, contact in enumerate(contacts):
+            check_kind(f"contacts[{checked_index}]", contact, Contact, "a Contact, as of find_contacts")
+        frame_interval = time - self.time
         # The interval between frames is added, up to the gap, so that a single missing frame of a slow stream is
         # bridged too.
-        tolerance = min(interval, self.gap)
+        gap_tolerance = min(frame_interval, self.gap)
         has_ended = [
-            time - touch.observations[-1][0] > self.gap * (_MAX_HIDDEN_GAPS if touch.is_hidden else 1) + tolerance
+            time - touch.observations[-1][0] > self.gap * (_MAX_HIDDEN_GAPS if touch.is_hidden else 1) + gap_tolerance
             for touch in self.open
         ]
         ended_touches = [touch for touch, is_ended in zip(self.open, has_ended, strict=True) if is_ended]
         current_touches = [touch for touch, is_ended in zip(self.open, has_ended, strict=True) if not is_ended]
         predicted_positions = np.array([touch.predicted_position(time) for touch in current_touches])
         contact_positions = np.array([contact.centroid for contact in contacts])
-        distances = np.linalg.norm(predicted_positions.reshape(-1, 1, 2) - contact_positions.reshape(1, -1, 2), axis=-1)
-        max_distance = self.reach + self.fastest * interval if current_touches else 0.0
+        touch_contact_distances = np.linalg.norm(
+            predicted_positions.reshape(-1, 1, 2) - contact_positions.reshape(1, -1, 2), axis=-1
+        )
+        max_distance = self.reach + self.fastest * frame_interval if current_touches else 0.0
         # Every pair of a touch and a contact beyond the maximum distance has the same large cost, so that pairs within
         # this distance are preferred.
-        rows, columns = linear_sum_assignment(np.where(distances <= max_distance, distances, 1e3 * max_distance))
+        touch_indices, assigned_indices = linear_sum_assignment(
+            np.where(touch_contact_distances <= max_distance, touch_contact_distances, 1e3 * max_distance)
+        )
         # Index of the contact that is assigned to each touch, by the index of the touch.
         assigned_contacts = {
-            int(row): int(column)
-            for row, column in zip(rows, columns, strict=True)
-            if distances[row, column] <= max_distance
+            int(touch_index): int(contact_number)
+            for touch_index, contact_number in zip(touch_indices, assigned_indices, strict=True)
+            if touch_contact_distances[touch_index, contact_number] <= max_distance
         }
         max_hiding_distances = self.reach + np.sqrt(np.array([contact.area for contact in contacts]) / np.pi)
-        unassigned_touches = [row for row in range(len(current_touches)) if row not in assigned_contacts]
+        unassigned_touches = [
+            touch_index for touch_index in range(len(current_touches)) if touch_index not in assigned_contacts
+        ]
         hidden_touches = {
-            row
-            for row in unassigned_touches
-            for column in assigned_contacts.values()
-            if distances[row, column] <= max_hiding_distances[column]
+            touch_index
+            for touch_index in unassigned_touches
+            for contact_number in assigned_contacts.values()
+            if touch_contact_distances[touch_index, contact_number] <= max_hiding_distances[contact_number]
         }
         updated_touches = [
-            _update_touch(touch, time, contacts[assigned_contacts[row]])
-            if row in assigned_contacts
+            _update_touch(touch, time, contacts[assigned_contacts[touch_index]])
+            if touch_index in assigned_contacts
             else _TrackedTouch(
                 touch.number,
                 time,
                 touch.predicted_position(time),
                 touch.velocity,
                 touch.observations,
-                row in hidden_touches,
+                touch_index in hidden_touches,
             )
-            for row, touch in enumerate(current_touches)
+            for touch_index, touch in enumerate(current_touches)
         ]
-        new_contacts = [contacts[column] for column in range(len(contacts)) if column not in assigned_contacts.values()]
+        new_contacts = [
+            contacts[contact_number]
+            for contact_number in range(len(contacts))
+            if contact_number not in assigned_contacts.values()
+        ]
         new_touches = [
             _TrackedTouch(self.number + contact_index, time, contact.centroid, np.zeros(2), ((time, contact),))
             for contact_index, contact in enumerate(new_contacts)
         ]
         closed_touches = self.closed + self._finished_paths(ended_touches)
-        values = (time, (*updated_touches, *new_touches), closed_touches, self.number + len(new_contacts))
-        return ContactTracker(self.gap, self.reach, self.fastest, self.least, *values)
+        tracker_fields = (time, (*updated_touches, *new_touches), closed_touches, self.number + len(new_contacts))
+        return ContactTracker(self.gap, self.reach, self.fastest, self.least, *tracker_fields)
 
     @property
     def touches(self) -> list[TouchPath]:
@@ -213,8 +225,8 @@ def track_contacts(
     print([path.position for path in paths])
     ```
     """
-    requirement = "a list with those of every frame, each a list"
-    check_kind("contacts", contacts, (list, tuple, np.ndarray), requirement)
+    requirement_text = "a list with those of every frame, each a list"
+    check_kind("contacts", contacts, (list, tuple, np.ndarray), requirement_text)
     for frame_index, frame_contacts in enumerate(contacts):
         check_kind(
             f"contacts[{frame_index}]",
@@ -239,8 +251,12 @@ def remove_side_lobes(touches: list[TouchPath], weakest: float) -> list[TouchPat
     """
 
     def find_max_simultaneous_peak(touch: TouchPath) -> float:
-        simultaneous_touches = [one for one in touches if one.onset <= touch.offset and touch.onset <= one.offset]
-        return max(float(np.abs(one.peak).max()) for one in simultaneous_touches)
+        simultaneous_touches = [
+            other_touch
+            for other_touch in touches
+            if other_touch.onset <= touch.offset and touch.onset <= other_touch.offset
+        ]
+        return max(float(np.abs(other_touch.peak).max()) for other_touch in simultaneous_touches)
 
     return [touch for touch in touches if np.abs(touch.peak).max() >= weakest * find_max_simultaneous_peak(touch)]
 

@@ -23,12 +23,16 @@ FEATURES = {
 """Names of the seven features of a touch, and their units; "image" stands for the unit of the images."""
 
 # Number of instants, evenly spaced from onset to end of a touch, at which the maximum change P is sampled.
-_NUM_INSTANTS = 16
+_NUM_COURSE_INSTANTS = 16
 _ADDITIONAL_FEATURES = (
     "area", "area spread", "path length", "farthest", "speed", "fastest", "straightness", "peaks", "rise", "decay",
     "roughness", "pauses", "centre of gravity", "breadth",
 )  # fmt: skip
-COURSE_FEATURES = (*FEATURES, *_ADDITIONAL_FEATURES, *(f"course {instant + 1}" for instant in range(_NUM_INSTANTS)))
+COURSE_FEATURES = (
+    *FEATURES,
+    *_ADDITIONAL_FEATURES,
+    *(f"course {instant + 1}" for instant in range(_NUM_COURSE_INSTANTS)),
+)
 """Names of the features of `course_features`: the seven features, further features of the time course, and samples of
 P."""
 
@@ -81,10 +85,10 @@ def touch_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> Touc
     ```
     """
     time_courses = _time_courses(touches)
-    values = np.array([_seven_features(time_course) for time_course in time_courses]).reshape(
+    feature_values = np.array([_seven_features(time_course) for time_course in time_courses]).reshape(
         len(time_courses), len(FEATURES)
     )
-    return TouchFeatures(values, tuple(FEATURES), tuple(FEATURES.values()))
+    return TouchFeatures(feature_values, tuple(FEATURES), tuple(FEATURES.values()))
 
 
 def course_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> TouchFeatures:
@@ -100,11 +104,29 @@ def course_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> Tou
     """
     time_courses = _time_courses(touches)
     seven_features = touch_features(touches)
-    values = np.array([_additional_features(time_course) for time_course in time_courses]).reshape(
-        len(time_courses), len(_ADDITIONAL_FEATURES) + _NUM_INSTANTS
+    feature_values = np.array([_additional_features(time_course) for time_course in time_courses]).reshape(
+        len(time_courses), len(_ADDITIONAL_FEATURES) + _NUM_COURSE_INSTANTS
     )
-    units = ("m²", "1", "m", "m", "m/s", "m/s", "1", "1", "s", "s", "1", "1", "1", "1", *["1"] * _NUM_INSTANTS)
-    return TouchFeatures(np.hstack([seven_features.values, values]), COURSE_FEATURES, (*seven_features.units, *units))
+    feature_units = (
+        "m²",
+        "1",
+        "m",
+        "m",
+        "m/s",
+        "m/s",
+        "1",
+        "1",
+        "s",
+        "s",
+        "1",
+        "1",
+        "1",
+        "1",
+        *["1"] * _NUM_COURSE_INSTANTS,
+    )
+    return TouchFeatures(
+        np.hstack([seven_features.values, feature_values]), COURSE_FEATURES, (*seven_features.units, *feature_units)
+    )
 
 
 def sequence_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> TouchFeatures:
@@ -119,11 +141,13 @@ def sequence_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> T
     time_courses = _time_courses(touches)
     course_values = course_features(touches)
     num_columns = NUM_SEQUENCE_INSTANTS * len(SEQUENCE_VALUES)
-    values = np.array([_sample_time_course(time_course).ravel() for time_course in time_courses]).reshape(
+    sampled_values = np.array([_sample_time_course(time_course).ravel() for time_course in time_courses]).reshape(
         len(time_courses), num_columns
     )
-    units = ("image", "1", "image", "m²", "1", "m/s", "m", "m") * NUM_SEQUENCE_INSTANTS
-    return TouchFeatures(np.hstack([course_values.values, values]), SEQUENCE_FEATURES, (*course_values.units, *units))
+    sampled_units = ("image", "1", "image", "m²", "1", "m/s", "m", "m") * NUM_SEQUENCE_INSTANTS
+    return TouchFeatures(
+        np.hstack([course_values.values, sampled_values]), SEQUENCE_FEATURES, (*course_values.units, *sampled_units)
+    )
 
 
 def _time_courses(touches) -> list[ChangeCourse]:
@@ -136,15 +160,15 @@ def _time_courses(touches) -> list[ChangeCourse]:
 def _seven_features(time_course: ChangeCourse) -> list[float]:
     """Compute the seven features of one touch from its time course, in the order of `FEATURES`."""
     peak_frame = int(time_course.peak.argmax())
-    intervals = np.diff(time_course.seconds)
-    rate = np.mean(np.abs(np.diff(time_course.peak)) / intervals) if intervals.size else 0.0
+    frame_intervals = np.diff(time_course.seconds)
+    mean_rate_of_change = np.mean(np.abs(np.diff(time_course.peak)) / frame_intervals) if frame_intervals.size else 0.0
     return [
         time_course.peak[peak_frame],
         time_course.least.min(),
         time_course.half_share[peak_frame],
         time_course.mean[peak_frame],
         time_course.seconds[-1] - time_course.seconds[0],
-        float(rate),
+        float(mean_rate_of_change),
         float(np.linalg.norm(time_course.centroid[-1] - time_course.centroid[0])),
     ]
 
@@ -152,69 +176,69 @@ def _seven_features(time_course: ChangeCourse) -> list[float]:
 def _additional_features(time_course: ChangeCourse) -> list[float]:
     """Compute the features of one touch that follow the first seven in `COURSE_FEATURES`, in this order."""
     has_centroid = np.isfinite(time_course.centroid[:, 0])  # a frame below the level has no centroid
-    centroids, seconds = time_course.centroid[has_centroid], time_course.seconds[has_centroid]
-    steps = np.linalg.norm(np.diff(centroids, axis=0), axis=1)
-    path_length, displacement = float(steps.sum()), float(np.linalg.norm(centroids[-1] - centroids[0]))
+    centroids, centroid_times = time_course.centroid[has_centroid], time_course.seconds[has_centroid]
+    step_lengths = np.linalg.norm(np.diff(centroids, axis=0), axis=1)
+    path_length, displacement = float(step_lengths.sum()), float(np.linalg.norm(centroids[-1] - centroids[0]))
     duration = max(time_course.seconds[-1] - time_course.seconds[0], 1e-9)
-    speeds = steps / np.diff(seconds) if steps.size else np.zeros(1)
+    centroid_speeds = step_lengths / np.diff(centroid_times) if step_lengths.size else np.zeros(1)
     relative_peaks = time_course.peak / time_course.peak.max()
     peak_frame = int(relative_peaks.argmax())
     relative_times = (time_course.seconds - time_course.seconds[0]) / duration
-    weights = relative_peaks / relative_peaks.sum()
-    mean_time = float(weights @ relative_times)
-    differences = np.diff(relative_peaks)
-    peak_frames = np.flatnonzero((differences[:-1] > 0) & (differences[1:] <= 0)) + 1
+    peak_weights = relative_peaks / relative_peaks.sum()
+    mean_time = float(peak_weights @ relative_times)
+    peak_differences = np.diff(relative_peaks)
+    peak_frames = np.flatnonzero((peak_differences[:-1] > 0) & (peak_differences[1:] <= 0)) + 1
     return [
         float(time_course.area[has_centroid].mean()),
         float(time_course.area[has_centroid].std() / time_course.area[has_centroid].mean()),
         path_length,
         float(np.linalg.norm(centroids - centroids[0], axis=1).max()),
         path_length / duration,
-        float(np.quantile(speeds, 0.9)),
+        float(np.quantile(centroid_speeds, 0.9)),
         displacement / max(path_length, 1e-9),
         float(max(np.count_nonzero(relative_peaks[peak_frames] > 0.5), 1)),
         float(time_course.seconds[peak_frame] - time_course.seconds[0]),
         float(time_course.seconds[-1] - time_course.seconds[peak_frame]),
-        float(np.abs(differences).sum()),
+        float(np.abs(peak_differences).sum()),
         float(np.mean(relative_peaks < 0.5)),
         mean_time,
-        float(np.sqrt(weights @ (relative_times - mean_time) ** 2)),
-        *np.interp(np.linspace(0, 1, _NUM_INSTANTS), relative_times, relative_peaks),
+        float(np.sqrt(peak_weights @ (relative_times - mean_time) ** 2)),
+        *np.interp(np.linspace(0, 1, _NUM_COURSE_INSTANTS), relative_times, relative_peaks),
     ]
 
 
 def _sample_time_course(time_course: ChangeCourse) -> Float[np.ndarray, "T c"]:
     """Sample the quantities `SEQUENCE_VALUES` at `NUM_SEQUENCE_INSTANTS` instants of a touch."""
-    seconds = time_course.seconds
-    sample_times = np.linspace(seconds[0], seconds[-1], NUM_SEQUENCE_INSTANTS)
+    frame_times = time_course.seconds
+    sample_times = np.linspace(frame_times[0], frame_times[-1], NUM_SEQUENCE_INSTANTS)
     has_centroid = np.isfinite(time_course.centroid[:, 0])  # a frame below the level has no centroid
     centroids = np.stack(
         [
-            np.interp(sample_times, seconds[has_centroid], coordinate[has_centroid])
-            for coordinate in time_course.centroid.T
+            np.interp(sample_times, frame_times[has_centroid], centroid_coordinate[has_centroid])
+            for centroid_coordinate in time_course.centroid.T
         ],
         axis=1,
     )
-    steps = np.linalg.norm(np.diff(centroids, axis=0, prepend=centroids[:1]), axis=1)
-    speed = steps / max((seconds[-1] - seconds[0]) / (NUM_SEQUENCE_INSTANTS - 1), 1e-9)
+    step_lengths = np.linalg.norm(np.diff(centroids, axis=0, prepend=centroids[:1]), axis=1)
+    centroid_speed = step_lengths / max((frame_times[-1] - frame_times[0]) / (NUM_SEQUENCE_INSTANTS - 1), 1e-9)
     centred_path = centroids - centroids.mean(axis=0)
     positions_on_axis = centred_path @ np.linalg.svd(centred_path, full_matrices=False)[2][0]
     positions_on_axis = positions_on_axis - positions_on_axis[0]
     largest_displacement = positions_on_axis[np.abs(positions_on_axis).argmax()]
-    change, mean, area, half_peak_share = (
-        np.interp(sample_times, seconds, values)
-        for values in (time_course.peak, time_course.mean, time_course.area, time_course.half_share)
+    peak_change, mean_change, contact_area, half_peak_share = (
+        np.interp(sample_times, frame_times, course_values)
+        for course_values in (time_course.peak, time_course.mean, time_course.area, time_course.half_share)
     )
-    distance = np.linalg.norm(centroids - centroids[0], axis=1)
+    distance_from_onset = np.linalg.norm(centroids - centroids[0], axis=1)
     return np.stack(
         [
-            change,
-            change / time_course.peak.max(),
-            mean,
-            area,
+            peak_change,
+            peak_change / time_course.peak.max(),
+            mean_change,
+            contact_area,
             half_peak_share,
-            speed,
-            distance,
+            centroid_speed,
+            distance_from_onset,
             np.sign(largest_displacement) * positions_on_axis,
         ],
         axis=1,

@@ -72,11 +72,13 @@ class Scale:
     @classmethod
     def from_features(cls, values: Float[np.ndarray, "n k"]) -> "Scale":
         """Estimate the transform from features (n, k); `size` is the median of |x|. Constant features become zero."""
-        size = np.median(np.abs(values), axis=0)
-        size = np.where(size > 0, size, np.maximum(np.abs(values).max(axis=0), 1e-300))
-        log_values = np.sign(values) * np.log1p(np.abs(values) / size)
-        deviation = log_values.std(axis=0)
-        return cls(size, log_values.mean(axis=0), np.where(deviation > 1e-12, deviation, 1.0))
+        median_magnitudes = np.median(np.abs(values), axis=0)
+        median_magnitudes = np.where(
+            median_magnitudes > 0, median_magnitudes, np.maximum(np.abs(values).max(axis=0), 1e-300)
+        )
+        log_values = np.sign(values) * np.log1p(np.abs(values) / median_magnitudes)
+        log_deviations = log_values.std(axis=0)
+        return cls(median_magnitudes, log_values.mean(axis=0), np.where(log_deviations > 1e-12, log_deviations, 1.0))
 
     def __call__(self, values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
         """Transform features (n, k) to the common scale."""
@@ -93,20 +95,22 @@ def held_out_odds(
     touch. The log-odds are computed by `log_odds`; they are −1000 for a class that occurs in no other fold. Raises
     `ValueError` if the other folds contain only one class.
     """
-    odds = np.full((len(true_classes), true_classes.max() + 1), -1e3)
+    class_log_odds = np.full((len(true_classes), true_classes.max() + 1), -1e3)
 
-    def predict(fold: int) -> None:
+    def predict_fold(fold: int) -> None:
         is_held_out = folds == fold
         if len(np.unique(true_classes[~is_held_out])) < 2:
             raise ValueError(
                 "labels: without the touches of one fold, or person, only one gesture remains; give touches of more."
             )
-        scale = Scale.from_features(features[~is_held_out])
-        model = GESTURE_CLASSIFIERS[method](scale(features[~is_held_out]), true_classes[~is_held_out])
-        odds[np.ix_(is_held_out, model.classes_)] = log_odds(model, scale(features[is_held_out]))
+        feature_scale = Scale.from_features(features[~is_held_out])
+        fold_classifier = GESTURE_CLASSIFIERS[method](feature_scale(features[~is_held_out]), true_classes[~is_held_out])
+        class_log_odds[np.ix_(is_held_out, fold_classifier.classes_)] = log_odds(
+            fold_classifier, feature_scale(features[is_held_out])
+        )
 
-    apply_over_folds(predict, int(folds.max()) + 1)
-    return odds
+    apply_over_folds(predict_fold, int(folds.max()) + 1)
+    return class_log_odds
 
 
 def random_folds(true_classes: np.ndarray, num_folds: int, seed: int = 0) -> Int[np.ndarray, " n"]:

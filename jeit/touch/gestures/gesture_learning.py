@@ -67,20 +67,22 @@ def learn_gestures(
     ```
     """
     check_kind("recordings", recordings, GestureSet, "a GestureSet, as of GestureSet.read(path)")
-    report = progress or (lambda message: None)
+    report_progress = progress or (lambda message: None)
     check_name("method", method, METHODS)
     check_labels(recordings.gesture)
-    images = TouchImages.prepare(description, recordings.reference[None], progress=report)
-    untouched_changes = images.changes(recordings.untouched)
-    level, sign = _touch_level_and_sign(images, untouched_changes, recordings)
+    touch_images = TouchImages.prepare(description, recordings.reference[None], progress=report_progress)
+    untouched_changes = touch_images.changes(recordings.untouched)
+    touch_level, touch_sign = _touch_level_and_sign(touch_images, untouched_changes, recordings)
     touches: list[StreamTouch] = []
     indices_with_touch, indices_without_touch = [], []
-    for recording_index, (seconds, changes) in enumerate(
-        _times_and_changes(images, recordings, range(len(recordings)))
+    for recording_index, (frame_times, recording_changes) in enumerate(
+        _times_and_changes(touch_images, recordings, range(len(recordings)))
     ):
         if recording_index % 50 == 0:
-            report(f"images: recording {recording_index} of {len(recordings)}")
-        recording_touches = find_touches(level, seconds, sign * changes) if len(seconds) else []
+            report_progress(f"images: recording {recording_index} of {len(recordings)}")
+        recording_touches = (
+            find_touches(touch_level, frame_times, touch_sign * recording_changes) if len(frame_times) else []
+        )
         if recording_touches:
             touches.append(max(recording_touches, key=lambda touch: touch.offset - touch.onset))
             indices_with_touch.append(recording_index)
@@ -91,47 +93,59 @@ def learn_gestures(
             f"recordings: {len(indices_without_touch)} of {len(recordings)} have no touch that exceeds the untouched "
             "skin's noise and drift; touch more firmly, or record the untouched skin just before."
         )
-    rate = 1 / float(
+    frame_rate = 1 / float(
         np.median([np.median(np.diff(touch.course.seconds)) for touch in touches if len(touch.course) > 1])
     )
-    protocol = images.calibration.model.protocol
-    model = GestureModel.fit(
+    protocol = touch_images.calibration.model.protocol
+    gesture_model = GestureModel.fit(
         touches,
         recordings.gesture[indices_with_touch],
         people=recordings.person[indices_with_touch],
         method=method,
         form=form,
-        reading=Reading(level.level, images.background, sign, rate, images.num_channels, protocol.name),
+        reading=Reading(
+            touch_level.level, touch_images.background, touch_sign, frame_rate, touch_images.num_channels, protocol.name
+        ),
         notes=(f"{counted(len(indices_without_touch), 'recording')} without a touch left out.",)
         if indices_without_touch
         else (),
-        progress=report,
+        progress=report_progress,
     )
-    return LearntGestures(model, images, tuple(indices_without_touch))
+    return LearntGestures(gesture_model, touch_images, tuple(indices_without_touch))
 
 
-def _touch_level_and_sign(images: TouchImages, untouched: np.ndarray, recordings: GestureSet) -> tuple[TouchLevel, int]:
+def _touch_level_and_sign(
+    images: TouchImages, untouched_changes: np.ndarray, recordings: GestureSet
+) -> tuple[TouchLevel, int]:
     """Determine the level of change above which the skin is touched, and the sign of touches: the sign for which
     touches exceed the level by the larger factor."""
-    indices = np.unique(np.linspace(0, len(recordings) - 1, min(_MAX_RECORDINGS_FOR_SIGN, len(recordings))).astype(int))
-    changes_of_recordings = [changes for _, changes in _times_and_changes(images, recordings, indices.tolist())]
-    candidates = []
-    for sign in (1, -1):
-        level = TouchLevel.of_untouched(images.mesh, sign * untouched)
-        signed_ratios = [
-            np.nanmax(sign * changes) / level.level for changes in changes_of_recordings if np.isfinite(changes).any()
+    recording_indices = np.unique(
+        np.linspace(0, len(recordings) - 1, min(_MAX_RECORDINGS_FOR_SIGN, len(recordings))).astype(int)
+    )
+    changes_of_recordings = [
+        recording_changes for _, recording_changes in _times_and_changes(images, recordings, recording_indices.tolist())
+    ]
+    sign_candidates = []
+    for touch_sign in (1, -1):
+        touch_level = TouchLevel.of_untouched(images.mesh, touch_sign * untouched_changes)
+        peak_to_level_ratios = [
+            np.nanmax(touch_sign * recording_changes) / touch_level.level
+            for recording_changes in changes_of_recordings
+            if np.isfinite(recording_changes).any()
         ]
-        candidates.append((float(np.median(signed_ratios)) if signed_ratios else 0.0, level, sign))
-    return max(candidates, key=lambda candidate: candidate[0])[1:]
+        sign_candidates.append(
+            (float(np.median(peak_to_level_ratios)) if peak_to_level_ratios else 0.0, touch_level, touch_sign)
+        )
+    return max(sign_candidates, key=lambda sign_candidate: sign_candidate[0])[1:]
 
 
 def _times_and_changes(
-    images: TouchImages, recordings: GestureSet, indices: Sequence[int]
+    images: TouchImages, recordings: GestureSet, recording_indices: Sequence[int]
 ) -> Iterator[tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T m"]]]:
-    """Yield the times (T,) and images of change (T, m) of each recording in `indices`, imaged as one stream."""
-    frames = (frame for recording_index in indices for frame in recordings.recording(recording_index)[1])
-    stream = images.stream(frames)
-    for recording_index in indices:
-        seconds, _ = recordings.recording(recording_index)
-        changes = [change for _, change in islice(stream, len(seconds))]
-        yield seconds, np.array(changes).reshape(len(seconds), images.mesh.num_cells)
+    """Yield the times (T,) and images of change (T, m) of the recordings `recording_indices`, imaged as one stream."""
+    frames = (frame for recording_index in recording_indices for frame in recordings.recording(recording_index)[1])
+    change_stream = images.stream(frames)
+    for recording_index in recording_indices:
+        frame_times, _ = recordings.recording(recording_index)
+        recording_changes = [change for _, change in islice(change_stream, len(frame_times))]
+        yield frame_times, np.array(recording_changes).reshape(len(frame_times), images.mesh.num_cells)

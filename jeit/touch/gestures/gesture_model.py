@@ -79,10 +79,11 @@ class Reading:
                 f"gestures were learnt from a skin driven by '{self.protocol}', and this one is by '{protocol}': learn "
                 "them on this skin."
             )
-        ratio = background / self.background
-        if not 1 / _MIN_CONDUCTIVITY_RATIO < ratio < _MIN_CONDUCTIVITY_RATIO:
+        conductivity_ratio = background / self.background
+        if not 1 / _MIN_CONDUCTIVITY_RATIO < conductivity_ratio < _MIN_CONDUCTIVITY_RATIO:
             raise ValueError(
-                f"the untouched skin has {ratio:.3g} times the conductivity of that which gestures were learnt on: is "
+                f"the untouched skin has {conductivity_ratio:.3g} times the conductivity of that which gestures "
+                "were learnt on: is "
                 "it the same, and are voltages in the unit and at the current that its description says?"
             )
 
@@ -91,9 +92,9 @@ METHODS = ("auto", *GESTURE_CLASSIFIERS)
 # Maximum number of folds of the cross-validation of classifiers.
 _MAX_FOLDS = 10
 # Fraction of held-out touches that are accepted as similar to the training set.
-_SIMILARITY_QUANTILE = 0.99
+_KNOWN_DISTANCE_QUANTILE = 0.99
 # Number of touches whose distances from the training set are computed at once.
-_CHUNK_SIZE = 1000
+_NUM_CHUNK_ROWS = 1000
 GESTURE_FILE = "gestures.skops"
 """Name of the model's file in the output folder of `jeit touch gestures`."""
 _FILE_KIND, _FILE_VERSION = "a jeit gesture model", 3
@@ -184,13 +185,13 @@ class GestureModel:
         names, class_indices = np.unique(label_array, return_inverse=True)
         model_notes = list(notes)
         if people_array is not None and len(np.unique(people_array)) > 1:
-            folds = person_folds(people_array, _MAX_FOLDS)
+            touch_folds = person_folds(people_array, _MAX_FOLDS)
         else:
-            folds = random_folds(class_indices, _MAX_FOLDS)
+            touch_folds = random_folds(class_indices, _MAX_FOLDS)
             model_notes.append("one person, or nobody, is named: chosen on touches held out at random, not on people.")
-        results = []
+        candidate_results = []
         for feature_form in FEATURE_FORMS:
-            values = FEATURE_FORMS[feature_form](touches).values
+            feature_values = FEATURE_FORMS[feature_form](touches).values
             for name in GESTURE_CLASSIFIERS:
                 if (
                     method not in ("auto", name)
@@ -200,28 +201,37 @@ class GestureModel:
                     continue
                 if progress is not None:
                     progress(f"{name} on {feature_form}")
-                odds = held_out_odds(name, values, class_indices, folds)
-                results.append((float(np.mean(odds.argmax(axis=1) != class_indices)), name, feature_form, odds))
-        if not results:
+                held_out_log_odds = held_out_odds(name, feature_values, class_indices, touch_folds)
+                candidate_results.append(
+                    (
+                        float(np.mean(held_out_log_odds.argmax(axis=1) != class_indices)),
+                        name,
+                        feature_form,
+                        held_out_log_odds,
+                    )
+                )
+        if not candidate_results:
             raise ValueError(f"form: '{method}' takes {' or '.join(feature_forms(method))}; '{form}' was requested.")
-        results.sort(key=lambda result: result[0])
-        _, chosen_method, feature_form, odds = results[0]
-        values, course_values = FEATURE_FORMS[feature_form](touches).values, course_features(touches).values
-        method_errors = [(f"{name} on {feature_form}", error) for error, name, feature_form, _ in results]
-        scale, known_scale = Scale.from_features(values), Scale.from_features(course_values)
+        candidate_results.sort(key=lambda candidate_result: candidate_result[0])
+        _, chosen_method, feature_form, held_out_log_odds = candidate_results[0]
+        feature_values, course_values = FEATURE_FORMS[feature_form](touches).values, course_features(touches).values
+        method_errors = [
+            (f"{name} on {feature_form}", error_rate) for error_rate, name, feature_form, _ in candidate_results
+        ]
+        feature_scale, known_scale = Scale.from_features(feature_values), Scale.from_features(course_values)
         scaled_courses = known_scale(course_values)
         return cls(
             names=tuple(str(name) for name in names),
             method=chosen_method,
             form=feature_form,
-            scale=scale,
-            model=GESTURE_CLASSIFIERS[chosen_method](scale(values), class_indices),
-            sharpness=fit_sharpness(odds, class_indices),
+            scale=feature_scale,
+            model=GESTURE_CLASSIFIERS[chosen_method](feature_scale(feature_values), class_indices),
+            sharpness=fit_sharpness(held_out_log_odds, class_indices),
             known=scaled_courses,
             known_scale=known_scale,
-            farthest=_max_held_out_distance(scaled_courses, folds),
+            farthest=_max_held_out_distance(scaled_courses, touch_folds),
             reading=reading,
-            standing=Standing(method_errors[0][0], method_errors, names[odds.argmax(axis=1)], label_array),
+            standing=Standing(method_errors[0][0], method_errors, names[held_out_log_odds.argmax(axis=1)], label_array),
             notes=tuple(model_notes),
         )
 
@@ -231,8 +241,8 @@ class GestureModel:
         Predictions are less certain for touches that are cut off, because only a part of the touch is known. Raises
         `ValueError` if `touches` is not a list of touches.
         """
-        values = FEATURE_FORMS[self.form](touches).values
-        if not len(values):
+        feature_values = FEATURE_FORMS[self.form](touches).values
+        if not len(feature_values):
             no_values = np.empty(0)
             return Gestures(
                 no_values.astype(str),
@@ -241,13 +251,17 @@ class GestureModel:
                 self.names,
                 no_values.astype(bool),
             )
-        odds = np.full((len(values), len(self.names)), -1e3)
-        odds[:, self.model.classes_] = log_odds(self.model, self.scale(values))
-        class_probabilities = probabilities(odds, self.sharpness)
-        distances = _nearest_distance(self.known, self.known_scale(course_features(touches).values))
+        class_log_odds = np.full((len(feature_values), len(self.names)), -1e3)
+        class_log_odds[:, self.model.classes_] = log_odds(self.model, self.scale(feature_values))
+        class_probabilities = probabilities(class_log_odds, self.sharpness)
+        distances_from_known = _nearest_distance(self.known, self.known_scale(course_features(touches).values))
         gestures = np.array(self.names)[class_probabilities.argmax(axis=1)]
         return Gestures(
-            gestures, class_probabilities.max(axis=1), class_probabilities, self.names, distances > self.farthest
+            gestures,
+            class_probabilities.max(axis=1),
+            class_probabilities,
+            self.names,
+            distances_from_known > self.farthest,
         )
 
     def write(self, path: str | Path) -> None:
@@ -269,7 +283,7 @@ class GestureModel:
         if not path.is_file():
             raise FileNotFoundError(f"'{path}': there is no such file; `jeit touch gestures` makes one.")
 
-        def make(field_values: dict[str, Any]) -> "GestureModel":
+        def make_model(field_values: dict[str, Any]) -> "GestureModel":
             converted_values: dict[str, Any] = {name: Scale(**field_values[name]) for name in ("scale", "known_scale")}
             converted_values["reading"] = (
                 None if field_values["reading"] is None else Reading(**field_values["reading"])
@@ -281,7 +295,7 @@ class GestureModel:
             )
             return cls(**all_values)
 
-        return read_fields(path, _FILE_KIND, _FILE_VERSION, "gesture model", make)
+        return read_fields(path, _FILE_KIND, _FILE_VERSION, "gesture model", make_model)
 
 
 def _check_labels_and_people(touches, labels, people) -> tuple[np.ndarray, np.ndarray | None]:
@@ -304,26 +318,30 @@ def check_labels(labels: np.ndarray) -> None:
 
     Raises `ValueError` if a name is empty, if there are fewer than two gestures, or if a gesture occurs only once.
     """
-    names, count = np.unique(labels, return_counts=True)
-    if any(not str(name).strip() for name in names):
+    gesture_names, touch_counts = np.unique(labels, return_counts=True)
+    if any(not str(name).strip() for name in gesture_names):
         raise ValueError("labels: some are empty; give every touch the name of a gesture.")
-    if len(names) < 2:
+    if len(gesture_names) < 2:
         raise ValueError("labels: give touches of two gestures, or more.")
-    if count.min() < 2:
-        raise ValueError(f"labels: there is only one touch of '{names[count.argmin()]}'; give two of each, or more.")
+    if touch_counts.min() < 2:
+        raise ValueError(
+            f"labels: there is only one touch of '{gesture_names[touch_counts.argmin()]}'; give two of each, or more."
+        )
 
 
 def _nearest_distance(training_features: np.ndarray, features: np.ndarray) -> Float[np.ndarray, " n"]:
     """Compute the distance (n,) of each row of `features` (n, k) from the nearest row of `training_features` (N, k)."""
     from scipy.spatial.distance import cdist
 
-    return apply_in_parts(lambda rows: cdist(rows, training_features).min(axis=1), features, _CHUNK_SIZE)
+    return apply_in_parts(
+        lambda feature_rows: cdist(feature_rows, training_features).min(axis=1), features, _NUM_CHUNK_ROWS
+    )
 
 
 def _max_held_out_distance(training_features: Float[np.ndarray, "N k"], folds: Int[np.ndarray, " N"]) -> float:
     """Compute the 99 % quantile of the distance of a fold's touches from the nearest touch of the other folds."""
-    distances = [
+    held_out_distances = [
         _nearest_distance(training_features[folds != fold_index], training_features[folds == fold_index])
         for fold_index in np.unique(folds)
     ]
-    return float(np.quantile(np.concatenate(distances), _SIMILARITY_QUANTILE))
+    return float(np.quantile(np.concatenate(held_out_distances), _KNOWN_DISTANCE_QUANTILE))

@@ -17,7 +17,7 @@ from jeit.arguments import describe
 
 # Maximum magnitude of the responses z (Friedman et al. 2000, section 4.2; the value of WEKA); minimum weight of a
 # sample; maximum number of times that a step is halved.
-_MAX_RESPONSE, _MIN_WEIGHT, _MAX_HALVINGS = 3.0, 1e-12, 30
+_MAX_RESPONSE, _MIN_WEIGHT, _MAX_STEP_HALVINGS = 3.0, 1e-12, 30
 
 
 class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
@@ -76,31 +76,35 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
             raise ValueError(f"y has one class only, {describe(self.classes_[0])}; give samples of two or more.")
         class_indicators = np.eye(len(self.classes_))[class_indices]
         class_scores = np.zeros(class_indicators.shape)
-        stumps, steps, likelihoods = [], [], [_log_likelihood(class_scores, class_indices)]
+        fitted_stumps, boosting_steps, log_likelihoods = [], [], [_log_likelihood(class_scores, class_indices)]
         for _ in range(self.n_estimators):
-            stump = _fit_stumps(X, class_indicators, _softmax(class_scores))
-            increments = _stump_values(X, *stump)
-            step, new_likelihood = _largest_step(
-                class_scores, increments, class_indices, float(self.learning_rate), likelihoods[-1]
+            round_stumps = _fit_stumps(X, class_indicators, _softmax(class_scores))
+            score_increments = _stump_values(X, *round_stumps)
+            boosting_step, new_log_likelihood = _largest_step(
+                class_scores, score_increments, class_indices, float(self.learning_rate), log_likelihoods[-1]
             )
-            class_scores = class_scores + step * increments
-            stumps.append(stump)
-            steps.append(step)
-            likelihoods.append(new_likelihood)
-        feature, threshold, values_below, values_above = map(np.array, zip(*stumps, strict=True))
-        self.feature_, self.threshold_, self.step_ = feature.astype(int), threshold, np.array(steps)
-        self.below_, self.above_ = (self.step_[:, None] * values for values in (values_below, values_above))
-        self.log_likelihood_ = np.array(likelihoods)
+            class_scores = class_scores + boosting_step * score_increments
+            fitted_stumps.append(round_stumps)
+            boosting_steps.append(boosting_step)
+            log_likelihoods.append(new_log_likelihood)
+        split_features, split_thresholds, values_below, values_above = map(np.array, zip(*fitted_stumps, strict=True))
+        self.feature_, self.threshold_, self.step_ = (
+            split_features.astype(int),
+            split_thresholds,
+            np.array(boosting_steps),
+        )
+        self.below_, self.above_ = (self.step_[:, None] * stump_values for stump_values in (values_below, values_above))
+        self.log_likelihood_ = np.array(log_likelihoods)
         return self
 
     def _staged_scores(self, X: Any) -> Iterator[Float[np.ndarray, "n J"]]:
         check_is_fitted(self)
         X = validate_data(self, X, dtype=np.float32, reset=False)
         class_scores = np.zeros((len(X), len(self.classes_)))
-        for feature, threshold, values_below, values_above in zip(
+        for split_features, split_thresholds, values_below, values_above in zip(
             self.feature_, self.threshold_, self.below_, self.above_, strict=True
         ):
-            class_scores = class_scores + _stump_values(X, feature, threshold, values_below, values_above)
+            class_scores = class_scores + _stump_values(X, split_features, split_thresholds, values_below, values_above)
             yield class_scores
 
     def staged_decision_function(self, X: Any) -> Iterator[np.ndarray]:
@@ -135,57 +139,74 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
         return last_classes
 
 
-def _fit_stumps(X: np.ndarray, class_indicators: np.ndarray, probability: np.ndarray) -> tuple[np.ndarray, ...]:
+def _fit_stumps(X: np.ndarray, class_indicators: np.ndarray, class_probabilities: np.ndarray) -> tuple[np.ndarray, ...]:
     """Fit a stump for each class; return features, thresholds, and values below and above the thresholds, each (J,).
 
     A stump that finds no split is constant, with an infinite threshold.
     """
-    residual = class_indicators - probability
-    variance = probability * (1 - probability)
-    response = np.clip(residual / np.maximum(variance, _MIN_WEIGHT), -_MAX_RESPONSE, _MAX_RESPONSE)
-    weight = np.maximum(np.where(response == 0, 0.0, residual / np.where(response == 0, 1.0, response)), _MIN_WEIGHT)
-    response = residual / weight  # smaller where the weight was raised, so that the gradient is unchanged
+    class_residuals = class_indicators - class_probabilities
+    class_variances = class_probabilities * (1 - class_probabilities)
+    working_response = np.clip(
+        class_residuals / np.maximum(class_variances, _MIN_WEIGHT), -_MAX_RESPONSE, _MAX_RESPONSE
+    )
+    working_weights = np.maximum(
+        np.where(working_response == 0, 0.0, class_residuals / np.where(working_response == 0, 1.0, working_response)),
+        _MIN_WEIGHT,
+    )
+    working_response = (
+        class_residuals / working_weights
+    )  # smaller where the weight was raised, so that the gradient is unchanged
     num_classes = class_indicators.shape[1]
-    stumps = []
+    class_stumps = []
     for class_index in range(num_classes):
-        tree = (
+        stump_tree = (
             DecisionTreeRegressor(max_depth=1, random_state=0)
-            .fit(X, response[:, class_index], weight[:, class_index])
+            .fit(X, working_response[:, class_index], working_weights[:, class_index])
             .tree_
         )
-        has_split = tree.node_count > 1
-        value_below, value_above = (float(tree.value[node, 0, 0]) for node in ((1, 2) if has_split else (0, 0)))
-        feature_and_threshold = (int(tree.feature[0]), float(tree.threshold[0])) if has_split else (0, np.inf)
-        stumps.append(
+        has_split = stump_tree.node_count > 1
+        value_below, value_above = (
+            float(stump_tree.value[leaf_node, 0, 0]) for leaf_node in ((1, 2) if has_split else (0, 0))
+        )
+        feature_and_threshold = (
+            (int(stump_tree.feature[0]), float(stump_tree.threshold[0])) if has_split else (0, np.inf)
+        )
+        class_stumps.append(
             (
                 *feature_and_threshold,
                 (num_classes - 1) / num_classes * value_below,
                 (num_classes - 1) / num_classes * value_above,
             )
         )
-    feature, threshold, value_below, value_above = (np.array(column) for column in zip(*stumps, strict=True))
-    return feature, threshold, value_below, value_above
+    split_features, split_thresholds, value_below, value_above = (
+        np.array(stump_column) for stump_column in zip(*class_stumps, strict=True)
+    )
+    return split_features, split_thresholds, value_below, value_above
 
 
-def _stump_values(X: np.ndarray, feature, threshold, values_below, values_above) -> Float[np.ndarray, "n J"]:
+def _stump_values(
+    X: np.ndarray, split_features, split_thresholds, values_below, values_above
+) -> Float[np.ndarray, "n J"]:
     """Return the values (n, J) that the stumps of a round add to the scores F."""
-    values = np.where(X[:, feature] <= threshold, values_below, values_above)
-    return values - values.mean(axis=1, keepdims=True)
+    stump_values = np.where(X[:, split_features] <= split_thresholds, values_below, values_above)
+    return stump_values - stump_values.mean(axis=1, keepdims=True)
 
 
-def _largest_step(class_scores, increments, class_indices, step: float, min_likelihood: float) -> tuple[float, float]:
-    """Find the largest step of `step`, `step` / 2, `step` / 4 … that keeps the log-likelihood at `min_likelihood` or
-    above.
+def _largest_step(
+    class_scores, score_increments, class_indices, boosting_step: float, min_log_likelihood: float
+) -> tuple[float, float]:
+    """Find the largest step of `boosting_step`, `boosting_step` / 2, `boosting_step` / 4 … that keeps the
+    log-likelihood at `min_log_likelihood` or above.
 
     Returns the step, and the log-likelihood of the classes `class_indices` (n,) after it. The step is 0 if the
     remaining gain is below rounding errors.
     """
-    for _ in range(_MAX_HALVINGS):
-        likelihood = _log_likelihood(class_scores + step * increments, class_indices)
-        if likelihood >= min_likelihood:
-            return step, likelihood
-        step /= 2
-    return 0.0, min_likelihood
+    for _ in range(_MAX_STEP_HALVINGS):
+        log_likelihood = _log_likelihood(class_scores + boosting_step * score_increments, class_indices)
+        if log_likelihood >= min_log_likelihood:
+            return boosting_step, log_likelihood
+        boosting_step /= 2
+    return 0.0, min_log_likelihood
 
 
 def _log_likelihood(class_scores: np.ndarray, class_indices: np.ndarray) -> float:
@@ -199,5 +220,5 @@ def _log_likelihood(class_scores: np.ndarray, class_indices: np.ndarray) -> floa
 
 
 def _softmax(class_scores: np.ndarray) -> Float[np.ndarray, "n J"]:
-    exponentials = np.exp(class_scores - class_scores.max(axis=1, keepdims=True))
-    return exponentials / exponentials.sum(axis=1, keepdims=True)
+    exponential_scores = np.exp(class_scores - class_scores.max(axis=1, keepdims=True))
+    return exponential_scores / exponential_scores.sum(axis=1, keepdims=True)

@@ -20,7 +20,7 @@ from jeit_solvers.module import Module
 # Minimum number of untouched frames for estimating the standard deviation of their peaks.
 _MIN_UNTOUCHED_FRAMES = 10
 # Number of standard deviations by which the touch level exceeds the mean peak of untouched frames.
-_LEVEL_DEVIATIONS = 5.0
+_TOUCH_LEVEL_DEVIATIONS = 5.0
 
 
 class ChangeCourse(Module):
@@ -46,17 +46,17 @@ class ChangeCourse(Module):
 
     def select(self, frames: slice | np.ndarray) -> "ChangeCourse":
         """Return the time course of the frames that are selected by a slice or an array of indices."""
-        return ChangeCourse(*(getattr(self, name)[frames] for name in _FIELD_NAMES))
+        return ChangeCourse(*(getattr(self, field_name)[frames] for field_name in _FIELD_NAMES))
 
     @classmethod
     def concatenate(cls, time_courses: "list[ChangeCourse]") -> "ChangeCourse":
         """Concatenate time courses; an empty list gives a time course without frames."""
-        empty_arrays = {name: np.empty((0, 2) if name == "centroid" else 0) for name in _FIELD_NAMES}
-        arrays = {
-            name: [empty_arrays[name], *(getattr(time_course, name) for time_course in time_courses)]
-            for name in _FIELD_NAMES
+        empty_arrays = {field_name: np.empty((0, 2) if field_name == "centroid" else 0) for field_name in _FIELD_NAMES}
+        field_arrays = {
+            field_name: [empty_arrays[field_name], *(getattr(time_course, field_name) for time_course in time_courses)]
+            for field_name in _FIELD_NAMES
         }
-        return cls(*(np.concatenate(arrays[name]) for name in _FIELD_NAMES))
+        return cls(*(np.concatenate(field_arrays[field_name]) for field_name in _FIELD_NAMES))
 
 
 _FIELD_NAMES = ("seconds", "peak", "least", "half_share", "mean", "area", "centroid")
@@ -109,14 +109,15 @@ class TouchLevel(Module):
         """
         check_kind("mesh", mesh, Mesh, "a Mesh, that of the images")
         images = check_images(images, mesh.num_cells)
-        peaks = images[np.isfinite(images).all(axis=1)].max(axis=1, initial=-np.inf)
-        if len(peaks) < _MIN_UNTOUCHED_FRAMES:
+        frame_peaks = images[np.isfinite(images).all(axis=1)].max(axis=1, initial=-np.inf)
+        if len(frame_peaks) < _MIN_UNTOUCHED_FRAMES:
             raise ValueError(
-                f"images: give {_MIN_UNTOUCHED_FRAMES} frames of an untouched skin, or more; {len(peaks)} have none."
+                f"images: give {_MIN_UNTOUCHED_FRAMES} frames of an untouched skin, or more; {len(frame_peaks)} "
+                "have none."
             )
-        if np.ptp(peaks) == 0:
+        if np.ptp(frame_peaks) == 0:
             raise ValueError("images are all the same and show no noise. Give what was read, not copies of a frame.")
-        return cls(mesh, float(peaks.mean() + _LEVEL_DEVIATIONS * peaks.std(ddof=1)))
+        return cls(mesh, float(frame_peaks.mean() + _TOUCH_LEVEL_DEVIATIONS * frame_peaks.std(ddof=1)))
 
     def course(self, seconds: Float[np.ndarray, " F"], images: Float[np.ndarray, "F m"]) -> ChangeCourse:
         """Compute the time course of images (F, m) at times `seconds` (F,).
@@ -128,20 +129,20 @@ class TouchLevel(Module):
         seconds = check_seconds(seconds, len(images))
         if not np.isfinite(images).all():
             raise ValueError("images have NaN or infinite values; leave out those frames, as `find_touches` does.")
-        peak = images.max(axis=1, initial=-np.inf)
+        frame_peaks = images.max(axis=1, initial=-np.inf)
         is_above_level = images > self.level
         num_elements_above = np.maximum(is_above_level.sum(axis=1), 1)
-        weights = self.areas * np.where(is_above_level, images - self.level, 0.0)
-        total_weight = weights.sum(axis=1, keepdims=True)
-        centroid = weights @ self.centres / np.where(total_weight > 0, total_weight, np.nan)
+        cell_weights = self.areas * np.where(is_above_level, images - self.level, 0.0)
+        total_weight = cell_weights.sum(axis=1, keepdims=True)
+        frame_centroids = cell_weights @ self.centres / np.where(total_weight > 0, total_weight, np.nan)
         return ChangeCourse(
             seconds=seconds,
-            peak=peak,
+            peak=frame_peaks,
             least=images.min(axis=1, initial=np.inf),
-            half_share=np.mean(images >= peak[:, None] / 2, axis=1),
+            half_share=np.mean(images >= frame_peaks[:, None] / 2, axis=1),
             mean=np.where(is_above_level, images, 0.0).sum(axis=1) / num_elements_above,
             area=is_above_level @ self.areas,
-            centroid=centroid,
+            centroid=frame_centroids,
         )
 
 
@@ -252,7 +253,7 @@ class TouchStream(Module):
 
     def __check_init__(self):
         """Check the fields. Raises `ValueError` for an invalid level, gap or number of frames."""
-        _check_settings(self.level, self.gap, self.least)
+        _check_touch_settings(self.level, self.gap, self.least)
 
     def follow(self, second: float, image: Float[np.ndarray, " m"]) -> "TouchStream":
         """Return the state of the segmentation after an image (m,) at time `second`, seconds.
@@ -319,29 +320,29 @@ def find_touches(
     print([(touch.onset, touch.offset) for touch in touches])
     ```
     """
-    _check_settings(level, gap, least)
+    _check_touch_settings(level, gap, least)
     images = check_images(images, len(level.areas))
     seconds = check_seconds(seconds, len(images))
     finite_frames = np.flatnonzero(np.isfinite(images).all(axis=1))
     used_frames = finite_frames[np.diff(seconds[finite_frames], prepend=-np.inf) > 0]
-    intervals = np.diff(seconds[used_frames])
-    if intervals.size and np.median(intervals) >= gap - _TIME_TOLERANCE:
+    frame_intervals = np.diff(seconds[used_frames])
+    if frame_intervals.size and np.median(frame_intervals) >= gap - _TIME_TOLERANCE:
         raise ValueError(
-            f"gap is {gap:g} s, and frames are {np.median(intervals):.3g} s apart: no touch lasts for two of them. "
-            "Give a greater gap."
+            f"gap is {gap:g} s, and frames are {np.median(frame_intervals):.3g} s apart: no touch lasts for two of "
+            "them. Give a greater gap."
         )
     time_course = level.course(seconds[used_frames], images[used_frames])
-    is_after_gap = np.concatenate([[True], intervals >= gap - _TIME_TOLERANCE, [True]])
+    is_after_gap = np.concatenate([[True], frame_intervals >= gap - _TIME_TOLERANCE, [True]])
     frames_above_level = np.flatnonzero(time_course.peak > level.level)
     frames_of_touches = np.split(
         frames_above_level,
         1 + np.flatnonzero(np.diff(time_course.seconds[frames_above_level]) >= gap - _TIME_TOLERANCE),
     )
     touches = []
-    for frames in frames_of_touches:
-        if not frames.size or frames[-1] - frames[0] + 1 < least:
+    for touch_frames in frames_of_touches:
+        if not touch_frames.size or touch_frames[-1] - touch_frames[0] + 1 < least:
             continue
-        first_frame, last_frame = frames[0], frames[-1]
+        first_frame, last_frame = touch_frames[0], touch_frames[-1]
         num_lost = int(used_frames[last_frame] - used_frames[first_frame] - (last_frame - first_frame))
         touch_course = time_course.select(slice(first_frame, last_frame + 1))
         touches.append(
@@ -350,7 +351,7 @@ def find_touches(
     return touches
 
 
-def _check_settings(level, gap, least) -> None:
+def _check_touch_settings(level, gap, least) -> None:
     check_kind("level", level, TouchLevel, "a TouchLevel, such as TouchLevel.of_untouched(mesh, images)")
     if not (is_number(gap) and gap > 0):
         raise ValueError(f"gap must be positive, in seconds; it is {describe(gap)}.")

@@ -135,8 +135,10 @@ def untouched_frames(
     first_frames = recording.frames[seconds < seconds[0] + span]
     frames_with_readings = first_frames[np.isfinite(first_frames).any(axis=1)]
     if len(frames_with_readings) < _MIN_UNTOUCHED_FRAMES:
-        interval = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
-        unit_hint = f" Frames are {interval:.3g} s apart: are these milliseconds?" if interval > span else ""
+        frame_interval = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
+        unit_hint = (
+            f" Frames are {frame_interval:.3g} s apart: are these milliseconds?" if frame_interval > span else ""
+        )
         raise ValueError(
             f"untouched: the first {span:g} s of '{recording.name}' have "
             f"{counted(len(frames_with_readings), 'frame')} with a reading; {_MIN_UNTOUCHED_FRAMES} are needed of the "
@@ -169,14 +171,14 @@ class RecordedContacts:
 
     def number_of(self, frame: int, contact: Contact) -> int | None:
         """Return the number of the touch to which a contact of the frame with index `frame` belongs, or None."""
-        return self._numbers.get((float(self.seconds[frame]), *contact.centroid.tolist()))
+        return self._touch_numbers.get((float(self.seconds[frame]), *contact.centroid.tolist()))
 
     @cached_property
-    def _numbers(self) -> dict[tuple[float, ...], int]:
+    def _touch_numbers(self) -> dict[tuple[float, ...], int]:
         return {
-            (time, *position): path.number
-            for path in self.touches
-            for time, position in zip(path.times.tolist(), path.position.tolist(), strict=True)
+            (time, *touch_position): touch_path.number
+            for touch_path in self.touches
+            for time, touch_position in zip(touch_path.times.tolist(), touch_path.position.tolist(), strict=True)
         }
 
 
@@ -215,19 +217,21 @@ def find_recorded_contacts(
     finder = CellFinder(images.mesh, sign=sign)
     changes, untouched_changes = images.changes(frames), images.changes(untouched)
     untouched_changes = untouched_changes[np.isfinite(untouched_changes).all(axis=1)]
-    noise = None
+    image_noise = None
     if len(untouched_changes) >= _MIN_NOISE_FRAMES and (untouched_changes != untouched_changes[0]).any():
-        noise = ImageNoise.of_images(untouched_changes)
+        image_noise = ImageNoise.of_images(untouched_changes)
     if not np.isfinite(changes).all(axis=1).any():
         raise ValueError(f"frames: none of the {counted(len(frames), 'frame')} could be imaged.")
-    all_contacts = [find_contacts(finder, change, noise) if np.isfinite(change).all() else [] for change in changes]
+    all_contacts = [
+        find_contacts(finder, change, image_noise) if np.isfinite(change).all() else [] for change in changes
+    ]
     contacts = []
-    for candidates in all_contacts:
-        max_peak = max((abs(contact.peak) for contact in candidates), default=0.0)
-        contacts.append([contact for contact in candidates if abs(contact.peak) >= weakest * max_peak])
+    for frame_contacts in all_contacts:
+        max_contact_peak = max((abs(contact.peak) for contact in frame_contacts), default=0.0)
+        contacts.append([contact for contact in frame_contacts if abs(contact.peak) >= weakest * max_contact_peak])
     touches = remove_side_lobes(track_contacts(seconds, contacts), weakest)
     notes = []
-    if noise is None:
+    if image_noise is None:
         notes.append(
             f"noise is estimated from each image, because fewer than {_MIN_NOISE_FRAMES} different frames of the "
             "untouched skin are known: contacts may be missed"
@@ -243,6 +247,6 @@ def find_recorded_contacts(
             f"{counted(num_excluded_contacts, 'contact')} with less than {100 * weakest:.0f} % of the strongest change "
             "of the frame may be side lobes of the image, and are left out"
         )
-    if num_unassigned_contacts := sum(map(len, contacts)) - sum(len(path.times) for path in touches):
+    if num_unassigned_contacts := sum(map(len, contacts)) - sum(len(touch_path.times) for touch_path in touches):
         notes.append(f"{counted(num_unassigned_contacts, 'contact')} of brief or weak appearance belong to no touch")
     return RecordedContacts(seconds, changes, contacts, touches, tuple(notes))

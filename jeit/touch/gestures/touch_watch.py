@@ -132,29 +132,30 @@ class TouchWatch:
         """
         check_kind("images", images, TouchImages, "TouchImages, as of TouchImages.prepare(description, untouched)")
         check_kind("model", model, GestureModel, "a GestureModel, as of GestureModel.read(path)")
-        for name, value in (("rate", rate), ("patience", patience)):
-            if not (is_number(value) and value > 0):
-                raise ValueError(f"{name} must be positive; it is {describe(value)}.")
+        for option_name, option_value in (("rate", rate), ("patience", patience)):
+            if not (is_number(option_value) and option_value > 0):
+                raise ValueError(f"{option_name} must be positive; it is {describe(option_value)}.")
         if model.reading is None:
             raise ValueError("model does not say how its skin was read; learn it with learn_gestures.")
         protocol = images.calibration.model.protocol
         model.reading.check_same_skin(protocol.num_measurements, protocol.name, images.background)
         notes = []
-        level = TouchLevel(images.mesh, model.reading.level)
-        peaks = np.nanmax(model.reading.sign * images.changes(untouched), axis=1)
-        peaks = peaks[np.isfinite(peaks)]
-        if len(peaks) and np.mean(peaks > level.level) > _MAX_FRACTION_ABOVE_LEVEL:
+        touch_level = TouchLevel(images.mesh, model.reading.level)
+        untouched_peaks = np.nanmax(model.reading.sign * images.changes(untouched), axis=1)
+        untouched_peaks = untouched_peaks[np.isfinite(untouched_peaks)]
+        if len(untouched_peaks) and np.mean(untouched_peaks > touch_level.level) > _MAX_FRACTION_ABOVE_LEVEL:
             untouched_level = TouchLevel.of_untouched(images.mesh, model.reading.sign * images.changes(untouched))
             notes.append(
-                f"the untouched skin's images reach {peaks.max() / level.level:.2g} times the level that a touch "
+                f"the untouched skin's images reach {untouched_peaks.max() / touch_level.level:.2g} times the level "
+                "that a touch "
                 "exceeded when gestures were learnt: a higher one is used, and weak touches are missed. Was the "
                 "skin touched meanwhile?"
             )
-            level = untouched_level
+            touch_level = untouched_level
         training_frame_rate = model.reading.rate
         if not 0.5 < rate / training_frame_rate < 2:
             notes.append(f"gestures were learnt at {training_frame_rate:.3g} frames/s, and frames come at {rate:.3g}.")
-        return cls(images, level, model, max(_MIN_GAP, _MIN_GAP_FRAMES / rate), patience, tuple(notes))
+        return cls(images, touch_level, model, max(_MIN_GAP, _MIN_GAP_FRAMES / rate), patience, tuple(notes))
 
     def follow(self, frames: Iterable[tuple[float, Any]]) -> Iterator[WatchedFrame]:
         """Yield a result for each frame as it comes; a frame is a pair of a time in seconds and voltages (M,).
@@ -172,25 +173,25 @@ class _WatchState:
 
     def __init__(self, watch: TouchWatch):
         self.watch = watch
-        self.sign = 1 if watch.model.reading is None else watch.model.reading.sign
-        self.touches = TouchStream(watch.level, gap=watch.gap)
-        self.reference = np.asarray(watch.images.imager.expected, float)
-        self.drift = np.zeros_like(self.reference)
+        self.touch_sign = 1 if watch.model.reading is None else watch.model.reading.sign
+        self.touch_stream = TouchStream(watch.level, gap=watch.gap)
+        self.untouched_frame = np.asarray(watch.images.imager.expected, float)
+        self.untouched_drift = np.zeros_like(self.untouched_frame)
         # The last frame with the drift subtracted, None if this frame is invalid; then the clock time at which the
         # frame came, its time in the stream, and the time in the stream of the last result.
-        self.frame: np.ndarray | None = None
+        self.latest_frame: np.ndarray | None = None
         self.arrival_time, self.frame_time, self.last_result_time = 0.0, -np.inf, -np.inf
         self.last_touch_time, self.num_ended_touches = -np.inf, 0
         self.last_named_touch: NamedTouch | None = None
-        self.opposite_start: float | None = None
+        self.opposite_change_start: float | None = None
 
     def follow(self, frames: Iterable) -> Iterator[WatchedFrame]:
         """Yield a result for each frame; see `TouchWatch.follow`."""
         for image, change in self.watch.images.stream(self._frames_without_drift(frames)):
-            yield self._frame_result(image, self.sign * change)
-        if self.touches.touches:
+            yield self._frame_result(image, self.touch_sign * change)
+        if self.touch_stream.touches:
             self.arrival_time = time.perf_counter()
-            ended_touches = tuple(self._ended_touch(ended_touch) for ended_touch in self.touches.touches)
+            ended_touches = tuple(self._ended_touch(ended_touch) for ended_touch in self.touch_stream.touches)
             yield WatchedFrame(
                 self.frame_time, None, np.nan, False, None, ended_touches, time.perf_counter() - self.arrival_time
             )
@@ -205,64 +206,81 @@ class _WatchState:
                 )
             self.frame_time = float(frame_time)
             try:
-                values = np.asarray(frame)
+                frame_voltages = np.asarray(frame)
             except ValueError:  # a ragged array, which the stream refuses
-                values = np.empty(0)
-            is_valid = values.shape == self.reference.shape and values.dtype.kind in "iuf"
-            self.frame = values - self.drift if is_valid else None
-            yield frame if self.frame is None else self.frame
+                frame_voltages = np.empty(0)
+            is_valid_frame = frame_voltages.shape == self.untouched_frame.shape and frame_voltages.dtype.kind in "iuf"
+            self.latest_frame = frame_voltages - self.untouched_drift if is_valid_frame else None
+            yield frame if self.latest_frame is None else self.latest_frame
 
-    def _frame_result(self, image: FrameImage, change: np.ndarray) -> WatchedFrame:
-        """Return the result for a frame with change of conductivity `change` (m,), which is positive where the skin is
-        touched."""
-        second = self.frame_time
-        self.touches = self.touches.follow(second, change)
-        ended_touches = tuple(self._ended_touch(touch) for touch in self.touches.ended)
-        self.touches = replace(self.touches, ended=())
-        is_ongoing, newly_named = bool(self.touches.open), None
-        is_touched = is_ongoing and self.touches.held == len(self.touches.open)
+    def _frame_result(self, image: FrameImage, conductivity_change: np.ndarray) -> WatchedFrame:
+        """Return the result for a frame with change of conductivity `conductivity_change` (m,), which is positive where
+        the skin is touched."""
+        frame_time = self.frame_time
+        self.touch_stream = self.touch_stream.follow(frame_time, conductivity_change)
+        ended_touches = tuple(self._ended_touch(touch) for touch in self.touch_stream.ended)
+        self.touch_stream = replace(self.touch_stream, ended=())
+        is_ongoing, newly_named = bool(self.touch_stream.open), None
+        is_touched = is_ongoing and self.touch_stream.held == len(self.touch_stream.open)
         if is_touched:
-            self.last_touch_time, self.last_named_touch = second, None  # the named touch continues
-        elif self.last_named_touch is None and self.touches.touches:
-            (ended_stream_touch,) = self.touches.touches
-            newly_named = self.last_named_touch = self._classify(ended_stream_touch)
+            self.last_touch_time, self.last_named_touch = frame_time, None  # the named touch continues
+        elif self.last_named_touch is None and self.touch_stream.touches:
+            (ended_stream_touch,) = self.touch_stream.touches
+            newly_named = self.last_named_touch = self._classify_touch(ended_stream_touch)
         note = ""
-        if self._is_lifted(image, change):
-            note = f"at {second:.2f} s the skin is more at rest than when its rest was read: was it touched? Read anew."
+        if self._is_lifted(image, conductivity_change):
+            note = (
+                f"at {frame_time:.2f} s the skin is more at rest than when its rest was read: was it touched? Read "
+                "anew."
+            )
             ended_touches = (*ended_touches, *self._reset_reference(image))
-        elif is_ongoing and second - self.touches.open[0].seconds[0] >= self.watch.patience:
+        elif is_ongoing and frame_time - self.touch_stream.open[0].seconds[0] >= self.watch.patience:
             ended_touches = (*ended_touches, *(replace(touch, held=True) for touch in self._reset_reference(image)))
-        elif second - self.last_touch_time >= _SETTLING_TIME and np.isfinite(self.last_result_time):
-            self._follow_drift(image, 1 - np.exp(-(second - self.last_result_time) / _DRIFT_TIME_CONSTANT))
-        self.last_result_time = second
-        peak = float(change.max())
+        elif frame_time - self.last_touch_time >= _SETTLING_TIME and np.isfinite(self.last_result_time):
+            self._follow_drift(image, 1 - np.exp(-(frame_time - self.last_result_time) / _DRIFT_TIME_CONSTANT))
+        self.last_result_time = frame_time
+        peak_change = float(conductivity_change.max())
         return WatchedFrame(
-            second, image, peak, is_touched, newly_named, ended_touches, time.perf_counter() - self.arrival_time, note
+            frame_time,
+            image,
+            peak_change,
+            is_touched,
+            newly_named,
+            ended_touches,
+            time.perf_counter() - self.arrival_time,
+            note,
         )
 
-    def _is_lifted(self, image: FrameImage, change: np.ndarray) -> bool:
+    def _is_lifted(self, image: FrameImage, conductivity_change: np.ndarray) -> bool:
         """Return whether a touch that was present when the reference was recorded has ended for good."""
-        if not image.imaged or -change.min() <= max(change.max(), _MIN_OPPOSITE_RATIO * self.watch.level.level):
-            self.opposite_start = None
-        elif self.opposite_start is None:
-            self.opposite_start = self.frame_time
-        return self.opposite_start is not None and self.frame_time - self.opposite_start >= _MIN_OPPOSITE_TIME
+        if not image.imaged or -conductivity_change.min() <= max(
+            conductivity_change.max(), _MIN_OPPOSITE_RATIO * self.watch.level.level
+        ):
+            self.opposite_change_start = None
+        elif self.opposite_change_start is None:
+            self.opposite_change_start = self.frame_time
+        return (
+            self.opposite_change_start is not None
+            and self.frame_time - self.opposite_change_start >= _MIN_OPPOSITE_TIME
+        )
 
     def _reset_reference(self, image: FrameImage) -> tuple[NamedTouch, ...]:
         """Make the last frame the reference of the untouched skin; return the current touch, which ends, if any."""
-        ended_touches = tuple(self._ended_touch(touch) for touch in self.touches.touches)
-        self.touches = replace(self.touches, open=(), held=0, lost=(0, 0))
-        self.opposite_start = None
+        ended_touches = tuple(self._ended_touch(touch) for touch in self.touch_stream.touches)
+        self.touch_stream = replace(self.touch_stream, open=(), held=0, lost=(0, 0))
+        self.opposite_change_start = None
         self._follow_drift(image, 1.0)
         return ended_touches
 
     def _follow_drift(self, image: FrameImage, update_fraction: float) -> None:
         """Add a fraction `update_fraction` of the last frame's deviation from the reference to the drift."""
-        if self.frame is not None and image.imaged:
-            is_usable = image.usable & np.isfinite(self.frame)
-            self.drift = self.drift + np.where(is_usable, update_fraction * (self.frame - self.reference), 0.0)
+        if self.latest_frame is not None and image.imaged:
+            is_usable = image.usable & np.isfinite(self.latest_frame)
+            self.untouched_drift = self.untouched_drift + np.where(
+                is_usable, update_fraction * (self.latest_frame - self.untouched_frame), 0.0
+            )
 
-    def _classify(self, touch: StreamTouch) -> NamedTouch:
+    def _classify_touch(self, touch: StreamTouch) -> NamedTouch:
         """Predict the gesture of a touch; record the computing time since the last frame arrived."""
         gestures = self.watch.model.predict([touch])
         return NamedTouch(
@@ -281,6 +299,6 @@ class _WatchState:
         prediction was not for the whole touch."""
         named_touch, self.last_named_touch = self.last_named_touch, None
         if named_touch is None or len(named_touch.touch.course) != len(touch.course):
-            named_touch = self._classify(touch)
+            named_touch = self._classify_touch(touch)
         self.num_ended_touches += 1
         return replace(named_touch, touch=touch)

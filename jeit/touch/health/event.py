@@ -141,8 +141,8 @@ class Step:
 def window_change(frames: Float[np.ndarray, "2w M"]) -> Float[np.ndarray, " M"]:
     """Compute the change of each channel from the median of the first half of frames to that of the second half; NaN if
     a half has no reading."""
-    half_length = len(frames) // 2
-    return channel_medians(frames[half_length:]) - channel_medians(frames[:half_length])
+    window_length = len(frames) // 2
+    return channel_medians(frames[window_length:]) - channel_medians(frames[:window_length])
 
 
 def channel_medians(frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, " M"]:
@@ -158,9 +158,9 @@ def channel_medians(frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, " M"]
 def change_size(scaled_changes: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "..."]:
     """Compute the size of voltage changes that are divided by the usual healthy changes: a power mean over the channels
     with a reading."""
-    powers = np.minimum(np.abs(scaled_changes), 1e9) ** _POWER_MEAN_EXPONENT
-    has_reading = np.isfinite(powers)
-    mean_powers = np.sum(np.where(has_reading, powers, 0.0), axis=-1) / np.maximum(has_reading.sum(axis=-1), 1)
+    change_powers = np.minimum(np.abs(scaled_changes), 1e9) ** _POWER_MEAN_EXPONENT
+    has_reading = np.isfinite(change_powers)
+    mean_powers = np.sum(np.where(has_reading, change_powers, 0.0), axis=-1) / np.maximum(has_reading.sum(axis=-1), 1)
     return mean_powers ** (1 / _POWER_MEAN_EXPONENT)
 
 
@@ -171,34 +171,44 @@ def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M
     `scale`: usual healthy change of each channel. Returns None unless the step between the medians of the two windows
     exceeds the `limit`, in units of `scale`, is sharp, and lasts to the end of the second window.
     """
-    change = window_change(frames)
-    size = float(change_size(change / scale))
-    if size <= limit:
+    voltage_change = window_change(frames)
+    size_of_change = float(change_size(voltage_change / scale))
+    if size_of_change <= limit:
         return None
-    direction = np.nan_to_num(change / scale**2)
-    half_length = len(frames) // 2
-    initial_medians = np.where(np.isfinite(change), channel_medians(frames[:half_length]), 0.0)
-    readings = np.where(np.isfinite(frames), frames, initial_medians)
+    step_direction = np.nan_to_num(voltage_change / scale**2)
+    window_length = len(frames) // 2
+    initial_medians = np.where(np.isfinite(voltage_change), channel_medians(frames[:window_length]), 0.0)
+    complete_frames = np.where(np.isfinite(frames), frames, initial_medians)
     # Component of the frames along the step: 0 before the step, 1 after the step.
-    projections = (readings - initial_medians) @ direction / max(np.nan_to_num(change) @ direction, 1e-300)
-    first_frame = _best_split_index(np.clip(projections, -1.0, 2.0), half_length)
-    quarter_length = max(2, half_length // 4)
-    if first_frame < half_length // 2 or first_frame + quarter_length > len(projections):
-        return None
-    sharpness = np.median(projections[first_frame : first_frame + quarter_length]) - np.median(
-        projections[max(0, first_frame - quarter_length) : first_frame]
+    step_projections = (
+        (complete_frames - initial_medians)
+        @ step_direction
+        / max(np.nan_to_num(voltage_change) @ step_direction, 1e-300)
     )
-    medians_after = [np.median(part) for part in np.array_split(projections[first_frame:], 3)]
-    medians_before = [np.median(part) for part in np.array_split(projections[:first_frame], 3)]
+    first_frame = _best_step_index(np.clip(step_projections, -1.0, 2.0), window_length)
+    quarter_window_length = max(2, window_length // 4)
+    if first_frame < window_length // 2 or first_frame + quarter_window_length > len(step_projections):
+        return None
+    step_sharpness = np.median(step_projections[first_frame : first_frame + quarter_window_length]) - np.median(
+        step_projections[max(0, first_frame - quarter_window_length) : first_frame]
+    )
+    median_projections_after = [
+        np.median(third_of_projections) for third_of_projections in np.array_split(step_projections[first_frame:], 3)
+    ]
+    median_projections_before = [
+        np.median(third_of_projections) for third_of_projections in np.array_split(step_projections[:first_frame], 3)
+    ]
     if (
-        sharpness < _MIN_SHARPNESS
-        or min(medians_after) < _MIN_FRACTION_AFTER
-        or max(medians_before) > _MAX_FRACTION_BEFORE
-        or not is_distinct(projections, first_frame)
+        step_sharpness < _MIN_SHARPNESS
+        or min(median_projections_after) < _MIN_FRACTION_AFTER
+        or max(median_projections_before) > _MAX_FRACTION_BEFORE
+        or not is_distinct(step_projections, first_frame)
     ):
         return None
     # The step need not be at the boundary between the windows.
-    return Step(channel_medians(frames[first_frame:]) - channel_medians(frames[:first_frame]), size, first_frame)
+    return Step(
+        channel_medians(frames[first_frame:]) - channel_medians(frames[:first_frame]), size_of_change, first_frame
+    )
 
 
 def is_distinct(projections: Float[np.ndarray, " n"], first_frame: int) -> bool:
@@ -207,26 +217,26 @@ def is_distinct(projections: Float[np.ndarray, " n"], first_frame: int) -> bool:
 
     A lasting step is distinct from two touches, between which the level returns to 0.
     """
-    noise = 1.4826 * np.median(np.abs(np.diff(projections))) / np.sqrt(2)
-    max_fraction = max(
-        _MAX_OUTLIER_FRACTION, 1.5 * float(ndtr((_MAX_FRACTION_OF_LEVEL_BEFORE - 1) / max(noise, 1e-12)))
+    projection_noise = 1.4826 * np.median(np.abs(np.diff(projections))) / np.sqrt(2)
+    max_outlier_fraction = max(
+        _MAX_OUTLIER_FRACTION, 1.5 * float(ndtr((_MAX_FRACTION_OF_LEVEL_BEFORE - 1) / max(projection_noise, 1e-12)))
     )
     outlier_fraction_before = (
         np.mean(projections[:first_frame] > 1 - _MAX_FRACTION_OF_LEVEL_BEFORE) if first_frame else 0.0
     )
     return bool(
-        np.mean(projections[first_frame:] < _MAX_FRACTION_OF_LEVEL_BEFORE) <= max_fraction
-        and outlier_fraction_before <= max_fraction
+        np.mean(projections[first_frame:] < _MAX_FRACTION_OF_LEVEL_BEFORE) <= max_outlier_fraction
+        and outlier_fraction_before <= max_outlier_fraction
     )
 
 
-def _best_split_index(projections: np.ndarray, half_length: int) -> int:
+def _best_step_index(frame_projections: np.ndarray, window_length: int) -> int:
     """Find the index at which the levels of frames are best split into two constant parts by least squares."""
-    num_frames = len(projections)
-    total_sum, cumulative_sums = projections.sum(), np.cumsum(projections)[:-1]
+    num_frames = len(frame_projections)
+    sum_of_projections, cumulative_projections = frame_projections.sum(), np.cumsum(frame_projections)[:-1]
     num_frames_before = np.arange(1, num_frames)
-    between_sum_of_squares = cumulative_sums**2 / num_frames_before + (total_sum - cumulative_sums) ** 2 / (
-        num_frames - num_frames_before
-    )
-    allowed_indices = slice(max(3, half_length // 2) - 1, num_frames - 3)
-    return int(np.argmax(between_sum_of_squares[allowed_indices])) + int(allowed_indices.start) + 1
+    between_sum_of_squares = cumulative_projections**2 / num_frames_before + (
+        sum_of_projections - cumulative_projections
+    ) ** 2 / (num_frames - num_frames_before)
+    allowed_split_indices = slice(max(3, window_length // 2) - 1, num_frames - 3)
+    return int(np.argmax(between_sum_of_squares[allowed_split_indices])) + int(allowed_split_indices.start) + 1

@@ -21,18 +21,18 @@ from jeit_solvers.engines import as_array
 
 # Maximum factor between the gain of a channel and the common gain of all channels; if the factor is larger, the common
 # gain is used.
-_MAX_GAIN_FACTOR = 3.0
+_MAX_CHANNEL_GAIN_RATIO = 3.0
 # Maximum factor between readings and modelled voltages that model errors explain; a larger factor is due to units or
 # polarity.
-_MAX_MODEL_FACTOR = 10.0
+_MAX_MODEL_GAIN_RATIO = 10.0
 # Fraction of an image's peak; the centroid of the cells above this level is the starting point of the fit of a cut.
-_PEAK_FRACTION = 0.5
+_LOSS_PEAK_FRACTION = 0.5
 # Thresholds for accepting a fitted line as a cut: maximum misfit, and maximum ratio of the misfits of line and spot.
 _MAX_MISFIT, _MAX_MISFIT_RATIO = 0.4, 0.6
 # Minimum distance of the fit's second starting point from the first, divided by the skin's side.
 _MIN_START_DISTANCE = 0.05
 # Maximum fraction of a change's energy (sum of squares over channels) that failing electrodes may leave unexplained.
-_MAX_UNEXPLAINED = 0.1
+_MAX_UNEXPLAINED_FRACTION = 0.1
 # Minimum fraction of a failing electrode's channels that have changed.
 _MIN_CHANGED_FRACTION = 0.75
 # Minimum change of a changed channel, divided by its reading.
@@ -78,29 +78,40 @@ class ImagedSkin:
         """
         if sign not in (1, -1):
             raise ValueError(f"sign must be 1, where touched skin conducts better, or -1, where worse; it is {sign!r}.")
-        values = np.asarray(check_conductivity(model.mesh, conductivity))
-        if values.ndim > 1 or np.iscomplexobj(values) or values.size not in (1, model.mesh.num_cells):
+        cell_conductivity = np.asarray(check_conductivity(model.mesh, conductivity))
+        if (
+            cell_conductivity.ndim > 1
+            or np.iscomplexobj(cell_conductivity)
+            or cell_conductivity.size not in (1, model.mesh.num_cells)
+        ):
             raise ValueError("conductivity must be real, one number or one for each cell.")
         if model.protocol.num_measurements != reference.size:
             raise ValueError(
                 f"healthy has {reference.size} channels, and the model {model.protocol.num_measurements}; give frames "
                 "and model of one skin."
             )
-        values = np.broadcast_to(values, model.mesh.num_cells).astype(float)
-        predicted = np.asarray(model.voltages(values))
-        is_used = np.isfinite(noise)
-        ratio = reference[is_used] @ predicted[is_used] / (predicted[is_used] @ predicted[is_used])
-        if not 1 / _MAX_MODEL_FACTOR < ratio < _MAX_MODEL_FACTOR:
-            raise ValueError(
-                f"healthy: it is {ratio:.2g} times what the model predicts; are both in SI units, and the signs right?"
-            )
-        channel_ratios = reference / np.where(predicted == 0, np.inf, predicted)
-        gain = np.where(
-            is_used & (channel_ratios > ratio / _MAX_GAIN_FACTOR) & (channel_ratios < ratio * _MAX_GAIN_FACTOR),
-            channel_ratios,
-            ratio,
+        cell_conductivity = np.broadcast_to(cell_conductivity, model.mesh.num_cells).astype(float)
+        predicted_voltages = np.asarray(model.voltages(cell_conductivity))
+        is_used_channel = np.isfinite(noise)
+        model_gain = (
+            reference[is_used_channel]
+            @ predicted_voltages[is_used_channel]
+            / (predicted_voltages[is_used_channel] @ predicted_voltages[is_used_channel])
         )
-        return cls(model, values, values, gain, noise, int(sign))
+        if not 1 / _MAX_MODEL_GAIN_RATIO < model_gain < _MAX_MODEL_GAIN_RATIO:
+            raise ValueError(
+                f"healthy: it is {model_gain:.2g} times what the model predicts; are both in SI units, "
+                "and the signs right?"
+            )
+        channel_gain_ratios = reference / np.where(predicted_voltages == 0, np.inf, predicted_voltages)
+        channel_gains = np.where(
+            is_used_channel
+            & (channel_gain_ratios > model_gain / _MAX_CHANNEL_GAIN_RATIO)
+            & (channel_gain_ratios < model_gain * _MAX_CHANNEL_GAIN_RATIO),
+            channel_gain_ratios,
+            model_gain,
+        )
+        return cls(model, cell_conductivity, cell_conductivity, channel_gains, noise, int(sign))
 
     def linear_reconstruction(self, usable: Bool[np.ndarray, " M"]) -> LinearReconstruction:
         """Return the one-step reconstruction from the `usable` channels, linearised at the present conductivity of the
@@ -116,14 +127,14 @@ class ImagedSkin:
         used.
         """
         has_reading = np.isfinite(changes) & usable
-        volts = np.where(has_reading, changes / self.gain, 0.0)
+        calibrated_changes = np.where(has_reading, changes / self.gain, 0.0)
         images = np.full((len(changes), self.model.mesh.num_cells), np.nan)
-        patterns, pattern_indices = np.unique(has_reading, axis=0, return_inverse=True)
-        for pattern_index, pattern in enumerate(patterns):
-            if pattern.any():
-                has_pattern = pattern_indices.ravel() == pattern_index
-                images[has_pattern] = np.asarray(
-                    self.linear_reconstruction(pattern).image(as_array(volts[has_pattern]))
+        reading_patterns, reading_pattern_indices = np.unique(has_reading, axis=0, return_inverse=True)
+        for pattern_index, reading_pattern in enumerate(reading_patterns):
+            if reading_pattern.any():
+                has_reading_pattern = reading_pattern_indices.ravel() == pattern_index
+                images[has_reading_pattern] = np.asarray(
+                    self.linear_reconstruction(reading_pattern).image(as_array(calibrated_changes[has_reading_pattern]))
                 )
         return images
 
@@ -135,25 +146,27 @@ class ImagedSkin:
 
         `usable`: whether each channel is used; `noise`: noise of each channel's change, volts.
         """
-        is_used = usable & np.isfinite(change)
-        volts = np.where(is_used, change / self.gain, 0.0)
-        image = np.asarray(self.linear_reconstruction(is_used).image(as_array(volts)))
+        is_used_channel = usable & np.isfinite(change)
+        calibrated_change = np.where(is_used_channel, change / self.gain, 0.0)
+        image = np.asarray(self.linear_reconstruction(is_used_channel).image(as_array(calibrated_change)))
         conductivity_losses = np.maximum(-image, 0.0)
         if not conductivity_losses.max() > 0:
             return None
-        centres = np.asarray(centroids(self.model.mesh))[:, :2]
-        weights = np.asarray(measures(self.model.mesh)) * np.where(
-            conductivity_losses > _PEAK_FRACTION * conductivity_losses.max(), conductivity_losses, 0.0
+        cell_centres = np.asarray(centroids(self.model.mesh))[:, :2]
+        cell_weights = np.asarray(measures(self.model.mesh)) * np.where(
+            conductivity_losses > _LOSS_PEAK_FRACTION * conductivity_losses.max(), conductivity_losses, 0.0
         )
-        start = weights @ centres / weights.sum()
-        channels = np.flatnonzero(is_used)
-        channel_noise = noise[channels] / np.abs(self.gain[channels])
-        loss_fit = LossFit(self.model, self.conductivity, volts[channels], channels, channel_noise, start)
-        spot_fit = loss_fit.fit_spot(start)
-        starts = [start]
-        if np.linalg.norm(spot_fit.path[0] - start) > _MIN_START_DISTANCE * loss_fit.skin_size:
-            starts.append(spot_fit.path[0])
-        line_fit = loss_fit.fit_line(starts)
+        loss_centroid = cell_weights @ cell_centres / cell_weights.sum()
+        used_channels = np.flatnonzero(is_used_channel)
+        channel_noise = noise[used_channels] / np.abs(self.gain[used_channels])
+        loss_fit = LossFit(
+            self.model, self.conductivity, calibrated_change[used_channels], used_channels, channel_noise, loss_centroid
+        )
+        spot_fit = loss_fit.fit_spot(loss_centroid)
+        initial_cut_places = [loss_centroid]
+        if np.linalg.norm(spot_fit.path[0] - loss_centroid) > _MIN_START_DISTANCE * loss_fit.skin_size:
+            initial_cut_places.append(spot_fit.path[0])
+        line_fit = loss_fit.fit_line(initial_cut_places)
         if line_fit.misfit > _MAX_MISFIT or line_fit.misfit > _MAX_MISFIT_RATIO * spot_fit.misfit:
             return None
         return line_fit
@@ -180,30 +193,39 @@ def faulty_electrodes(
     relative_changes = np.minimum(relative_changes, _MAX_RELATIVE_CHANGE)
     # The change of a channel with a weak reading is relative to the root mean square reading, not to the channel's own
     # reading.
-    energies = np.minimum(np.abs(np.nan_to_num(change)) / rms_reading, relative_changes) ** 2
-    total_energy, is_unexplained, electrodes = energies.sum(), np.ones(len(energies), bool), []
+    channel_energies = np.minimum(np.abs(np.nan_to_num(change)) / rms_reading, relative_changes) ** 2
+    total_energy, is_unexplained_channel, found_faulty_electrodes = (
+        channel_energies.sum(),
+        np.ones(len(channel_energies), bool),
+        [],
+    )
     while (
         total_energy > 0
-        and energies[is_unexplained].sum() > _MAX_UNEXPLAINED * total_energy
-        and len(electrodes) < max(1, _MAX_FAULTY_FRACTION * len(uses_electrode))
+        and channel_energies[is_unexplained_channel].sum() > _MAX_UNEXPLAINED_FRACTION * total_energy
+        and len(found_faulty_electrodes) < max(1, _MAX_FAULTY_FRACTION * len(uses_electrode))
     ):
-        scores = np.array(
+        electrode_scores = np.array(
             [
-                energies[is_unexplained & electrode_channels].sum()
-                / max(1, (is_unexplained & electrode_channels).sum()) ** 0.5
+                channel_energies[is_unexplained_channel & electrode_channels].sum()
+                / max(1, (is_unexplained_channel & electrode_channels).sum()) ** 0.5
                 for electrode_channels in uses_electrode
             ]
         )
-        best_electrode = int(scores.argmax())
-        unexplained_channels = uses_electrode[best_electrode] & is_unexplained
+        best_electrode = int(electrode_scores.argmax())
+        unexplained_channels = uses_electrode[best_electrode] & is_unexplained_channel
         if (
             not unexplained_channels.any()
             or np.mean(relative_changes[unexplained_channels] > _MIN_RELATIVE_CHANGE) < _MIN_CHANGED_FRACTION
         ):
             return []
-        electrodes.append(best_electrode)
-        is_unexplained &= ~uses_electrode[best_electrode]
-    return electrodes if total_energy > 0 and energies[is_unexplained].sum() <= _MAX_UNEXPLAINED * total_energy else []
+        found_faulty_electrodes.append(best_electrode)
+        is_unexplained_channel &= ~uses_electrode[best_electrode]
+    return (
+        found_faulty_electrodes
+        if total_energy > 0
+        and channel_energies[is_unexplained_channel].sum() <= _MAX_UNEXPLAINED_FRACTION * total_energy
+        else []
+    )
 
 
 def kind_of_fault(
@@ -215,28 +237,28 @@ def kind_of_fault(
     """Classify the fault of a failing electrode from the latest `frames`; `electrode_channels`: whether each channel
     uses this electrode."""
     electrode_frames = frames[:, electrode_channels]
-    medians = np.nanmedian(electrode_frames, axis=0)
+    median_voltages = np.nanmedian(electrode_frames, axis=0)
     rms_reading = np.sqrt(np.mean(reference[electrode_channels] ** 2))
-    is_constant = (
-        len(medians) > 1
-        and np.ptp(medians) <= 0.02 * np.abs(medians).max()
+    are_readings_constant = (
+        len(median_voltages) > 1
+        and np.ptp(median_voltages) <= 0.02 * np.abs(median_voltages).max()
         and np.ptp(reference[electrode_channels]) > 0.1 * rms_reading
     )
-    if is_constant or np.median(np.abs(medians)) < _MAX_TORN_READING_RATIO * np.median(
+    if are_readings_constant or np.median(np.abs(median_voltages)) < _MAX_TORN_READING_RATIO * np.median(
         np.abs(reference[electrode_channels])
     ):
         return EventKind.TORN
     # Touches hardly affect the median difference from frame to frame.
-    differences = np.diff(electrode_frames, axis=0)
-    has_differences = np.isfinite(differences).any(axis=0)
-    noise_ratios = np.zeros(len(medians))
+    frame_differences = np.diff(electrode_frames, axis=0)
+    has_differences = np.isfinite(frame_differences).any(axis=0)
+    noise_ratios = np.zeros(len(median_voltages))
     if has_differences.any():
         noise_ratios[has_differences] = _DEVIATION_PER_MEDIAN_DIFFERENCE * np.nanmedian(
-            np.abs(differences[:, has_differences]), axis=0
+            np.abs(frame_differences[:, has_differences]), axis=0
         )
     noise_ratios /= np.minimum(noise[electrode_channels], rms_reading)
     if np.median(noise_ratios) > _MIN_LOOSE_NOISE_RATIO and np.median(
-        np.abs(medians)
+        np.abs(median_voltages)
     ) < _MAX_RELATIVE_CHANGE * np.median(np.abs(reference[electrode_channels])):
         return EventKind.LOOSE
     return EventKind.DEAD
@@ -288,23 +310,27 @@ def classify_change(
     skin: ImagedSkin | None,
 ) -> list[Finding]:
     """Classify a lasting change of the channels from their `reference`, volts, with the `frames` after the change."""
-    usable = healthy.used & np.isfinite(change)
-    electrodes = [] if touching is None else faulty_electrodes(change, reference, touching & healthy.used)
-    faults = []
-    for electrode in electrodes:
+    is_usable_channel = healthy.used & np.isfinite(change)
+    electrodes_at_fault = [] if touching is None else faulty_electrodes(change, reference, touching & healthy.used)
+    electrode_findings = []
+    for electrode in electrodes_at_fault:
         electrode_channels = touching[electrode] & healthy.used  # pyright: ignore[reportOptionalSubscript]
-        kind = kind_of_fault(frames, reference, healthy.noise, electrode_channels)
+        fault_kind = kind_of_fault(frames, reference, healthy.noise, electrode_channels)
         fault_reason = (
             f"Nearly all of the change is in the {int(electrode_channels.sum())} channels of electrode {electrode + 1}."
         )
-        faults.append(Finding(kind, fault_reason, True, electrode=electrode, channels=electrode_channels))
+        electrode_findings.append(
+            Finding(fault_kind, fault_reason, True, electrode=electrode, channels=electrode_channels)
+        )
     # A cut right beside an electrode also changes almost only that electrode's channels. But readings beside a cut do
     # not fluctuate, and a cut does not increase the current at the electrode.
-    if faults and (skin is None or any(fault.kind != EventKind.DEAD for fault in faults)):
-        return faults
-    loss = None if skin is None else skin.fit_cut(change, usable, healthy.scale)
-    if faults and (loss is None or loss.misfit > _MAX_CUT_MISFIT):
-        return faults
+    if electrode_findings and (
+        skin is None or any(electrode_finding.kind != EventKind.DEAD for electrode_finding in electrode_findings)
+    ):
+        return electrode_findings
+    fitted_cut = None if skin is None else skin.fit_cut(change, is_usable_channel, healthy.scale)
+    if electrode_findings and (fitted_cut is None or fitted_cut.misfit > _MAX_CUT_MISFIT):
+        return electrode_findings
     fraction_outside = healthy.fraction_outside(change)
     is_unlike_touches = fraction_outside > healthy.max_fraction_outside
     reason_text = (
@@ -313,10 +339,12 @@ def classify_change(
         if is_unlike_touches
         else "A press that is held looks the same: wait, or check the skin."
     )
-    if loss is not None:
-        depth_text = "through the whole skin" if loss.through else "perhaps through a part of its depth"
+    if fitted_cut is not None:
+        depth_text = "through the whole skin" if fitted_cut.through else "perhaps through a part of its depth"
         reason_text = f"Conductivity is lost along a line, {depth_text}. {reason_text}"
-        return [Finding(EventKind.CUT, reason_text, is_unlike_touches or _loss_is_opposite_to_touch(skin), loss=loss)]
+        return [
+            Finding(EventKind.CUT, reason_text, is_unlike_touches or _loss_is_opposite_to_touch(skin), loss=fitted_cut)
+        ]
     return [Finding(EventKind.CHANGED, reason_text, is_unlike_touches)]
 
 

@@ -57,17 +57,23 @@ def learn_health(
     if seconds is not None:
         is_later_than_previous = np.diff(seconds, prepend=-np.inf) > 0  # duplicate frames are left out
         frames, seconds = frames[is_later_than_previous], seconds[is_later_than_previous]
-    options = {"patience": patience, "sign": sign}
+    skin_health_options = {"patience": patience, "sign": sign}
     if description is None:
-        return SkinHealth.fit(frames, seconds, **options)
+        return SkinHealth.fit(frames, seconds, **skin_health_options)
     if description.domain is None or description.electrodes is None:
-        return SkinHealth.fit(frames, seconds, protocol=description.protocol(healthy.name), **options)
+        return SkinHealth.fit(frames, seconds, protocol=description.protocol(healthy.name), **skin_health_options)
     median_untouched_frame = (
         np.nanmedian(frames, axis=0, keepdims=True) if healthy.reference is None else healthy.reference
     )
-    images = TouchImages.prepare(description, median_untouched_frame, progress=progress)
-    background = np.full(images.mesh.num_cells, images.background)
-    return SkinHealth.fit(frames, seconds, model=images.calibration.model, conductivity=background, **options)
+    touch_images = TouchImages.prepare(description, median_untouched_frame, progress=progress)
+    background_conductivity = np.full(touch_images.mesh.num_cells, touch_images.background)
+    return SkinHealth.fit(
+        frames,
+        seconds,
+        model=touch_images.calibration.model,
+        conductivity=background_conductivity,
+        **skin_health_options,
+    )
 
 
 def seconds_of(recording: FrameRecording, rate: float | None) -> Float[np.ndarray, " F"] | None:
@@ -100,22 +106,24 @@ def doubts_of(health: SkinHealth, healthy: FrameRecording, frames: Float[np.ndar
     has_reading = np.isfinite(frames)
     if not (has_reading[:, healthy_state.used].mean(axis=1) >= _MIN_READ_FRACTION).any():
         raise ValueError("frames: none of them has a reading in half of the healthy recording's channels.")
-    warnings = []
+    warning_texts = []
     window_length = healthy_state.window * healthy_state.stride
     if len(frames) < 2 * window_length:
-        warnings.append(
+        warning_texts.append(
             f"{len(frames)} frames are fewer than two windows of {window_length}: a change that lasts cannot be "
             "distinguished from a touch in them."
         )
     if healthy_state.is_brief or len(healthy.frames) < _MIN_NUM_FRAMES:
-        warnings.append(
+        warning_texts.append(
             f"the healthy recording has {len(healthy.frames)} frames, few beside the length of touches, or at all: "
             "findings may be false, and damage may be missed. Give forty of the longest touches, and a minute; or a "
             f"shorter patience than {health.patience:.3g}, if no touch lasts that long."
         )
     silent_channels = np.flatnonzero(healthy_state.used & ~has_reading.any(axis=0))
     if silent_channels.size:
-        warnings.append(f"without any reading: channels {', '.join(map(str, silent_channels[:12]))}, counted from 0.")
+        warning_texts.append(
+            f"without any reading: channels {', '.join(map(str, silent_channels[:12]))}, counted from 0."
+        )
     first_readings = np.where(
         has_reading.any(axis=0), np.take_along_axis(frames, has_reading.argmax(axis=0)[None], axis=0)[0], np.nan
     )
@@ -123,12 +131,14 @@ def doubts_of(health: SkinHealth, healthy: FrameRecording, frames: Float[np.ndar
         healthy_state.used & has_reading.any(axis=0) & (~has_reading | (frames == first_readings)).all(axis=0)
     )
     if constant_channels.size and len(frames) > 2:
-        warnings.append(f"constant throughout: channels {', '.join(map(str, constant_channels[:12]))}, counted from 0.")
-    medians = np.nanmedian(
+        warning_texts.append(
+            f"constant throughout: channels {', '.join(map(str, constant_channels[:12]))}, counted from 0."
+        )
+    median_voltages = np.nanmedian(
         np.where(has_reading, frames, np.nan)[:, healthy_state.used & has_reading.any(axis=0)], axis=0
     )
-    healthy_medians = healthy_state.reference[healthy_state.used & has_reading.any(axis=0)]
-    ratio = float(np.median(np.abs(medians)) / max(np.median(np.abs(healthy_medians)), 1e-300))
-    if not 1 / _MAX_UNIT_RATIO < ratio < _MAX_UNIT_RATIO:
-        warnings.append(f"frames are {ratio:.3g} times the healthy ones: are both in the same unit?")
-    return warnings
+    healthy_median_voltages = healthy_state.reference[healthy_state.used & has_reading.any(axis=0)]
+    voltage_ratio = float(np.median(np.abs(median_voltages)) / max(np.median(np.abs(healthy_median_voltages)), 1e-300))
+    if not 1 / _MAX_UNIT_RATIO < voltage_ratio < _MAX_UNIT_RATIO:
+        warning_texts.append(f"frames are {voltage_ratio:.3g} times the healthy ones: are both in the same unit?")
+    return warning_texts

@@ -32,7 +32,7 @@ _CHANGE_LIMIT_FACTOR_INCREASE = 20.0
 # Factor by which windows may be shorter than touches require.
 _SHORT_WINDOW_FACTOR = 1.5
 # Factor on the limits of changes if windows are even shorter, because touches then appear to last.
-_BRIEF_LIMIT_FACTOR = 2.0
+_BRIEF_RECORDING_FACTOR = 2.0
 # Minimum fraction of a lasting step of the voltages that remains one window later.
 _MIN_REMAINING_FRACTION = 0.4
 # Limit of the change of voltages from the healthy recording to another recording, as a multiple of the maximum between
@@ -41,16 +41,16 @@ _LEVEL_LIMIT_FACTOR = 3.0
 # Minimum ratio of the change in a touched frame to the change in quiet frames.
 _MIN_TOUCH_RATIO = 3.0
 # Quantile of the changes of all frames that estimates the change in quiet frames.
-_QUIET_QUANTILE = 0.3
+_UNTOUCHED_QUANTILE = 0.3
 # Maximum number of principal directions of touches.
 _MAX_NUM_DIRECTIONS = 40
 # Fraction of the touches' energy that the directions explain.
-_EXPLAINED_FRACTION = 0.98
+_EXPLAINED_ENERGY_FRACTION = 0.98
 # A change is unlike touches if its fraction of energy outside of the directions of touches exceeds this quantile over
 # healthy touches.
-_OUTSIDE_QUANTILE = 0.99
+_OUTSIDE_FRACTION_QUANTILE = 0.99
 # Minimum energy of the healthy touches, relative to that of a strong touch.
-_MIN_STRONG_ENERGY = 0.2
+_MIN_TOUCH_ENERGY_RATIO = 0.2
 _MIN_NUM_FRAMES = 20
 # Fraction of the changes from frame to frame, those of smallest magnitude, that touches do not affect.
 _UNTOUCHED_FRACTION = 0.8
@@ -110,39 +110,43 @@ class HealthyState:
                 "minute of them with touches at best."
             )
         frames = np.where(np.isfinite(frames), frames, np.nan)
-        is_used = np.isfinite(frames).mean(axis=0) > 0.5
-        medians = channel_medians(frames)
+        is_used_channel = np.isfinite(frames).mean(axis=0) > 0.5
+        median_frame = channel_medians(frames)
         noise = _estimate_noise(frames)
-        is_used &= noise > 1e-12 * np.nanmax(np.abs(medians), initial=0.0)
-        is_used &= noise > 0
-        if not is_used.any():
+        is_used_channel &= noise > 1e-12 * np.nanmax(np.abs(median_frame), initial=0.0)
+        is_used_channel &= noise > 0
+        if not is_used_channel.any():
             raise ValueError("healthy: every channel lacks readings or is constant; is this a recording of the skin?")
-        noise = np.where(is_used, noise, np.inf)
-        frames = np.where(is_used, frames, np.nan)
-        window, wanted_length = _window_length(frames, noise, period, window_duration)
-        is_brief = wanted_length > _SHORT_WINDOW_FACTOR * window
-        limit_factor = _BRIEF_LIMIT_FACTOR if is_brief else 1.0
-        stride = max(1, -(-window // _MAX_WINDOW_STEPS))
-        steps = average_frames(frames, stride)
-        window = max(_MIN_WINDOW_STEPS, window // stride)
-        scale, limit, sudden_limit = _step_limits(
-            _window_triples(steps, window), window, _median_noise(noise, stride * window)
+        noise = np.where(is_used_channel, noise, np.inf)
+        frames = np.where(is_used_channel, frames, np.nan)
+        window_length, wanted_window_length = _window_length(frames, noise, period, window_duration)
+        is_brief = wanted_window_length > _SHORT_WINDOW_FACTOR * window_length
+        limit_factor = _BRIEF_RECORDING_FACTOR if is_brief else 1.0
+        averaging_stride = max(1, -(-window_length // _MAX_WINDOW_STEPS))
+        averaged_frames = average_frames(frames, averaging_stride)
+        window_length = max(_MIN_WINDOW_STEPS, window_length // averaging_stride)
+        change_scale, change_limit, sudden_limit = _step_limits(
+            _window_triples(averaged_frames, window_length),
+            window_length,
+            _median_noise(noise, averaging_stride * window_length),
         )
-        level_scale, level_limit = _level_limit(_window_levels(steps, window), scale)
-        touch_directions, max_fraction_outside = _touch_directions(frames, noise, stride * window)
-        deviations = frames - medians
-        span = np.stack([np.nanmin(deviations, axis=0, initial=0.0), np.nanmax(deviations, axis=0, initial=0.0)])
-        reference = np.where(is_used, np.nan_to_num(medians), 0.0)
-        steadiness = Steadiness.learn(steps, window, noise)
+        level_scale, level_limit = _level_limit(_window_levels(averaged_frames, window_length), change_scale)
+        touch_directions, max_fraction_outside = _touch_directions(frames, noise, averaging_stride * window_length)
+        frame_deviations = frames - median_frame
+        deviation_span = np.stack(
+            [np.nanmin(frame_deviations, axis=0, initial=0.0), np.nanmax(frame_deviations, axis=0, initial=0.0)]
+        )
+        reference = np.where(is_used_channel, np.nan_to_num(median_frame), 0.0)
+        steadiness = Steadiness.learn(averaged_frames, window_length, noise)
         return cls(
             reference=reference,
-            used=is_used,
+            used=is_used_channel,
             noise=noise,
-            span=span,
-            stride=stride,
-            window=window,
-            scale=scale,
-            limit=limit_factor * limit,
+            span=deviation_span,
+            stride=averaging_stride,
+            window=window_length,
+            scale=change_scale,
+            limit=limit_factor * change_limit,
             sudden_limit=limit_factor * sudden_limit,
             level_scale=level_scale,
             level_limit=limit_factor * level_limit,
@@ -156,43 +160,47 @@ class HealthyState:
     def fraction_outside(self, change: Float[np.ndarray, " M"]) -> float:
         """Compute the fraction of a voltage change's sum of squares, in units of noise, that is outside of the
         directions of touches."""
-        return float(_fraction_outside((np.nan_to_num(change) / self.noise)[None], self.touch_directions)[0])
+        return float(_fraction_outside_directions((np.nan_to_num(change) / self.noise)[None], self.touch_directions)[0])
 
 
 def average_frames(frames: Float[np.ndarray, "F M"], stride: int) -> Float[np.ndarray, "n M"]:
     """Average every `stride` consecutive frames; the mean of each channel is over the frames with a reading."""
     if stride == 1:
         return frames
-    groups = frames[: len(frames) // stride * stride].reshape(-1, stride, frames.shape[1])
-    has_reading = np.isfinite(groups)
+    frame_groups = frames[: len(frames) // stride * stride].reshape(-1, stride, frames.shape[1])
+    has_reading = np.isfinite(frame_groups)
     num_readings = has_reading.sum(axis=1)
     return np.where(
-        num_readings > 0, np.where(has_reading, groups, 0.0).sum(axis=1) / np.maximum(num_readings, 1), np.nan
+        num_readings > 0, np.where(has_reading, frame_groups, 0.0).sum(axis=1) / np.maximum(num_readings, 1), np.nan
     )
 
 
 def _estimate_noise(frames: np.ndarray) -> np.ndarray:
     """Estimate the standard deviation of every channel's noise from frame to frame from the smaller changes."""
-    steps = np.diff(frames, axis=0)
-    has_steps = np.isfinite(steps).any(axis=0)
-    deviations, trimmed_deviations, total_deviations = np.zeros((3, frames.shape[1]))
-    magnitudes = np.sort(np.abs(steps[:, has_steps]), axis=0)  # NaN last
-    num_readings = np.isfinite(magnitudes).sum(axis=0)
-    deviations[has_steps] = 1.4826 * np.nanmedian(magnitudes, axis=0) / np.sqrt(2)
-    total_deviations[has_steps] = np.nanstd(steps[:, has_steps], axis=0) / np.sqrt(2)
+    frame_differences = np.diff(frames, axis=0)
+    has_differences = np.isfinite(frame_differences).any(axis=0)
+    noise_deviations, trimmed_deviations, total_deviations = np.zeros((3, frames.shape[1]))
+    difference_magnitudes = np.sort(np.abs(frame_differences[:, has_differences]), axis=0)  # NaN last
+    num_readings = np.isfinite(difference_magnitudes).sum(axis=0)
+    noise_deviations[has_differences] = 1.4826 * np.nanmedian(difference_magnitudes, axis=0) / np.sqrt(2)
+    total_deviations[has_differences] = np.nanstd(frame_differences[:, has_differences], axis=0) / np.sqrt(2)
     # With a coarse analogue-to-digital converter, the median change is zero or one step of the converter; the mean
     # change is more informative.
-    num_smallest_changes = np.maximum((_UNTOUCHED_FRACTION * num_readings).astype(int), 1)
-    trimmed_deviations[has_steps] = (
-        np.cumsum(np.nan_to_num(magnitudes), axis=0)[num_smallest_changes - 1, np.arange(len(num_smallest_changes))]
-        / num_smallest_changes
+    num_smallest_differences = np.maximum((_UNTOUCHED_FRACTION * num_readings).astype(int), 1)
+    trimmed_deviations[has_differences] = (
+        np.cumsum(np.nan_to_num(difference_magnitudes), axis=0)[
+            num_smallest_differences - 1, np.arange(len(num_smallest_differences))
+        ]
+        / num_smallest_differences
         / _NORMAL_MEAN_MAGNITUDE
         / np.sqrt(2)
     )
-    deviations = np.where(
-        (deviations > 0.05 * total_deviations) & (deviations < 2 * trimmed_deviations), deviations, trimmed_deviations
+    noise_deviations = np.where(
+        (noise_deviations > 0.05 * total_deviations) & (noise_deviations < 2 * trimmed_deviations),
+        noise_deviations,
+        trimmed_deviations,
     )
-    return np.where(deviations > 0.05 * total_deviations, deviations, total_deviations)
+    return np.where(noise_deviations > 0.05 * total_deviations, noise_deviations, total_deviations)
 
 
 def _window_length(
@@ -200,19 +208,23 @@ def _window_length(
 ) -> tuple[int, float]:
     """Return the length of a window, and the length that touches require, for which the recording may be too short;
     both in frames."""
-    max_length = max(_MIN_WINDOW_STEPS, len(frames) // _MIN_NUM_WINDOWS)
+    max_window_length = max(_MIN_WINDOW_STEPS, len(frames) // _MIN_NUM_WINDOWS)
     if window_duration is not None:
-        return int(np.clip(np.ceil(window_duration / period), _MIN_WINDOW_STEPS, max_length)), window_duration / period
+        return int(
+            np.clip(np.ceil(window_duration / period), _MIN_WINDOW_STEPS, max_window_length)
+        ), window_duration / period
     change_sizes = change_size((frames - channel_medians(frames)) / noise)
-    quiet_size = np.quantile(change_sizes, _QUIET_QUANTILE)
-    is_touched = change_sizes > _MIN_TOUCH_RATIO * quiet_size
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], is_touched.astype(int), [0]])))
-    touch_lengths = edges[1::2] - edges[::2]
-    min_length = min(max(_MIN_WINDOW_FRAMES, int(_MIN_WINDOW_FRACTION * len(frames))), max_length)
-    wanted_length = _WINDOW_PER_TOUCH * float(touch_lengths.max(initial=0))
-    if touch_lengths.size and touch_lengths.max() > max_length:
-        return int(np.clip(max_length // 2, min_length, max(min_length, _MAX_WINDOW_FRAMES))), wanted_length
-    return int(np.clip(wanted_length, min_length, max_length)), wanted_length
+    untouched_change_size = np.quantile(change_sizes, _UNTOUCHED_QUANTILE)
+    is_touched = change_sizes > _MIN_TOUCH_RATIO * untouched_change_size
+    touch_edge_indices = np.flatnonzero(np.diff(np.concatenate([[0], is_touched.astype(int), [0]])))
+    touch_lengths = touch_edge_indices[1::2] - touch_edge_indices[::2]
+    min_window_length = min(max(_MIN_WINDOW_FRAMES, int(_MIN_WINDOW_FRACTION * len(frames))), max_window_length)
+    wanted_window_length = _WINDOW_PER_TOUCH * float(touch_lengths.max(initial=0))
+    if touch_lengths.size and touch_lengths.max() > max_window_length:
+        return int(
+            np.clip(max_window_length // 2, min_window_length, max(min_window_length, _MAX_WINDOW_FRAMES))
+        ), wanted_window_length
+    return int(np.clip(wanted_window_length, min_window_length, max_window_length)), wanted_window_length
 
 
 def _median_noise(noise: np.ndarray, num_frames: int) -> np.ndarray:
@@ -221,20 +233,29 @@ def _median_noise(noise: np.ndarray, num_frames: int) -> np.ndarray:
     return noise * np.sqrt(np.pi / max(num_frames, 2))
 
 
-def _window_triples(steps: np.ndarray, window: int) -> np.ndarray:
-    """Return the triples of consecutive windows in a recording (triples, 3 `window`, channels), with `window` steps in
-    each window."""
-    starts = range(0, max(1, len(steps) - 3 * window + 1), max(1, window // 4))
-    return np.array([steps[start : start + 3 * window] for start in starts])
+def _window_triples(averaged_frames: np.ndarray, window_length: int) -> np.ndarray:
+    """Return the triples of consecutive windows in a recording (triples, 3 `window_length`, channels), with
+    `window_length` steps in each window."""
+    window_starts = range(0, max(1, len(averaged_frames) - 3 * window_length + 1), max(1, window_length // 4))
+    return np.array(
+        [averaged_frames[window_start : window_start + 3 * window_length] for window_start in window_starts]
+    )
 
 
-def _window_levels(steps: np.ndarray, window: int) -> np.ndarray:
+def _window_levels(averaged_frames: np.ndarray, window_length: int) -> np.ndarray:
     """Compute the differences (windows, channels) of the medians of windows from the median of the whole recording."""
-    starts = range(0, max(1, len(steps) - window + 1), max(1, window // 2))
-    return np.array([channel_medians(steps[start : start + window]) for start in starts]) - channel_medians(steps)
+    window_starts = range(0, max(1, len(averaged_frames) - window_length + 1), max(1, window_length // 2))
+    return np.array(
+        [
+            channel_medians(averaged_frames[window_start : window_start + window_length])
+            for window_start in window_starts
+        ]
+    ) - channel_medians(averaged_frames)
 
 
-def _step_limits(window_triples: np.ndarray, window: int, floor: np.ndarray) -> tuple[np.ndarray, float, float]:
+def _step_limits(
+    window_triples: np.ndarray, window_length: int, min_change_scale: np.ndarray
+) -> tuple[np.ndarray, float, float]:
     """Estimate the scale of each channel's change between windows, and two limits of voltage steps relative to this
     scale.
 
@@ -242,106 +263,130 @@ def _step_limits(window_triples: np.ndarray, window: int, floor: np.ndarray) -> 
     including touches. The steps in each half of the recording are relative to the scale of the other half, which is
     independent of them.
     """
-    pairs = window_triples[:, : 2 * window]
-    changes = np.nan_to_num(np.array([window_change(pair) for pair in pairs]))
-    middle_index, lasting_sizes, sizes = len(changes) // 2, [0.0], [0.0]
+    window_pairs = window_triples[:, : 2 * window_length]
+    window_changes = np.nan_to_num(np.array([window_change(window_pair) for window_pair in window_pairs]))
+    middle_index, lasting_step_sizes, step_sizes = len(window_changes) // 2, [0.0], [0.0]
     untouched_medians = channel_medians(
         np.concatenate(list(window_triples[:: max(1, len(window_triples) // _MIN_NUM_WINDOWS)]))
     )
-    for is_training_part, test in (
+    for training_windows, test_windows in (
         (slice(None, middle_index), slice(middle_index, None)),
         (slice(middle_index, None), slice(None, middle_index)),
     ):
-        scale = _deviation_of_changes(changes[is_training_part], floor)
-        for triple, pair in zip(window_triples[test], pairs[test], strict=True):
-            step = lasting_step(pair, scale, 0.0)
-            if step is None:
+        change_scale = _deviation_of_changes(window_changes[training_windows], min_change_scale)
+        for window_triple, window_pair in zip(window_triples[test_windows], window_pairs[test_windows], strict=True):
+            lasting_window_step = lasting_step(window_pair, change_scale, 0.0)
+            if lasting_window_step is None:
                 continue
-            sizes.append(step.size)
-            direction = np.nan_to_num(step.change / scale**2)
-            medians_after = channel_medians(triple[2 * window :])
+            step_sizes.append(lasting_window_step.size)
+            step_direction = np.nan_to_num(lasting_window_step.change / change_scale**2)
+            medians_after = channel_medians(window_triple[2 * window_length :])
             # A step back to the voltages of the untouched skin is the end of a touch.
-            if change_size((medians_after - untouched_medians) / scale) < _MIN_REMAINING_FRACTION * step.size:
+            if (
+                change_size((medians_after - untouched_medians) / change_scale)
+                < _MIN_REMAINING_FRACTION * lasting_window_step.size
+            ):
                 continue
-            lasting_change = np.nan_to_num(medians_after - channel_medians(pair[:window]))
-            if lasting_change @ direction > _MIN_REMAINING_FRACTION * (np.nan_to_num(step.change) @ direction):
-                lasting_sizes.append(step.size)
-        lasting_sizes.append(float(np.median(change_size(changes[test] / scale))) if len(changes[test]) else 0.0)
-    factor = _CHANGE_LIMIT_FACTOR + _CHANGE_LIMIT_FACTOR_INCREASE / max(len(changes), 1)
-    lasting_limit = max(_MIN_CHANGE_SIZE, factor * max(lasting_sizes))
-    return _deviation_of_changes(changes, floor), lasting_limit, max(lasting_limit, factor * max(sizes))
-
-
-def _level_limit(changes: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, float]:
-    """Estimate the scale of each channel's differences between windows and the whole recording, and the limit of these
-    differences. Differences in each half of the recording are divided by the scale of the other half."""
-    changes = np.nan_to_num(changes)
-    middle_index = len(changes) // 2
-    sizes = [
-        change_size(changes[middle_index:] / _deviation_of_changes(changes[:middle_index], floor)),
-        change_size(changes[:middle_index] / _deviation_of_changes(changes[middle_index:], floor)),
-    ]
-    max_size = float(np.concatenate(sizes).max(initial=0.0))
-    return _deviation_of_changes(changes, floor), max(
-        _MIN_CHANGE_SIZE, (_LEVEL_LIMIT_FACTOR + _CHANGE_LIMIT_FACTOR_INCREASE / max(len(changes), 1)) * max_size
+            lasting_change = np.nan_to_num(medians_after - channel_medians(window_pair[:window_length]))
+            if lasting_change @ step_direction > _MIN_REMAINING_FRACTION * (
+                np.nan_to_num(lasting_window_step.change) @ step_direction
+            ):
+                lasting_step_sizes.append(lasting_window_step.size)
+        lasting_step_sizes.append(
+            float(np.median(change_size(window_changes[test_windows] / change_scale)))
+            if len(window_changes[test_windows])
+            else 0.0
+        )
+    limit_factor = _CHANGE_LIMIT_FACTOR + _CHANGE_LIMIT_FACTOR_INCREASE / max(len(window_changes), 1)
+    lasting_limit = max(_MIN_CHANGE_SIZE, limit_factor * max(lasting_step_sizes))
+    return (
+        _deviation_of_changes(window_changes, min_change_scale),
+        lasting_limit,
+        max(lasting_limit, limit_factor * max(step_sizes)),
     )
 
 
-def _deviation_of_changes(changes: np.ndarray, floor: np.ndarray) -> np.ndarray:
+def _level_limit(level_changes: np.ndarray, min_change_scale: np.ndarray) -> tuple[np.ndarray, float]:
+    """Estimate the scale of each channel's differences between windows and the whole recording, and the limit of these
+    differences. Differences in each half of the recording are divided by the scale of the other half."""
+    level_changes = np.nan_to_num(level_changes)
+    middle_index = len(level_changes) // 2
+    level_change_sizes = [
+        change_size(
+            level_changes[middle_index:] / _deviation_of_changes(level_changes[:middle_index], min_change_scale)
+        ),
+        change_size(
+            level_changes[:middle_index] / _deviation_of_changes(level_changes[middle_index:], min_change_scale)
+        ),
+    ]
+    max_level_change_size = float(np.concatenate(level_change_sizes).max(initial=0.0))
+    return _deviation_of_changes(level_changes, min_change_scale), max(
+        _MIN_CHANGE_SIZE,
+        (_LEVEL_LIMIT_FACTOR + _CHANGE_LIMIT_FACTOR_INCREASE / max(len(level_changes), 1)) * max_level_change_size,
+    )
+
+
+def _deviation_of_changes(changes: np.ndarray, min_deviations: np.ndarray) -> np.ndarray:
     """Estimate the standard deviation of each channel's changes from their mean magnitude, as for a normal variable."""
     deviations = (
         _DEVIATION_PER_MEAN_MAGNITUDE * np.mean(np.abs(changes), axis=0) if len(changes) else np.zeros(changes.shape[1])
     )
     # A channel may have hardly changed by chance while others did change.
-    median_deviation_ratio = np.median(deviations[np.isfinite(floor)] / floor[np.isfinite(floor)])
-    return np.maximum(deviations, np.maximum(1.0, 0.5 * median_deviation_ratio) * floor)
+    median_deviation_ratio = np.median(
+        deviations[np.isfinite(min_deviations)] / min_deviations[np.isfinite(min_deviations)]
+    )
+    return np.maximum(deviations, np.maximum(1.0, 0.5 * median_deviation_ratio) * min_deviations)
 
 
-def _touch_directions(frames: np.ndarray, noise: np.ndarray, window: int) -> tuple[np.ndarray, float]:
+def _touch_directions(frames: np.ndarray, noise: np.ndarray, window_length: int) -> tuple[np.ndarray, float]:
     """Compute the principal directions (channels, directions) of healthy touches, in units of noise, and the 99 %
     quantile of the fraction of touches' energy outside of these directions."""
-    readings = np.where(np.isfinite(frames), frames, channel_medians(frames))
-    centres = np.concatenate(
+    complete_frames = np.where(np.isfinite(frames), frames, channel_medians(frames))
+    window_medians = np.concatenate(
         [
             np.tile(channel_medians(window_frames), (len(window_frames), 1))
-            for window_frames in np.array_split(readings, max(1, len(readings) // (2 * window)))
+            for window_frames in np.array_split(complete_frames, max(1, len(complete_frames) // (2 * window_length)))
         ]
     )
-    scaled_frames = np.nan_to_num((readings - centres) / noise)
-    energies = np.sum(scaled_frames**2, axis=1)
-    frames_of_touches = scaled_frames[
-        energies > max(4 * np.median(energies), _MIN_STRONG_ENERGY * np.quantile(energies, 0.95))
+    noise_scaled_frames = np.nan_to_num((complete_frames - window_medians) / noise)
+    frame_energies = np.sum(noise_scaled_frames**2, axis=1)
+    frames_of_touches = noise_scaled_frames[
+        frame_energies > max(4 * np.median(frame_energies), _MIN_TOUCH_ENERGY_RATIO * np.quantile(frame_energies, 0.95))
     ]
-    frames_of_touches = frames_of_touches if len(frames_of_touches) >= _MIN_WINDOW_STEPS else scaled_frames
+    frames_of_touches = frames_of_touches if len(frames_of_touches) >= _MIN_WINDOW_STEPS else noise_scaled_frames
     frames_of_touches = frames_of_touches[:: max(1, len(frames_of_touches) // 2000)]
-    middle_index, fractions = len(frames_of_touches) // 2, []
-    for training, test in (
+    middle_index, fractions_outside = len(frames_of_touches) // 2, []
+    for training_frames, test_frames in (
         (frames_of_touches[:middle_index], frames_of_touches[middle_index:]),
         (frames_of_touches[middle_index:], frames_of_touches[:middle_index]),
     ):
-        if len(training) and len(test):
-            fractions.append(_fraction_outside(test, _principal_directions(training)))
-    max_fraction_outside = float(np.quantile(np.concatenate(fractions), _OUTSIDE_QUANTILE)) if fractions else 1.0
+        if len(training_frames) and len(test_frames):
+            fractions_outside.append(_fraction_outside_directions(test_frames, _principal_directions(training_frames)))
+    max_fraction_outside = (
+        float(np.quantile(np.concatenate(fractions_outside), _OUTSIDE_FRACTION_QUANTILE)) if fractions_outside else 1.0
+    )
     return _principal_directions(frames_of_touches), max_fraction_outside
 
 
 def _principal_directions(frames: np.ndarray) -> np.ndarray:
     """Compute the leading principal directions (channels, directions) of frames, which explain up to 98 % of the
     frames' energy."""
-    _, singular_values, rows = np.linalg.svd(frames, full_matrices=False)
-    fractions = np.cumsum(singular_values**2) / max(np.sum(singular_values**2), 1e-300)
+    _, singular_values, right_singular_vectors = np.linalg.svd(frames, full_matrices=False)
+    explained_fractions = np.cumsum(singular_values**2) / max(np.sum(singular_values**2), 1e-300)
     num_directions = min(
-        int(np.searchsorted(fractions, _EXPLAINED_FRACTION)) + 1, _MAX_NUM_DIRECTIONS, max(1, len(frames) // 4)
+        int(np.searchsorted(explained_fractions, _EXPLAINED_ENERGY_FRACTION)) + 1,
+        _MAX_NUM_DIRECTIONS,
+        max(1, len(frames) // 4),
     )
-    return rows[: min(num_directions, max(1, frames.shape[1] // 2))].T
+    return right_singular_vectors[: min(num_directions, max(1, frames.shape[1] // 2))].T
 
 
-def _fraction_outside(scaled_changes: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def _fraction_outside_directions(scaled_changes: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Compute the fraction of the energy (sum of squares) of each voltage change that is outside of the
     `directions`."""
-    energies = np.sum(scaled_changes**2, axis=1)
-    energies_outside = energies - np.sum((scaled_changes @ directions) ** 2, axis=1)
-    return np.clip(energies_outside / np.maximum(energies, 1e-300), 0.0, 1.0)
+    change_energies = np.sum(scaled_changes**2, axis=1)
+    energies_outside = change_energies - np.sum((scaled_changes @ directions) ** 2, axis=1)
+    return np.clip(energies_outside / np.maximum(change_energies, 1e-300), 0.0, 1.0)
 
 
 def check_frames(name: str, values) -> Float[np.ndarray, "F M"]:

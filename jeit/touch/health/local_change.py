@@ -67,17 +67,19 @@ def finer_mesh(mesh: Mesh, centre: np.ndarray, radius: float, area: float) -> tu
     parent_cells = np.arange(len(cells))
     for _ in range(_MAX_HALVINGS_OF_CELL):
         refined_mesh = Mesh.create(points, cells)
-        is_near = np.linalg.norm(np.asarray(centroids(refined_mesh)) - centre, axis=1) < radius
-        is_large = is_near & (np.asarray(measures(refined_mesh)) > area)
-        if not is_large.any():
+        is_near_centre = np.linalg.norm(np.asarray(centroids(refined_mesh)) - centre, axis=1) < radius
+        is_large_cell = is_near_centre & (np.asarray(measures(refined_mesh)) > area)
+        if not is_large_cell.any():
             break
-        points, cells, parent_cells = _halve_cells(points, cells, parent_cells, is_large)
+        points, cells, parent_cells = _halve_cells(points, cells, parent_cells, is_large_cell)
     return Mesh.create(points, cells), parent_cells
 
 
-def _halve_cells(points: np.ndarray, cells: np.ndarray, parent_cells: np.ndarray, is_large: Bool[np.ndarray, " m"]):
-    """Halve the cells that `is_large` marks, and further cells as needed to avoid hanging nodes. Returns the points,
-    the cells, and the index of each cell's original cell."""
+def _halve_cells(
+    points: np.ndarray, cells: np.ndarray, parent_cells: np.ndarray, is_large_cell: Bool[np.ndarray, " m"]
+):
+    """Halve the cells that `is_large_cell` marks, and further cells as needed to avoid hanging nodes. Returns the
+    points, the cells, and the index of each cell's original cell."""
     node_pairs = np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).astype(np.int64)
     pair_numbers = node_pairs[..., 0] * len(points) + node_pairs[..., 1]  # numbers are sorted faster than rows
     edges, edge_numbers = np.unique(pair_numbers, return_inverse=True)
@@ -86,33 +88,39 @@ def _halve_cells(points: np.ndarray, cells: np.ndarray, parent_cells: np.ndarray
     # If two edges of a cell are equally long, all cells must choose the same edge as the longest.
     edge_lengths = edge_lengths * (1 + 1e-9 * np.arange(len(edge_lengths)) / len(edge_lengths))
     longest_edges = edge_numbers[np.arange(len(cells)), edge_lengths[edge_numbers].argmax(axis=1)]
-    is_split = np.zeros(len(edges), bool)
-    is_split[longest_edges[is_large]] = True
+    is_split_edge = np.zeros(len(edges), bool)
+    is_split_edge[longest_edges[is_large_cell]] = True
     while True:
-        has_hanging_node = is_split[edge_numbers].any(axis=1) & ~is_split[longest_edges]
+        has_hanging_node = is_split_edge[edge_numbers].any(axis=1) & ~is_split_edge[longest_edges]
         if not has_hanging_node.any():
             break
-        is_split[longest_edges[has_hanging_node]] = True
+        is_split_edge[longest_edges[has_hanging_node]] = True
     midpoint_nodes = np.full(len(edges), -1)
-    midpoint_nodes[is_split] = len(points) + np.arange(is_split.sum())
-    points = np.concatenate([points, points[edges[is_split]].mean(axis=1)])
+    midpoint_nodes[is_split_edge] = len(points) + np.arange(is_split_edge.sum())
+    points = np.concatenate([points, points[edges[is_split_edge]].mean(axis=1)])
     # Turn each cell so that its longest edge comes first, then halve it.
-    longest_positions = edge_lengths[edge_numbers].argmax(axis=1)
-    rows = np.arange(len(cells))[:, None]
+    longest_edge_positions = edge_lengths[edge_numbers].argmax(axis=1)
+    cell_indices = np.arange(len(cells))[:, None]
     rotated_cells, rotated_edges = (
-        cells[rows, (longest_positions[:, None] + np.arange(3)) % 3],
-        edge_numbers[rows, (longest_positions[:, None] + np.arange(3)) % 3],
+        cells[cell_indices, (longest_edge_positions[:, None] + np.arange(3)) % 3],
+        edge_numbers[cell_indices, (longest_edge_positions[:, None] + np.arange(3)) % 3],
     )
-    is_unchanged = ~is_split[longest_edges]
-    first_node, second_node, third_node = rotated_cells[~is_unchanged].T
-    new_nodes, parents_of_halved = midpoint_nodes[rotated_edges[~is_unchanged]], parent_cells[~is_unchanged]
-    new_cells, new_parents = [rotated_cells[is_unchanged]], [parent_cells[is_unchanged]]
-    half_triangles = ((second_node, third_node, new_nodes[:, 1]), (third_node, first_node, new_nodes[:, 2]))
+    is_unchanged_cell = ~is_split_edge[longest_edges]
+    first_node, second_node, third_node = rotated_cells[~is_unchanged_cell].T
+    midpoints_of_halved, parents_of_halved = (
+        midpoint_nodes[rotated_edges[~is_unchanged_cell]],
+        parent_cells[~is_unchanged_cell],
+    )
+    new_cells, new_parents = [rotated_cells[is_unchanged_cell]], [parent_cells[is_unchanged_cell]]
+    half_triangles = (
+        (second_node, third_node, midpoints_of_halved[:, 1]),
+        (third_node, first_node, midpoints_of_halved[:, 2]),
+    )
     for corner, opposite_corner, edge_midpoint in half_triangles:
         # Half of a cell is the triangle (corner, opposite, midpoint of the longest edge); its edge from corner to
         # opposite may be halved too.
         is_halved_cell = edge_midpoint >= 0
-        longest_midpoint = new_nodes[:, 0]
+        longest_midpoint = midpoints_of_halved[:, 0]
         new_cells += [
             np.column_stack([corner, opposite_corner, longest_midpoint])[~is_halved_cell],
             np.column_stack([corner, edge_midpoint, longest_midpoint])[is_halved_cell],
@@ -144,102 +152,110 @@ class LocalChange:
     ):
         self.model = model
         mesh = model.mesh
-        distances = np.linalg.norm(np.asarray(centroids(mesh))[:, :2] - centre, axis=1)
-        corners = np.asarray(mesh.cells)
-        while len(nodes := np.unique(corners[distances < radius])) > _MAX_NUM_NODES:
+        cell_distances = np.linalg.norm(np.asarray(centroids(mesh))[:, :2] - centre, axis=1)
+        cell_nodes = np.asarray(mesh.cells)
+        while len(region_nodes := np.unique(cell_nodes[cell_distances < radius])) > _MAX_NUM_NODES:
             radius *= _SHRINKAGE_FACTOR
         self.radius = radius
-        self.cells: Int[np.ndarray, " c"] = np.flatnonzero(distances < radius)
-        region_numbers = np.full(mesh.num_points, -1)
-        region_numbers[nodes] = np.arange(len(nodes))
-        self.corners = region_numbers[corners[self.cells]]
+        self.cells: Int[np.ndarray, " c"] = np.flatnonzero(cell_distances < radius)
+        region_node_numbers = np.full(mesh.num_points, -1)
+        region_node_numbers[region_nodes] = np.arange(len(region_nodes))
+        self.corners = region_node_numbers[cell_nodes[self.cells]]
         self.gradients = np.asarray(gradients(mesh))[self.cells]  # (cells, nodes of a cell, coordinates)
         self.measures = np.asarray(measures(mesh))[self.cells]
         self.centres = np.asarray(centroids(mesh))[self.cells][:, :2]
-        solved: SolvedSystem = on_host(evaluate(model, solved_system_of, conductivity))
-        self.rest_product, self.resistance = solved.product, solved.resistance
-        self.solution = np.asarray(solved.solution)[nodes]
-        matrix = solved.operator.pattern.to_scipy(solved.operator.values).tocsr()
-        self.inverse = _restricted_inverse(matrix, nodes)
+        solved_system: SolvedSystem = on_host(evaluate(model, solved_system_of, conductivity))
+        self.rest_product, self.resistance = solved_system.product, solved_system.resistance
+        self.solution = np.asarray(solved_system.solution)[region_nodes]
+        system_matrix = solved_system.operator.pattern.to_scipy(solved_system.operator.values).tocsr()
+        self.inverse = _inverse_at_nodes(system_matrix, region_nodes)
         self._last_solved: tuple[np.ndarray, tuple] | None = None
 
     def impedance(self, change: Float[np.ndarray, "c ..."]) -> Float[np.ndarray, "L L"]:
         """Compute the transfer impedance matrix (electrodes, electrodes), ohms, after a `change` of the conductivity in
         the region's cells: scalars (cells,) or tensors (cells, d, d) in d dimensions."""
-        return self._impedance(self._solve_change(change)[1])
+        return self._transfer_impedance(self._solve_change(change)[1])
 
     def derivatives(
         self, change: Float[np.ndarray, "c ..."], directions: list[Float[np.ndarray, "c ..."]]
     ) -> tuple[Float[np.ndarray, "L L"], list[Float[np.ndarray, "L L"]]]:
         """Compute the transfer impedance matrix (electrodes, electrodes), ohms, after a `change` of conductivity in the
         region, and its derivatives along the changes in `directions`."""
-        cells, product, solution = self._solve_change(change)
-        fields: Any = unit_fields(solution, product, self.resistance)[0]  # pyright: ignore[reportArgumentType]
-        nodal_fields = np.zeros((self.solution.shape[0], fields.shape[1]))
-        nodes = np.unique(self.corners[cells])
-        nodal_fields[nodes] = fields
+        changed_cells, electrode_product, changed_solution = self._solve_change(change)
+        changed_node_fields: Any = unit_fields(changed_solution, electrode_product, self.resistance)[0]  # pyright: ignore[reportArgumentType]
+        nodal_fields = np.zeros((self.solution.shape[0], changed_node_fields.shape[1]))
+        changed_nodes = np.unique(self.corners[changed_cells])
+        nodal_fields[changed_nodes] = changed_node_fields
         field_gradients = np.einsum(
-            "ckd,ckl->dcl", self.gradients[cells], nodal_fields[self.corners[cells]], optimize=True
+            "ckd,ckl->dcl", self.gradients[changed_cells], nodal_fields[self.corners[changed_cells]], optimize=True
         )
         impedance_derivatives = []
-        for direction in directions:
-            conductance_changes = direction[cells] * self.measures[cells].reshape((-1,) + (1,) * (direction.ndim - 1))
+        for conductivity_direction in directions:
+            conductance_changes = conductivity_direction[changed_cells] * self.measures[changed_cells].reshape(
+                (-1,) + (1,) * (conductivity_direction.ndim - 1)
+            )
             current_changes = (
                 np.einsum("cab,bcl->acl", conductance_changes, field_gradients)
                 if conductance_changes.ndim == 3
                 else conductance_changes[:, None] * field_gradients
             )
-            energies = np.tensordot(field_gradients, current_changes, axes=([0, 1], [0, 1]))
-            impedance_derivatives.append(-np.asarray(centred(energies)))  # pyright: ignore[reportArgumentType]
-        return self._impedance(product), impedance_derivatives
+            power_changes = np.tensordot(field_gradients, current_changes, axes=([0, 1], [0, 1]))
+            impedance_derivatives.append(-np.asarray(centred(power_changes)))  # pyright: ignore[reportArgumentType]
+        return self._transfer_impedance(electrode_product), impedance_derivatives
 
-    def _solve_change(self, change: np.ndarray):
+    def _solve_change(self, conductivity_change: np.ndarray):
         """Solve the forward problem after a change of conductivity; returns the indices of the changed cells, Bᵀ(A +
         D)⁻¹B, and (A + D)⁻¹B at the nodes of these cells, with the grounded matrix A, its change D and the loads B.
 
         The last result is kept: a fit computes the voltages after a change, and then their derivatives."""
-        if self._last_solved is None or not np.array_equal(self._last_solved[0], change):
-            self._last_solved = change.copy(), self._solve_new_change(change)
+        if self._last_solved is None or not np.array_equal(self._last_solved[0], conductivity_change):
+            self._last_solved = conductivity_change.copy(), self._solve_new_change(conductivity_change)
         return self._last_solved[1]
 
-    def _solve_new_change(self, change: np.ndarray):
-        cells = np.flatnonzero(change.reshape(len(change), -1).any(axis=1))
-        if not len(cells):
-            return cells, np.asarray(self.rest_product), np.zeros((0, len(self.rest_product)))
-        nodes, corners = np.unique(self.corners[cells], return_inverse=True)
-        corners = corners.reshape(len(cells), -1)
-        cell_gradients = self.gradients[cells]
-        conductance_changes = change[cells] * self.measures[cells].reshape((-1,) + (1,) * (change.ndim - 1))
+    def _solve_new_change(self, conductivity_change: np.ndarray):
+        changed_cells = np.flatnonzero(conductivity_change.reshape(len(conductivity_change), -1).any(axis=1))
+        if not len(changed_cells):
+            return changed_cells, np.asarray(self.rest_product), np.zeros((0, len(self.rest_product)))
+        changed_nodes, changed_cell_nodes = np.unique(self.corners[changed_cells], return_inverse=True)
+        changed_cell_nodes = changed_cell_nodes.reshape(len(changed_cells), -1)
+        cell_gradients = self.gradients[changed_cells]
+        conductance_changes = conductivity_change[changed_cells] * self.measures[changed_cells].reshape(
+            (-1,) + (1,) * (conductivity_change.ndim - 1)
+        )
         weighted_gradients = (
             np.einsum("cka,cab->ckb", cell_gradients, conductance_changes)
             if conductance_changes.ndim == 3
             else cell_gradients * conductance_changes[:, None, None]
         )
         cell_stiffness = weighted_gradients @ np.swapaxes(cell_gradients, 1, 2)
-        rows, columns = np.broadcast_arrays(corners[:, :, None], corners[:, None, :])
-        stiffness = scipy.sparse.csr_array(
-            (cell_stiffness.ravel(), (rows.ravel(), columns.ravel())), shape=(len(nodes), len(nodes))
+        row_nodes, column_nodes = np.broadcast_arrays(changed_cell_nodes[:, :, None], changed_cell_nodes[:, None, :])
+        stiffness_change = scipy.sparse.csr_array(
+            (cell_stiffness.ravel(), (row_nodes.ravel(), column_nodes.ravel())),
+            shape=(len(changed_nodes), len(changed_nodes)),
         )
-        initial_solution = self.solution[nodes]
+        initial_solution = self.solution[changed_nodes]
         changed_solution = np.linalg.solve(
-            np.eye(len(nodes)) + self.inverse[np.ix_(nodes, nodes)] @ stiffness, initial_solution
+            np.eye(len(changed_nodes)) + self.inverse[np.ix_(changed_nodes, changed_nodes)] @ stiffness_change,
+            initial_solution,
         )
-        product = self.rest_product - initial_solution.T @ (stiffness @ changed_solution)
-        return cells, product, changed_solution
+        electrode_product = self.rest_product - initial_solution.T @ (stiffness_change @ changed_solution)
+        return changed_cells, electrode_product, changed_solution
 
-    def _impedance(self, product: Any) -> Float[np.ndarray, "L L"]:
-        return np.asarray(electrode_impedance(product, self.resistance).transfer)
+    def _transfer_impedance(self, electrode_product: Any) -> Float[np.ndarray, "L L"]:
+        return np.asarray(electrode_impedance(electrode_product, self.resistance).transfer)
 
 
-def _restricted_inverse(matrix, nodes: Int[np.ndarray, " t"]) -> Float[np.ndarray, "t t"]:
-    """Compute the inverse of a sparse symmetric matrix, restricted to `nodes`: the inverse of the Schur complement
+def _inverse_at_nodes(system_matrix, kept_nodes: Int[np.ndarray, " t"]) -> Float[np.ndarray, "t t"]:
+    """Compute the inverse of a sparse symmetric matrix, restricted to `kept_nodes`: the inverse of the Schur complement
     after elimination of all other nodes."""
-    other_nodes = np.setdiff1d(np.arange(matrix.shape[0]), nodes)
-    schur_complement = matrix[nodes][:, nodes].toarray()
+    other_nodes = np.setdiff1d(np.arange(system_matrix.shape[0]), kept_nodes)
+    schur_complement = system_matrix[kept_nodes][:, kept_nodes].toarray()
     if len(other_nodes):
-        coupling = matrix[other_nodes][:, nodes]
-        coupled_nodes = np.flatnonzero(np.diff(coupling.tocsc().indptr))
-        coupling = coupling[:, coupled_nodes].toarray()
-        factor = scipy.sparse.linalg.splu(matrix[other_nodes][:, other_nodes].tocsc(), permc_spec="MMD_AT_PLUS_A")
-        schur_complement[np.ix_(coupled_nodes, coupled_nodes)] -= coupling.T @ factor.solve(coupling)
+        coupling_matrix = system_matrix[other_nodes][:, kept_nodes]
+        coupled_nodes = np.flatnonzero(np.diff(coupling_matrix.tocsc().indptr))
+        coupling_matrix = coupling_matrix[:, coupled_nodes].toarray()
+        lu_factors = scipy.sparse.linalg.splu(
+            system_matrix[other_nodes][:, other_nodes].tocsc(), permc_spec="MMD_AT_PLUS_A"
+        )
+        schur_complement[np.ix_(coupled_nodes, coupled_nodes)] -= coupling_matrix.T @ lu_factors.solve(coupling_matrix)
     return scipy.linalg.inv(0.5 * (schur_complement + schur_complement.T))

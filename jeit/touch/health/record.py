@@ -15,7 +15,7 @@ from jeit.touch.health.healthy import HealthyState
 
 # Fraction of a change that must have disappeared for the change to count as gone, and maximum norm of what is left of
 # a change that another reverses, relative to the change.
-MIN_DISAPPEARED_FRACTION, _MAX_LEFT_FRACTION = 0.6, 0.6
+MIN_DISAPPEARED_FRACTION, _MAX_REMAINING_FRACTION = 0.6, 0.6
 # Kinds of events that concern single channels.
 CHANNEL_KINDS = (EventKind.NOISY, EventKind.STUCK)
 
@@ -45,8 +45,8 @@ class HealthRecord:
         self, change: LastingChange, finding: Finding, status: EventStatus, number: int | None = None
     ) -> HealthEvent:
         """Create an event from a change and its cause. `number`: default: the number of the next event."""
-        is_affected = np.ones(self.reference.size, bool) if finding.channels is None else finding.channels
-        is_large = np.abs(np.nan_to_num(change.vector)) > self.healthy.limit * self.healthy.scale
+        is_affected_channel = np.ones(self.reference.size, bool) if finding.channels is None else finding.channels
+        is_large_change = np.abs(np.nan_to_num(change.vector)) > self.healthy.limit * self.healthy.scale
         return HealthEvent(
             number=len(self.events) if number is None else number,
             kind=finding.kind,
@@ -54,8 +54,8 @@ class HealthRecord:
             time=change.time,
             noticed=change.detection_time,
             frame=change.frame,
-            channels=is_large & is_affected,
-            change=np.where(is_affected, change.vector, 0.0),
+            channels=is_large_change & is_affected_channel,
+            change=np.where(is_affected_channel, change.vector, 0.0),
             strength=change.size / self.healthy.limit,
             electrode=finding.electrode,
             path=None if finding.loss is None else finding.loss.path,
@@ -66,23 +66,23 @@ class HealthRecord:
 
     def add_events(self, change: LastingChange, findings: list[Finding], status: EventStatus) -> HealthRecord:
         """Add an event for each finding, and their change to the reference voltages."""
-        events = [
+        new_events = [
             self.create_event(change, finding, status, len(self.events) + finding_index)
             for finding_index, finding in enumerate(findings)
         ]
         # If electrodes fail, the reference changes only in their channels, since the skin may be touched meanwhile.
-        is_affected = np.logical_or.reduce(
+        is_affected_channel = np.logical_or.reduce(
             [np.ones_like(self.trusted) if finding.channels is None else finding.channels for finding in findings]
         )
-        skin = self.skin
+        skin_with_cuts = self.skin
         for finding in findings:
-            if finding.loss is not None and skin is not None:
-                skin = skin.with_cut(finding.loss)
+            if finding.loss is not None and skin_with_cuts is not None:
+                skin_with_cuts = skin_with_cuts.with_cut(finding.loss)
         new_reference = np.where(
-            is_affected & np.isfinite(change.vector), self.reference + change.vector, self.reference
+            is_affected_channel & np.isfinite(change.vector), self.reference + change.vector, self.reference
         )
         return replace(
-            self, events=(*self.events, *events), reference=new_reference, skin=skin
+            self, events=(*self.events, *new_events), reference=new_reference, skin=skin_with_cuts
         )._update_trusted_channels()
 
     def add_channel_faults(
@@ -90,15 +90,17 @@ class HealthRecord:
     ) -> HealthRecord:
         """Add an event for each of the noisy or stuck `channels` (M,). `event_time`: the time of the events; its change
         is not used."""
-        fault = "is several times as noisy as it was, or jumps" if kind == EventKind.NOISY else "does not move"
-        record = self
+        fault_description = (
+            "is several times as noisy as it was, or jumps" if kind == EventKind.NOISY else "does not move"
+        )
+        updated_record = self
         for channel in np.flatnonzero(channels):
             is_faulty_channel = np.arange(self.reference.size) == channel
-            finding = Finding(kind, f"Channel {channel} {fault}.", True, channels=is_faulty_channel)
-            event = record.create_event(event_time, finding, EventStatus.LASTING)
-            event = eqx.tree_at(lambda event: event.channels, event, is_faulty_channel)
-            record = replace(record, events=(*record.events, event))
-        return record if record is self else record._update_trusted_channels()
+            finding = Finding(kind, f"Channel {channel} {fault_description}.", True, channels=is_faulty_channel)
+            channel_event = updated_record.create_event(event_time, finding, EventStatus.LASTING)
+            channel_event = eqx.tree_at(lambda channel_event: channel_event.channels, channel_event, is_faulty_channel)
+            updated_record = replace(updated_record, events=(*updated_record.events, channel_event))
+        return updated_record if updated_record is self else updated_record._update_trusted_channels()
 
     def set_event_status(self, event: HealthEvent, status: EventStatus) -> HealthRecord:
         """Set the status of an event. Raises `ValueError` for an event of a different skin."""
@@ -114,33 +116,42 @@ class HealthRecord:
     def deny_event(self, event: HealthEvent) -> HealthRecord:
         """Deny an event, and reset the reference voltages to those before it. Raises `ValueError` for an event of a
         different skin."""
-        reference = np.where(np.isfinite(event.change), self.reference - event.change, self.reference)
-        return replace(self.set_event_status(event, EventStatus.DENIED), reference=reference)._update_trusted_channels()
+        restored_reference = np.where(np.isfinite(event.change), self.reference - event.change, self.reference)
+        return replace(
+            self.set_event_status(event, EventStatus.DENIED), reference=restored_reference
+        )._update_trusted_channels()
 
     def mend_reversed_event(self, change: LastingChange) -> HealthRecord | None:
         """Mend the event whose change is reversed by `change`; None if there is no such event."""
         for earlier_event in self.open_events:
-            is_used = np.isfinite(earlier_event.change) & np.isfinite(change.vector) & self.trusted
-            earlier_change = (earlier_event.change[is_used] / self.healthy.scale[is_used]).clip(-1e9, 1e9)
-            new_change = (change.vector[is_used] / self.healthy.scale[is_used]).clip(-1e9, 1e9)
-            fraction = -(new_change @ earlier_change) / max(earlier_change @ earlier_change, 1e-300)
-            remaining_norm = np.linalg.norm(new_change + earlier_change)
-            if fraction > MIN_DISAPPEARED_FRACTION and remaining_norm < _MAX_LEFT_FRACTION * np.linalg.norm(
-                earlier_change
+            is_used_channel = np.isfinite(earlier_event.change) & np.isfinite(change.vector) & self.trusted
+            earlier_change = (earlier_event.change[is_used_channel] / self.healthy.scale[is_used_channel]).clip(
+                -1e9, 1e9
+            )
+            new_change = (change.vector[is_used_channel] / self.healthy.scale[is_used_channel]).clip(-1e9, 1e9)
+            reversed_fraction = -(new_change @ earlier_change) / max(earlier_change @ earlier_change, 1e-300)
+            remaining_change_norm = np.linalg.norm(new_change + earlier_change)
+            if (
+                reversed_fraction > MIN_DISAPPEARED_FRACTION
+                and remaining_change_norm < _MAX_REMAINING_FRACTION * np.linalg.norm(earlier_change)
             ):
-                record = self.set_event_status(earlier_event, EventStatus.MENDED)
-                reason = f"Event {earlier_event.number} is gone: it was mended, or a press that has been lifted."
-                finding = Finding(EventKind.REPAIRED, reason, True)
-                event = record.create_event(change, finding, EventStatus.LASTING)
-                reference = np.where(np.isfinite(change.vector), self.reference + change.vector, self.reference)
-                return replace(record, events=(*record.events, event), reference=reference)._update_trusted_channels()
+                mended_record = self.set_event_status(earlier_event, EventStatus.MENDED)
+                repair_reason = f"Event {earlier_event.number} is gone: it was mended, or a press that has been lifted."
+                finding = Finding(EventKind.REPAIRED, repair_reason, True)
+                repair_event = mended_record.create_event(change, finding, EventStatus.LASTING)
+                restored_reference = np.where(
+                    np.isfinite(change.vector), self.reference + change.vector, self.reference
+                )
+                return replace(
+                    mended_record, events=(*mended_record.events, repair_event), reference=restored_reference
+                )._update_trusted_channels()
         return None
 
     def mend_all_events(self, reference: Float[np.ndarray, " M"], time: float, frame: int) -> HealthRecord:
         """Mend all open events after the user has repaired the skin. `reference`: voltages of the repaired skin, volts,
         NaN in channels without a reading."""
         has_reading = np.isfinite(reference) & self.healthy.used
-        change = np.where(has_reading, reference - self.reference, 0.0)
+        voltage_change = np.where(has_reading, reference - self.reference, 0.0)
         mended_events = [_set_status(event, EventStatus.MENDED) if event.open else event for event in self.events]
         event = HealthEvent(
             number=len(self.events),
@@ -149,9 +160,9 @@ class HealthRecord:
             time=time,
             noticed=time,
             frame=frame,
-            channels=np.abs(change) > self.healthy.limit * self.healthy.scale,
-            change=change,
-            strength=float(change_size(change / self.healthy.scale)) / self.healthy.limit,
+            channels=np.abs(voltage_change) > self.healthy.limit * self.healthy.scale,
+            change=voltage_change,
+            strength=float(change_size(voltage_change / self.healthy.scale)) / self.healthy.limit,
             reason="As the user says.",
         )
         return replace(
@@ -164,15 +175,15 @@ class HealthRecord:
 
     def _update_trusted_channels(self) -> HealthRecord:
         """Update the trusted channels and the cuts of the model after a change of the events."""
-        trusted = self.healthy.used.copy()
+        trusted_channels = self.healthy.used.copy()
         for event in self.open_events:
             if event.electrode is not None and self.touching is not None:
-                trusted &= ~self.touching[event.electrode]
+                trusted_channels &= ~self.touching[event.electrode]
             if event.kind in CHANNEL_KINDS:
-                trusted &= ~event.channels
+                trusted_channels &= ~event.channels
         has_cut = any(event.path is not None for event in self.open_events)
-        skin = self.skin if self.skin is None or has_cut else self.skin.without_cuts()
-        return replace(self, trusted=trusted, skin=skin)
+        present_skin = self.skin if self.skin is None or has_cut else self.skin.without_cuts()
+        return replace(self, trusted=trusted_channels, skin=present_skin)
 
 
 def _set_status(event: HealthEvent, status: EventStatus) -> HealthEvent:

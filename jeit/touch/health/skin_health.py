@@ -118,21 +118,21 @@ class SkinHealth:
         rise, and a patience that is not positive.
         """
         frames = check_frames("healthy", healthy)
-        period = 1.0
+        frame_period = 1.0
         if times is not None:
-            seconds = check_times(times, len(frames))
-            if (np.diff(seconds) <= 0).any():
+            frame_times = check_times(times, len(frames))
+            if (np.diff(frame_times) <= 0).any():
                 raise ValueError("times must increase from frame to frame, in seconds; some do not.")
-            period = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
+            frame_period = float(np.median(np.diff(frame_times))) if len(frame_times) > 1 else 1.0
         if patience is not None and not (is_number(patience) and patience > 0):
             raise ValueError(f"patience must be positive, in seconds; it is {describe(patience)}.")
         wanted_patience = DEFAULT_PATIENCE if times is not None and patience is None else patience
         state = HealthyState.learn(
-            frames, period, None if wanted_patience is None else float(wanted_patience) / _PATIENCE_PER_WINDOW
+            frames, frame_period, None if wanted_patience is None else float(wanted_patience) / _PATIENCE_PER_WINDOW
         )
-        duration = state.window * state.stride * state.period
+        window_time = state.window * state.stride * state.period
         wanted_patience = max(
-            _PATIENCE_WINDOWS * duration if wanted_patience is None else float(wanted_patience), 2 * duration
+            _PATIENCE_WINDOWS * window_time if wanted_patience is None else float(wanted_patience), 2 * window_time
         )
         skin = None
         if model is not None:
@@ -185,18 +185,19 @@ class SkinHealth:
         """
         if not is_number(time):
             raise ValueError(f"time must be seconds; it is {describe(time)}.")
-        values = real_array("frame", frame, f"{self.reference.size} voltages")
-        if values.shape != self.reference.shape:
+        voltages = real_array("frame", frame, f"{self.reference.size} voltages")
+        if voltages.shape != self.reference.shape:
             raise ValueError(
-                f"frame has shape {values.shape}; this skin has {self.reference.size} channels, as its healthy frames."
+                f"frame has shape {voltages.shape}; this skin has {self.reference.size} channels, as its healthy "
+                "frames."
             )
-        has_reading = np.isfinite(values) & self.healthy.used
+        has_reading = np.isfinite(voltages) & self.healthy.used
         if not time > self.time:
             reason = f"Its time is not later than that of the frame before, {self.time:g}."
         elif has_reading.sum() < _MIN_READ_FRACTION * self.healthy.used.sum():
             reason = f"Only {int(has_reading.sum())} of {int(self.healthy.used.sum())} channels have a reading."
         else:
-            return self._process(float(time), values, has_reading)
+            return self._process_frame(float(time), voltages, has_reading)
         is_usable = np.zeros_like(has_reading)
         return replace(self, frames=self.frames + 1, status=WatchStatus.REFUSED, reason=reason, usable=is_usable)
 
@@ -270,13 +271,13 @@ class SkinHealth:
         """The events that still apply: neither denied nor mended, and no repairs."""
         return self.record.open_events
 
-    def _process(self, time: float, values: np.ndarray, has_reading: np.ndarray) -> "SkinHealth":
+    def _process_frame(self, time: float, voltages: np.ndarray, has_reading: np.ndarray) -> "SkinHealth":
         healthy = self.healthy
         lower_limits, upper_limits = healthy.span + self.reference
         margins = _FAULTY_SPAN_RATIO * (upper_limits - lower_limits) + healthy.limit * np.where(
             healthy.used, healthy.noise, 0.0
         )
-        is_outlier = has_reading & ((values < lower_limits - margins) | (values > upper_limits + margins))
+        is_outlier = has_reading & ((voltages < lower_limits - margins) | (voltages > upper_limits + margins))
         # If many channels are beyond their healthy span, the skin has changed; the channels are not faulty.
         is_outlier &= is_outlier.sum() <= _MAX_OUTLIER_FRACTION * healthy.used.sum()
         usable = has_reading & self.trusted & ~is_outlier
@@ -287,36 +288,36 @@ class SkinHealth:
                 WatchStatus.PARTIAL,
                 f"{num_lost} of {int(healthy.used.sum())} channels are not to be trusted.",
             )
-        stride_frames = (*self._part, np.where(has_reading, values, np.nan))
-        next_state = replace(
-            self, time=time, frames=self.frames + 1, status=status, reason=reason, usable=usable, _part=stride_frames
+        new_frames = (*self._part, np.where(has_reading, voltages, np.nan))
+        state = replace(
+            self, time=time, frames=self.frames + 1, status=status, reason=reason, usable=usable, _part=new_frames
         )
-        if len(stride_frames) < healthy.stride:
-            return next_state
-        (step,) = average_frames(np.array(stride_frames), healthy.stride)
+        if len(new_frames) < healthy.stride:
+            return state
+        (averaged_frame,) = average_frames(np.array(new_frames), healthy.stride)
         first_frame = self.frames + 1 - healthy.stride
-        window = (*self._window, (time, first_frame, step))[-2 * healthy.window :]
-        next_state = replace(next_state, _part=(), _window=window, _steps=self._steps + 1)
-        return next_state._compare_windows() if next_state._steps % max(1, healthy.window // 4) == 0 else next_state
+        recent_frames = (*self._window, (time, first_frame, averaged_frame))[-2 * healthy.window :]
+        state = replace(state, _part=(), _window=recent_frames, _steps=self._steps + 1)
+        return state._compare_windows() if state._steps % max(1, healthy.window // 4) == 0 else state
 
     def _compare_windows(self) -> "SkinHealth":
         """Return the state after comparing the medians of the last two windows of frames."""
-        healthy, num_steps = self.healthy, len(self._window)
-        if num_steps < healthy.window:
+        healthy, num_averages = self.healthy, len(self._window)
+        if num_averages < healthy.window:
             return self
-        frames = np.array([step_frame for _, _, step_frame in self._window])
+        frames = np.array([averaged_frame for _, _, averaged_frame in self._window])
         medians = channel_medians(frames[-healthy.window :])
         if not self._settled:
             return self._process_first_window(medians)
         next_state = self._update_pending(medians)
-        if num_steps == 2 * healthy.window:
+        if num_averages == 2 * healthy.window:
             # Changes in untrusted channels belong to known events and are ignored.
-            step = lasting_step(frames, np.where(next_state.trusted, healthy.scale, np.inf), healthy.limit)
-            if step is not None:
-                return next_state._process_step(step, frames)
+            sudden_change = lasting_step(frames, np.where(next_state.trusted, healthy.scale, np.inf), healthy.limit)
+            if sudden_change is not None:
+                return next_state._process_step(sudden_change, frames)
             next_state = next_state._check_channels(frames)
-        deviations = np.where(self.trusted & np.isfinite(medians), medians - self.reference, 0.0)
-        if next_state._pending is None and change_size(deviations / healthy.scale) < healthy.limit:
+        reference_change = np.where(self.trusted & np.isfinite(medians), medians - self.reference, 0.0)
+        if next_state._pending is None and change_size(reference_change / healthy.scale) < healthy.limit:
             updated_reference = self.reference + _REFERENCE_WEIGHT * (medians - self.reference)
             next_state = next_state._with_reference(np.where(np.isfinite(medians), updated_reference, self.reference))
         return next_state
@@ -334,18 +335,18 @@ class SkinHealth:
             scaled_change = scaled_change - uniform_change * (scaled_change @ uniform_change) / (
                 uniform_change @ uniform_change
             )
-        size = float(change_size(scaled_change))
-        first_deviations = np.array([step_frame for _, _, step_frame in self._window]) - healthy.reference
-        direction = change / healthy.level_scale**2
-        projections = (
-            np.nan_to_num(first_deviations / healthy.level_scale**2) @ change / max(direction @ change, 1e-300)
+        size_of_change = float(change_size(scaled_change))
+        first_deviations = np.array([averaged for _, _, averaged in self._window]) - healthy.reference
+        change_direction = change / healthy.level_scale**2
+        frame_projections = (
+            np.nan_to_num(first_deviations / healthy.level_scale**2) @ change / max(change_direction @ change, 1e-300)
         )
         state = replace(self, _settled=True)._with_reference(np.where(np.isfinite(medians), medians, self.reference))
-        if size <= healthy.level_limit or not is_distinct(projections, 0):
+        if size_of_change <= healthy.level_limit or not is_distinct(frame_projections, 0):
             return state
         time, frame, _ = self._window[0]
-        change = LastingChange(change, size / healthy.level_limit * healthy.limit, time, frame, self.time)
-        frames = np.array([step_frame for _, _, step_frame in self._window])
+        change = LastingChange(change, size_of_change / healthy.level_limit * healthy.limit, time, frame, self.time)
+        frames = np.array([averaged for _, _, averaged in self._window])
         findings = classify_change(change.vector, frames, healthy.reference, healthy, self.record.touching, self.skin)
         findings = [
             finding
@@ -379,9 +380,9 @@ class SkinHealth:
         change = LastingChange(step.change, step.size, time, frame, self.time)
         next_state = replace(self, _window=self._window[step.first_frame :])
         frames_after = frames[step.first_frame :]
-        deviations = np.where(np.isfinite(step.change), channel_medians(frames_after) - self.reference, 0.0)
-        scale = np.where(self.trusted, self.healthy.scale, np.inf)
-        if change_size(deviations / scale) <= self.healthy.limit:  # the skin is as before a touch
+        reference_change = np.where(np.isfinite(step.change), channel_medians(frames_after) - self.reference, 0.0)
+        usual_change = np.where(self.trusted, self.healthy.scale, np.inf)
+        if change_size(reference_change / usual_change) <= self.healthy.limit:  # the skin is as before a touch
             return next_state
         record_without_reversed_event = self.record.mend_reversed_event(change)
         if record_without_reversed_event is not None:
@@ -402,11 +403,11 @@ class SkinHealth:
             if event.kind in CHANNEL_KINDS and event.status == EventStatus.DENIED:
                 checked_channels &= ~event.channels
         time, frame, _ = self._window[0]
-        change = LastingChange(np.zeros(self.reference.size), self.healthy.limit, time, frame, self.time)
+        event_time = LastingChange(np.zeros(self.reference.size), self.healthy.limit, time, frame, self.time)
         noisy_channels = steadiness.noisy_channels(frames, checked_channels)
         stuck_channels = steadiness.stuck_channels(frames, checked_channels)
-        record = self.record.add_channel_faults(EventKind.NOISY, noisy_channels, change)
-        return replace(self, record=record.add_channel_faults(EventKind.STUCK, stuck_channels, change))
+        updated_record = self.record.add_channel_faults(EventKind.NOISY, noisy_channels, event_time)
+        return replace(self, record=updated_record.add_channel_faults(EventKind.STUCK, stuck_channels, event_time))
 
     def _with_reference(self, reference: Float[np.ndarray, " M"]) -> "SkinHealth":
         return replace(self, record=replace(self.record, reference=reference))

@@ -23,8 +23,8 @@ from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 # Number of neurons from which the place of a frame is estimated, and regularisation of the neurons' shares. The
 # regularisation is relative to the mean square deviation of the neurons' frames from their mean. The first line is for
 # the neurons nearest to the frame, the second for the 5 by 5 neurons on the grid around the nearest neuron.
-_NUM_NEAREST, _REGULARISATION = 9, 0.05
-_NUM_ON_GRID, _REGULARISATION_ON_GRID = 25, 0.005
+_NUM_NEAREST_NEURONS, _REGULARISATION = 9, 0.05
+_NUM_GRID_NEIGHBOURS, _REGULARISATION_ON_GRID = 25, 0.005
 # Weight of the mean place of a neuron's presses in the least-squares fit of the neuron's place, relative to one press.
 _MEAN_PLACE_WEIGHT = 0.3
 _MIN_PRESSES = 10
@@ -87,18 +87,18 @@ class PlacedMap:
             raise ValueError(f"positions: give those of {_MIN_PRESSES} presses or more, at different places.")
         nearest_neurons = learnt.nearest(frames, 1)[0][:, 0]
         is_odd_frame = np.arange(len(frames)) % 2 == 1
-        candidates = []
+        placement_results = []
         for is_fitted in (False, True):
             squared_error = squared_spread = squared_residual = 0.0
             for is_held_out in (is_odd_frame, ~is_odd_frame):
                 training_map = cls._from_presses(
                     learnt, frames[~is_held_out], positions[~is_held_out], nearest_neurons[~is_held_out], is_fitted
                 )
-                estimate = training_map._estimate_places(frames[is_held_out])
-                squared_error += float(np.sum((estimate.places - positions[is_held_out]) ** 2))
-                squared_spread += float(np.sum(estimate.deviation**2))
-                squared_residual += float(np.sum(estimate.residuals**2))
-            candidates.append(
+                place_estimate = training_map._estimate_places(frames[is_held_out])
+                squared_error += float(np.sum((place_estimate.places - positions[is_held_out]) ** 2))
+                squared_spread += float(np.sum(place_estimate.place_deviations**2))
+                squared_residual += float(np.sum(place_estimate.frame_residuals**2))
+            placement_results.append(
                 (
                     squared_error,
                     is_fitted,
@@ -106,9 +106,9 @@ class PlacedMap:
                     float(np.sqrt(squared_residual / frames.size)),
                 )
             )
-        _, is_fitted, deviation_factor, _ = min(candidates)
+        _, is_fitted, deviation_factor, _ = min(placement_results)
         fitted_map = cls._from_presses(learnt, frames, positions, nearest_neurons, is_fitted)
-        return replace(fitted_map, widening=deviation_factor, missed=candidates[0][3])
+        return replace(fitted_map, widening=deviation_factor, missed=placement_results[0][3])
 
     @classmethod
     def _from_presses(cls, learnt, frames, positions, nearest_neurons, is_fitted: bool) -> "PlacedMap":
@@ -119,7 +119,11 @@ class PlacedMap:
         num_neurons = learnt.shape[0] * learnt.shape[1]
         win_counts = np.bincount(nearest_neurons, minlength=num_neurons)[:, None]
         position_sums = np.stack(
-            [np.bincount(nearest_neurons, column, minlength=num_neurons) for column in positions.T], axis=1
+            [
+                np.bincount(nearest_neurons, coordinate_column, minlength=num_neurons)
+                for coordinate_column in positions.T
+            ],
+            axis=1,
         )
         mean_positions = np.where(win_counts > 0, position_sums / np.maximum(win_counts, 1), np.nan).reshape(
             *learnt.shape, -1
@@ -128,15 +132,15 @@ class PlacedMap:
         if not is_fitted:
             return placed_map
         combined_neurons, neuron_weights, _ = placed_map._find_neurons_and_weights(frames)
-        rows = np.repeat(np.arange(len(frames)), combined_neurons.shape[1])
+        frame_indices = np.repeat(np.arange(len(frames)), combined_neurons.shape[1])
         combination_matrix = csr_array(
-            (neuron_weights.ravel(), (rows, combined_neurons.ravel())),
+            (neuron_weights.ravel(), (frame_indices, combined_neurons.ravel())),
             shape=(len(frames), np.count_nonzero(win_counts)),
         )
         place_errors = positions - combination_matrix @ mean_positions[placed_map.placed]
         place_corrections = [
-            lsqr(combination_matrix, column, damp=np.sqrt(_MEAN_PLACE_WEIGHT), atol=1e-9, btol=1e-9)[0]
-            for column in place_errors.T
+            lsqr(combination_matrix, coordinate_column, damp=np.sqrt(_MEAN_PLACE_WEIGHT), atol=1e-9, btol=1e-9)[0]
+            for coordinate_column in place_errors.T
         ]
         fitted_positions = mean_positions.copy()
         fitted_positions[placed_map.placed] += np.stack(place_corrections, axis=1)
@@ -158,18 +162,21 @@ class PlacedMap:
         `fitted` places: from the place of the nearest neuron) than the farthest neuron's place is. Raises `ValueError`
         for frames whose number of channels is not that of the map, and for NaN.
         """
-        estimate = self._estimate_places(self.learnt.checked(frames))
-        return estimate.places, self.widening * estimate.deviation
+        place_estimate = self._estimate_places(self.learnt.checked(frames))
+        return place_estimate.places, self.widening * place_estimate.place_deviations
 
-    def _estimate_places(self, frames: Float[np.ndarray, "n M"]) -> "_Estimate":
-        combined_neurons, neuron_weights, residuals = self._find_neurons_and_weights(frames)
+    def _estimate_places(self, frames: Float[np.ndarray, "n M"]) -> "_PlaceEstimate":
+        combined_neurons, neuron_weights, frame_residuals = self._find_neurons_and_weights(frames)
         neuron_places = self._placed_neurons.places[combined_neurons]
         initial_places = neuron_places.mean(axis=1) if self.fitted is None else neuron_places[:, 0]
-        offset = np.einsum("nq,nqd->nd", neuron_weights, neuron_places) - initial_places
-        max_lengths = np.linalg.norm(neuron_places - initial_places[:, None], axis=2).max(axis=1)
-        lengths = np.linalg.norm(offset, axis=1)
-        places = initial_places + offset * np.minimum(1.0, max_lengths / np.maximum(lengths, 1e-300))[:, None]
-        return _Estimate(places, np.sqrt(np.mean((neuron_places - places[:, None]) ** 2, axis=1)), residuals)
+        place_offsets = np.einsum("nq,nqd->nd", neuron_weights, neuron_places) - initial_places
+        max_offset_lengths = np.linalg.norm(neuron_places - initial_places[:, None], axis=2).max(axis=1)
+        offset_lengths = np.linalg.norm(place_offsets, axis=1)
+        places = (
+            initial_places
+            + place_offsets * np.minimum(1.0, max_offset_lengths / np.maximum(offset_lengths, 1e-300))[:, None]
+        )
+        return _PlaceEstimate(places, np.sqrt(np.mean((neuron_places - places[:, None]) ** 2, axis=1)), frame_residuals)
 
     def _find_neurons_and_weights(self, frames: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Find the neurons from which the places of frames are estimated, and their shares in the frames.
@@ -180,7 +187,7 @@ class PlacedMap:
         placed_neurons = self._placed_neurons
         if self.fitted is None:
             combined_neurons, regularisation = (
-                placed_neurons.neurons.nearest(frames, min(_NUM_NEAREST, len(placed_neurons.places)))[0],
+                placed_neurons.neurons.nearest(frames, min(_NUM_NEAREST_NEURONS, len(placed_neurons.places)))[0],
                 _REGULARISATION,
             )
         else:
@@ -188,13 +195,13 @@ class PlacedMap:
                 placed_neurons.grid_neighbours[placed_neurons.neurons.winners(frames)[:, 1]],
                 _REGULARISATION_ON_GRID,
             )
-        neuron_weights, residuals = np.empty(combined_neurons.shape), np.empty(frames.shape)
-        for start in range(0, len(frames), _CHUNK_SIZE):
-            rows = slice(start, start + _CHUNK_SIZE)
-            neuron_weights[rows], residuals[rows] = _fit_combination_weights(
-                placed_neurons.neurons.weights[0][combined_neurons[rows]], frames[rows], regularisation
+        neuron_weights, frame_residuals = np.empty(combined_neurons.shape), np.empty(frames.shape)
+        for chunk_start in range(0, len(frames), _CHUNK_SIZE):
+            chunk = slice(chunk_start, chunk_start + _CHUNK_SIZE)
+            neuron_weights[chunk], frame_residuals[chunk] = _fit_combination_weights(
+                placed_neurons.neurons.weights[0][combined_neurons[chunk]], frames[chunk], regularisation
             )
-        return combined_neurons, neuron_weights, residuals
+        return combined_neurons, neuron_weights, frame_residuals
 
     def predict(self, features: ArrayLike) -> Float[np.ndarray, "n d"]:
         """Estimate the places of touches as `locate` does, without standard deviations, in the interface of
@@ -204,10 +211,17 @@ class PlacedMap:
     @cached_property
     def _placed_neurons(self) -> "_PlacedNeurons":
         neurons = SelfOrganisingMap(self.learnt.weights[self.placed][None], self.learnt.scale)
-        places, grid = (self.places if self.fitted is None else self.fitted)[self.placed], np.argwhere(self.placed)
+        neuron_places, grid_positions = (
+            (self.places if self.fitted is None else self.fitted)[self.placed],
+            np.argwhere(self.placed),
+        )
         # Neighbours are sorted by the larger of the distances in rows and columns; the first is the neuron itself.
-        grid_neighbours = KDTree(grid).query(grid, min(_NUM_ON_GRID, len(grid)), p=np.inf)[1].reshape(len(grid), -1)
-        return _PlacedNeurons(neurons, places, grid_neighbours)
+        grid_neighbours = (
+            KDTree(grid_positions)
+            .query(grid_positions, min(_NUM_GRID_NEIGHBOURS, len(grid_positions)), p=np.inf)[1]
+            .reshape(len(grid_positions), -1)
+        )
+        return _PlacedNeurons(neurons, neuron_places, grid_neighbours)
 
 
 class _PlacedNeurons(NamedTuple):
@@ -222,16 +236,16 @@ class _PlacedNeurons(NamedTuple):
     grid_neighbours: Int[np.ndarray, "k q"]
 
 
-class _Estimate(NamedTuple):
+class _PlaceEstimate(NamedTuple):
     """Estimated places of touches (frames, coordinates), metres.
 
-    `deviation` (frames, coordinates): standard deviations of the neurons' places around an estimated place; `residuals`
-    (frames, channels): residuals of the frames.
+    `place_deviations` (frames, coordinates): standard deviations of the neurons' places around an estimated place;
+    `frame_residuals` (frames, channels): residuals of the frames.
     """
 
     places: Float[np.ndarray, "n d"]
-    deviation: Float[np.ndarray, "n d"]
-    residuals: Float[np.ndarray, "n M"]
+    place_deviations: Float[np.ndarray, "n d"]
+    frame_residuals: Float[np.ndarray, "n M"]
 
 
 def _fit_combination_weights(
@@ -244,14 +258,14 @@ def _fit_combination_weights(
     """
     num_neurons = neuron_frames.shape[1]
     mean_frames = neuron_frames.mean(axis=1, keepdims=True)
-    deviations = neuron_frames - mean_frames
-    gram_matrix = deviations @ np.swapaxes(deviations, 1, 2)
-    diagonal = np.einsum("nqq->nq", gram_matrix)  # a view of the diagonal of `gram_matrix`
-    diagonal += regularisation * diagonal.mean(axis=1, keepdims=True) + 1e-300
-    change = frames - mean_frames[:, 0]
-    weights = np.linalg.solve(gram_matrix, deviations @ change[..., None])
-    residuals = change - (np.swapaxes(weights, 1, 2) @ deviations)[:, 0]
-    return weights[..., 0] + (1 - weights.sum(axis=1)) / num_neurons, residuals
+    neuron_deviations = neuron_frames - mean_frames
+    gram_matrix = neuron_deviations @ np.swapaxes(neuron_deviations, 1, 2)
+    gram_diagonal = np.einsum("nqq->nq", gram_matrix)  # a view of the diagonal of `gram_matrix`
+    gram_diagonal += regularisation * gram_diagonal.mean(axis=1, keepdims=True) + 1e-300
+    frame_deviations = frames - mean_frames[:, 0]
+    combination_weights = np.linalg.solve(gram_matrix, neuron_deviations @ frame_deviations[..., None])
+    frame_residuals = frame_deviations - (np.swapaxes(combination_weights, 1, 2) @ neuron_deviations)[:, 0]
+    return combination_weights[..., 0] + (1 - combination_weights.sum(axis=1)) / num_neurons, frame_residuals
 
 
 # Number of iterations of the spring layout.
@@ -273,27 +287,35 @@ def drawn_map(learnt: SelfOrganisingMap, key: Array) -> Float[np.ndarray, "R C 2
 
     check_kind("learnt", learnt, SelfOrganisingMap, "a map, as of SelfOrganisingMap.fit")
     check_key(key)
-    rows, columns = learnt.shape
+    num_rows, num_columns = learnt.shape
     first_neurons, second_neurons = neighbours(learnt.shape)
-    weight_rows = learnt.weights.reshape(rows * columns, -1)
-    distances = np.linalg.norm(weight_rows[first_neurons] - weight_rows[second_neurons], axis=1)
-    median_distance = float(np.median(distances)) or 1.0
-    strengths = median_distance / np.maximum(distances, _MIN_RELATIVE_DISTANCE * median_distance)
-    graph = networkx.Graph()
-    graph.add_nodes_from(range(rows * columns))
-    graph.add_weighted_edges_from(zip(first_neurons.tolist(), second_neurons.tolist(), strengths.tolist(), strict=True))
-    grid = np.stack(np.unravel_index(np.arange(rows * columns), learnt.shape), axis=1) / max(rows, columns)
-    grid = grid + 1e-3 * np.asarray(jax.random.normal(key, grid.shape))
-    initial_places = dict(enumerate(grid))
-    final_places = networkx.spring_layout(graph, pos=initial_places, iterations=_NUM_ITERATIONS, method="force", seed=0)
-    return np.array([final_places[neuron] for neuron in range(rows * columns)]).reshape(rows, columns, 2)
+    weight_rows = learnt.weights.reshape(num_rows * num_columns, -1)
+    edge_distances = np.linalg.norm(weight_rows[first_neurons] - weight_rows[second_neurons], axis=1)
+    median_edge_distance = float(np.median(edge_distances)) or 1.0
+    edge_strengths = median_edge_distance / np.maximum(edge_distances, _MIN_RELATIVE_DISTANCE * median_edge_distance)
+    map_graph = networkx.Graph()
+    map_graph.add_nodes_from(range(num_rows * num_columns))
+    map_graph.add_weighted_edges_from(
+        zip(first_neurons.tolist(), second_neurons.tolist(), edge_strengths.tolist(), strict=True)
+    )
+    initial_grid = np.stack(np.unravel_index(np.arange(num_rows * num_columns), learnt.shape), axis=1) / max(
+        num_rows, num_columns
+    )
+    initial_grid = initial_grid + 1e-3 * np.asarray(jax.random.normal(key, initial_grid.shape))
+    initial_places = dict(enumerate(initial_grid))
+    final_places = networkx.spring_layout(
+        map_graph, pos=initial_places, iterations=_NUM_ITERATIONS, method="force", seed=0
+    )
+    return np.array([final_places[neuron_index] for neuron_index in range(num_rows * num_columns)]).reshape(
+        num_rows, num_columns, 2
+    )
 
 
 def neighbours(shape: tuple[int, int]) -> tuple[Int[np.ndarray, " e"], Int[np.ndarray, " e"]]:
     """Return the indices, counted row by row, of the neurons at both ends of every edge of a grid of this `shape`."""
-    indices = np.arange(shape[0] * shape[1]).reshape(shape)
-    first_neurons = np.concatenate([indices[:-1].ravel(), indices[:, :-1].ravel()])
-    return first_neurons, np.concatenate([indices[1:].ravel(), indices[:, 1:].ravel()])
+    neuron_indices = np.arange(shape[0] * shape[1]).reshape(shape)
+    first_neurons = np.concatenate([neuron_indices[:-1].ravel(), neuron_indices[:, :-1].ravel()])
+    return first_neurons, np.concatenate([neuron_indices[1:].ravel(), neuron_indices[:, 1:].ravel()])
 
 
 def write_map(learnt: SelfOrganisingMap | PlacedMap, path: str | Path) -> None:
@@ -318,8 +340,10 @@ def write_map(learnt: SelfOrganisingMap | PlacedMap, path: str | Path) -> None:
         raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / 'map.npz'}.")
     has_places = isinstance(learnt, PlacedMap)
     map_without_places = learnt.learnt if has_places else learnt
-    place_arrays = {name: getattr(learnt, name) for name in _PLACE_FIELDS} if has_places else {}
-    place_arrays = {name: value for name, value in place_arrays.items() if value is not None}
+    place_arrays = {field_name: getattr(learnt, field_name) for field_name in _PLACE_FIELDS} if has_places else {}
+    place_arrays = {
+        field_name: field_value for field_name, field_value in place_arrays.items() if field_value is not None
+    }
     with atomically_written_file(path) as file:
         np.savez_compressed(file, weights=map_without_places.weights, scale=map_without_places.scale, **place_arrays)
 
@@ -345,19 +369,19 @@ def read_map(path: str | Path) -> SelfOrganisingMap | PlacedMap:
     if not Path(path).is_file():
         raise FileNotFoundError(f"'{path}': there is no such file.")
     try:
-        arrays = npz_arrays(Path(path), "weights", "scale", *_PLACE_FIELDS)
-        require_arrays(arrays, "weights", "scale")
-        learnt = SelfOrganisingMap(arrays["weights"], _read_scalar("scale", arrays))
-        if "places" not in arrays:
+        map_arrays = npz_arrays(Path(path), "weights", "scale", *_PLACE_FIELDS)
+        require_arrays(map_arrays, "weights", "scale")
+        learnt = SelfOrganisingMap(map_arrays["weights"], _read_scalar("scale", map_arrays))
+        if "places" not in map_arrays:
             return learnt
-        errors = _read_scalar("widening", arrays), _read_scalar("missed", arrays)
-        return PlacedMap(learnt, arrays["places"], *errors, arrays.get("fitted"))
+        error_measures = _read_scalar("widening", map_arrays), _read_scalar("missed", map_arrays)
+        return PlacedMap(learnt, map_arrays["places"], *error_measures, map_arrays.get("fitted"))
     except ValueError as error:
         raise ValueError(f"'{path}' is no map: {error}") from None
 
 
-def _read_scalar(name: str, arrays: dict[str, np.ndarray]) -> float:
-    value = arrays.get(name, np.zeros(0))
-    if value.dtype.kind not in "fiu" or value.shape != ():
-        raise ValueError(f"{name} must be one number; it has shape {value.shape}.")
-    return float(value)
+def _read_scalar(array_name: str, map_arrays: dict[str, np.ndarray]) -> float:
+    scalar_array = map_arrays.get(array_name, np.zeros(0))
+    if scalar_array.dtype.kind not in "fiu" or scalar_array.shape != ():
+        raise ValueError(f"{array_name} must be one number; it has shape {scalar_array.shape}.")
+    return float(scalar_array)

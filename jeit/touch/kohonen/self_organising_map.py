@@ -20,7 +20,7 @@ from jeit.touch.kohonen.training import MapSchedule, train
 # Minimum number of frames from which a map is learnt: fewer frames define no order.
 _MIN_FRAMES = 3
 # Standard deviation of a map's initial weights, relative to the frames' root mean square.
-_INITIAL_DEVIATION = 1e-3
+_RELATIVE_INITIAL_DEVIATION = 1e-3
 # Neighbourhood radius ρ, in grid steps, at which only the winner moves: for its neighbours, exp(−1/2ρ²) underflows.
 _WINNER_ONLY_RADIUS = 0.01
 # Number of frames whose distances to all neurons are computed at once.
@@ -115,11 +115,11 @@ class SelfOrganisingMap:
         Returns the indices of the neurons, counted row by row on the grid, and their distances, both (frames, count).
         """
         squared_distances = self._squared_distances(frames)
-        candidates = np.argpartition(squared_distances, count - 1, axis=1)[:, :count]
-        candidate_distances = np.take_along_axis(squared_distances, candidates, axis=1)
-        sort_order = np.argsort(candidate_distances, axis=1)
-        return np.take_along_axis(candidates, sort_order, axis=1), np.sqrt(
-            np.take_along_axis(candidate_distances, sort_order, axis=1)
+        nearest_neurons = np.argpartition(squared_distances, count - 1, axis=1)[:, :count]
+        nearest_squared_distances = np.take_along_axis(squared_distances, nearest_neurons, axis=1)
+        sort_order = np.argsort(nearest_squared_distances, axis=1)
+        return np.take_along_axis(nearest_neurons, sort_order, axis=1), np.sqrt(
+            np.take_along_axis(nearest_squared_distances, sort_order, axis=1)
         )
 
     def checked(self, frames: ArrayLike) -> Float[np.ndarray, "n M"]:
@@ -130,16 +130,16 @@ class SelfOrganisingMap:
     def _squared_distances(self, frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n k"]:
         """Compute squared distances of frames x from weights w as |w − m|² − 2 (w − m)·(x − m) + |x − m|², with the
         mean weights m."""
-        mean_weights, weights, squares = self._centred_weights
-        distances = np.empty((len(frames), len(weights)))
-        for start in range(0, len(frames), _CHUNK_SIZE):
-            centred_frames = frames[start : start + _CHUNK_SIZE] - mean_weights
-            chunk = distances[start : start + _CHUNK_SIZE]
-            np.matmul(centred_frames, weights.T, out=chunk)
-            chunk *= -2
-            chunk += squares
-            chunk += np.sum(centred_frames**2, axis=1)[:, None]
-        return np.maximum(distances, 0.0, out=distances)
+        mean_weights, centred_weights, squared_norms = self._centred_weights
+        squared_distances = np.empty((len(frames), len(centred_weights)))
+        for chunk_start in range(0, len(frames), _CHUNK_SIZE):
+            centred_frames = frames[chunk_start : chunk_start + _CHUNK_SIZE] - mean_weights
+            distances_of_chunk = squared_distances[chunk_start : chunk_start + _CHUNK_SIZE]
+            np.matmul(centred_frames, centred_weights.T, out=distances_of_chunk)
+            distances_of_chunk *= -2
+            distances_of_chunk += squared_norms
+            distances_of_chunk += np.sum(centred_frames**2, axis=1)[:, None]
+        return np.maximum(squared_distances, 0.0, out=squared_distances)
 
     @cached_property
     def _centred_weights(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -187,15 +187,19 @@ def learn_weights(
     if not keys or len({schedule.steps for schedule in schedules}) != 1:
         raise ValueError("keys and schedules: give one at least of each, and schedules that show as many frames.")
     shape = _check_shape(shape)
-    pairs = [(key, schedule) for key in keys for schedule in schedules]
-    initial_weights = np.stack([_draw_initial_weights(frames, key, shape) for key, _ in pairs])
-    orders = np.stack([_draw_order(key, len(frames), schedule.steps) for key, schedule in pairs])
-    learning_rates = np.stack([schedule.rates() for _, schedule in pairs])
+    key_schedule_pairs = [(key, schedule) for key in keys for schedule in schedules]
+    initial_weights = np.stack([_draw_initial_weights(frames, key, shape) for key, _ in key_schedule_pairs])
+    frame_orders = np.stack([_draw_order(key, len(frames), schedule.steps) for key, schedule in key_schedule_pairs])
+    learning_rates = np.stack([schedule.rates() for _, schedule in key_schedule_pairs])
     max_ordering = max(schedule.ordering for schedule in schedules)
-    radii = np.stack([_extend_radii(schedule.radii(shape), max_ordering) for _, schedule in pairs])
-    train_maps = jax.vmap(train, in_axes=(0, None, 0, 0, 0)) if len(pairs) > 1 else _train_single_map
-    weights, curves = train_maps(jnp.asarray(initial_weights), jnp.asarray(frames), orders, learning_rates, radii)
-    return np.asarray(weights), np.asarray(curves)
+    neighbourhood_radii = np.stack(
+        [_extend_radii(schedule.radii(shape), max_ordering) for _, schedule in key_schedule_pairs]
+    )
+    train_maps = jax.vmap(train, in_axes=(0, None, 0, 0, 0)) if len(key_schedule_pairs) > 1 else _train_single_map
+    weights, mean_weight_curves = train_maps(
+        jnp.asarray(initial_weights), jnp.asarray(frames), frame_orders, learning_rates, neighbourhood_radii
+    )
+    return np.asarray(weights), np.asarray(mean_weight_curves)
 
 
 def checked_frames(values, num_channels: int | None = None) -> Float[np.ndarray, "n M"]:
@@ -211,10 +215,10 @@ def checked_frames(values, num_channels: int | None = None) -> Float[np.ndarray,
     if num_channels is not None and frames.shape[1] != num_channels:
         raise ValueError(f"frames has {frames.shape[1]} channels, and the map was learnt from {num_channels}.")
     if not np.isfinite(frames).all():
-        rows = int((~np.isfinite(frames).all(axis=1)).sum())
+        num_invalid_frames = int((~np.isfinite(frames).all(axis=1)).sum())
         raise ValueError(
-            f"frames: {counted(rows, 'frame')} of {len(frames)} have NaN or infinite readings; leave those frames out, "
-            "or those channels."
+            f"frames: {counted(num_invalid_frames, 'frame')} of {len(frames)} have NaN or infinite readings; leave "
+            "those frames out, or those channels."
         )
     return frames
 
@@ -229,7 +233,8 @@ def _extend_radii(radii: Float[np.ndarray, " O"], max_ordering: int) -> Float[np
 
 def _train_single_map(initial_weights, frames, frame_orders, learning_rates, radii):
     return tuple(
-        array[None] for array in train(initial_weights[0], frames, frame_orders[0], learning_rates[0], radii[0])
+        map_result[None]
+        for map_result in train(initial_weights[0], frames, frame_orders[0], learning_rates[0], radii[0])
     )
 
 
@@ -245,27 +250,29 @@ def _create_map(weights: np.ndarray, frames: np.ndarray, scale: float | None) ->
 
 def _draw_initial_weights(frames: np.ndarray, key: Array, shape: tuple[int, int]) -> Float[np.ndarray, "R C M"]:
     """Draw small random numbers as the initial weights of a map."""
-    deviation = _INITIAL_DEVIATION * float(np.sqrt(np.mean(frames**2)))
-    return deviation * np.asarray(jax.random.normal(key, (*shape, frames.shape[1])))
+    initial_deviation = _RELATIVE_INITIAL_DEVIATION * float(np.sqrt(np.mean(frames**2)))
+    return initial_deviation * np.asarray(jax.random.normal(key, (*shape, frames.shape[1])))
 
 
 def _draw_order(key: Array, num_frames: int, num_steps: int) -> Int[np.ndarray, " T"]:
     """Draw the order in which frames are shown in training: a new permutation each time that all frames have been
     shown."""
-    random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-    permutations = [random.permutation(num_frames) for _ in range(-(-num_steps // num_frames))]
-    return np.concatenate(permutations)[:num_steps]
+    generator = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    frame_permutations = [generator.permutation(num_frames) for _ in range(-(-num_steps // num_frames))]
+    return np.concatenate(frame_permutations)[:num_steps]
 
 
-def _check_shape(shape) -> tuple[int, int]:
-    requirement = "two whole numbers, rows and columns, such as (32, 32)"
-    check_kind("shape", shape, (tuple, list), requirement)
-    if len(shape) != 2 or not all(is_number(count) and int(count) == count and count >= 1 for count in shape):
-        raise ValueError(f"shape must be {requirement}; it is {shape!r}.")
-    rows, columns = int(shape[0]), int(shape[1])
-    if rows * columns < 2:
+def _check_shape(grid_shape) -> tuple[int, int]:
+    requirement_text = "two whole numbers, rows and columns, such as (32, 32)"
+    check_kind("shape", grid_shape, (tuple, list), requirement_text)
+    if len(grid_shape) != 2 or not all(
+        is_number(grid_length) and int(grid_length) == grid_length and grid_length >= 1 for grid_length in grid_shape
+    ):
+        raise ValueError(f"shape must be {requirement_text}; it is {grid_shape!r}.")
+    num_rows, num_columns = int(grid_shape[0]), int(grid_shape[1])
+    if num_rows * num_columns < 2:
         raise ValueError("shape: a map needs two neurons or more.")
-    return rows, columns
+    return num_rows, num_columns
 
 
 @dataclass(frozen=True)
@@ -309,13 +316,19 @@ def map_quality(learnt: SelfOrganisingMap, frames: ArrayLike) -> MapQuality:
     frames = learnt.checked(frames)
     if len(frames) <= 2 * _NUM_NEIGHBOURS:
         raise ValueError(f"frames: {len(frames)} are too few to compare; give {2 * _NUM_NEIGHBOURS + 1} or more.")
-    nearest_neurons, distances = learnt.nearest(frames, 2)
-    row, column = np.unravel_index(nearest_neurons, learnt.shape)
-    grid_distances = np.maximum(np.abs(row[:, 0] - row[:, 1]), np.abs(column[:, 0] - column[:, 1]))
+    nearest_neurons, neuron_distances = learnt.nearest(frames, 2)
+    winner_rows, winner_columns = np.unravel_index(nearest_neurons, learnt.shape)
+    grid_distances = np.maximum(
+        np.abs(winner_rows[:, 0] - winner_rows[:, 1]), np.abs(winner_columns[:, 0] - winner_columns[:, 1])
+    )
     compared_frames = np.unique(np.linspace(0, len(frames) - 1, _MAX_COMPARED_FRAMES).astype(int))
-    grid_positions = np.stack([row[compared_frames, 0], column[compared_frames, 0]], axis=1).astype(float)
+    grid_positions = np.stack([winner_rows[compared_frames, 0], winner_columns[compared_frames, 0]], axis=1).astype(
+        float
+    )
     trustworthiness_score = trustworthiness(frames[compared_frames], grid_positions, n_neighbors=_NUM_NEIGHBOURS)
-    return MapQuality(float(distances[:, 0].mean()), float(np.mean(grid_distances > 1)), float(trustworthiness_score))
+    return MapQuality(
+        float(neuron_distances[:, 0].mean()), float(np.mean(grid_distances > 1)), float(trustworthiness_score)
+    )
 
 
 def learning_curves(
@@ -332,9 +345,12 @@ def learning_curves(
     channels). The initial weights of the maps are small. The neighbourhood radius is constant, half the map's longer
     side. Raises `ValueError` as `SelfOrganisingMap.fit` does.
     """
-    radius = max(shape) / 2
-    schedules = [MapSchedule(steps, 0, (float(rate), float(rate)), (radius, radius)) for rate in rates]
-    return learn_weights(checked_frames(frames), [key], shape, schedules)[1]
+    constant_radius = max(shape) / 2
+    constant_schedules = [
+        MapSchedule(steps, 0, (float(constant_rate), float(constant_rate)), (constant_radius, constant_radius))
+        for constant_rate in rates
+    ]
+    return learn_weights(checked_frames(frames), [key], shape, constant_schedules)[1]
 
 
 def time_constant(curve: ArrayLike) -> float:
@@ -344,8 +360,8 @@ def time_constant(curve: ArrayLike) -> float:
     The final value is the mean of the last tenth of the curve. Raises `ValueError` for a curve that is not
     one-dimensional, not finite, or shorter than ten steps.
     """
-    values = real_array("curve", curve, "the means (T,) of a map's weights")
-    if values.ndim != 1 or len(values) < 10 or not np.isfinite(values).all():
-        raise ValueError(f"curve must be finite, (T,), of ten steps or more; it has shape {values.shape}.")
-    final_value = values[-len(values) // 10 :].mean()
-    return float(1 + np.argmax(values / final_value >= 1 - np.exp(-1)))
+    curve_values = real_array("curve", curve, "the means (T,) of a map's weights")
+    if curve_values.ndim != 1 or len(curve_values) < 10 or not np.isfinite(curve_values).all():
+        raise ValueError(f"curve must be finite, (T,), of ten steps or more; it has shape {curve_values.shape}.")
+    final_value = curve_values[-len(curve_values) // 10 :].mean()
+    return float(1 + np.argmax(curve_values / final_value >= 1 - np.exp(-1)))

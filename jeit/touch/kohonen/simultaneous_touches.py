@@ -90,19 +90,23 @@ def touches_reported(
     superposition = _TouchSuperposition.from_frame(placed, frame, reference)
     if apart is None:
         apart = _RELATIVE_SEPARATION * float(np.ptp(superposition.places, axis=0).max())
-    neuron_weights, residual = superposition.fit_weights(np.ones(len(superposition.places), bool))
+    neuron_weights, residual_sum_of_squares = superposition.fit_weights(np.ones(len(superposition.places), bool))
     num_neurons = np.count_nonzero(neuron_weights)
     if not num_neurons:
         return []
-    variance = max(residual / max(len(superposition.change) - num_neurons, 1), superposition.variance)
-    selected_groups = _select_groups(superposition, superposition.group_neurons(neuron_weights, apart), variance)
+    residual_variance = max(
+        residual_sum_of_squares / max(len(superposition.frame_change) - num_neurons, 1), superposition.map_variance
+    )
+    selected_groups = _select_groups(
+        superposition, superposition.group_neurons(neuron_weights, apart), residual_variance
+    )
     if not selected_groups:
         return []
     neuron_weights, _ = superposition.fit_weights(np.any(selected_groups, axis=0))
     touches = [
-        _create_touch(superposition.places[group], neuron_weights[group])
-        for group in selected_groups
-        if neuron_weights[group].any()
+        _create_touch(superposition.places[neuron_group], neuron_weights[neuron_group])
+        for neuron_group in selected_groups
+        if neuron_weights[neuron_group].any()
     ]
     touches.sort(key=lambda touch: -touch.strength)
     return [touch for touch in touches if touch.strength >= least * max(1.0, touches[0].strength)]
@@ -110,36 +114,42 @@ def touches_reported(
 
 @dataclass(frozen=True)
 class _TouchSuperposition:
-    """Model of the voltage `change` of a frame as a weighted sum of the `changes` of neurons at `places`.
+    """Model of the `frame_change`, of voltages, as a weighted sum of the `neuron_changes` of neurons at `places`.
 
-    `change` (channels,) and `changes` (neurons, channels) are divided by the root mean square of the neurons' changes;
-    `variance`: residual variance of a channel, in the square of the same unit; `places` in metres.
+    `frame_change` (channels,) and `neuron_changes` (neurons, channels) are divided by the root mean square of the
+    neurons' changes; `map_variance`: residual variance of a channel, in the square of this unit; `places` in metres.
     """
 
-    change: Float[np.ndarray, " M"]
-    changes: Float[np.ndarray, "k M"]
+    frame_change: Float[np.ndarray, " M"]
+    neuron_changes: Float[np.ndarray, "k M"]
     places: Float[np.ndarray, "k d"]
-    variance: float
+    map_variance: float
 
     @classmethod
     def from_frame(cls, placed_map: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> "_TouchSuperposition":
         check_kind("placed", placed_map, PlacedMap, "a map with places, as of PlacedMap.learn")
         frame_values, reference_values = (
-            _check_frame(placed_map, name, array) for name, array in (("frame", frame), ("reference", reference))
+            _check_frame(placed_map, frame_name, voltages)
+            for frame_name, voltages in (("frame", frame), ("reference", reference))
         )
-        changes = placed_map.learnt.weights[placed_map.placed] - reference_values
-        size = float(np.sqrt(np.mean(changes**2))) or 1.0
+        neuron_changes = placed_map.learnt.weights[placed_map.placed] - reference_values
+        rms_change = float(np.sqrt(np.mean(neuron_changes**2))) or 1.0
         placed_positions = placed_map.places[placed_map.placed]
         return cls(
-            (frame_values - reference_values) / size, changes / size, placed_positions, (placed_map.missed / size) ** 2
+            (frame_values - reference_values) / rms_change,
+            neuron_changes / rms_change,
+            placed_positions,
+            (placed_map.missed / rms_change) ** 2,
         )
 
-    def fit_weights(self, neurons: Bool[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " k"], float]:
-        """Fit the shares of the selected `neurons` in the frame; also returns the residual sum of squares."""
+    def fit_weights(self, is_selected_neuron: Bool[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " k"], float]:
+        """Fit the shares of the neurons `is_selected_neuron` in the frame; also returns the residual sum of squares."""
         from scipy.optimize import nnls
 
-        neuron_weights = np.zeros(len(neurons))
-        neuron_weights[neurons], residual_norm = nnls(self.changes[neurons].T, self.change)
+        neuron_weights = np.zeros(len(is_selected_neuron))
+        neuron_weights[is_selected_neuron], residual_norm = nnls(
+            self.neuron_changes[is_selected_neuron].T, self.frame_change
+        )
         return neuron_weights, float(residual_norm) ** 2
 
     def group_neurons(
@@ -156,28 +166,37 @@ class _TouchSuperposition:
         cluster_numbers = np.ones(1, int)
         if len(neurons_with_share) > 1:
             cluster_numbers = fcluster(linkage(self.places[neurons_with_share], "single"), min_distance, "distance")
-        clusters = [neurons_with_share[cluster_numbers == number] for number in np.unique(cluster_numbers)]
-        clusters.sort(key=lambda cluster: -np.linalg.norm(neuron_weights[cluster] @ self.changes[cluster]))
+        clusters = [
+            neurons_with_share[cluster_numbers == cluster_number] for cluster_number in np.unique(cluster_numbers)
+        ]
+        clusters.sort(
+            key=lambda cluster_neurons: (
+                -np.linalg.norm(neuron_weights[cluster_neurons] @ self.neuron_changes[cluster_neurons])
+            )
+        )
         return [
-            np.linalg.norm(self.places[:, None] - self.places[cluster], axis=-1).min(axis=1) < min_distance / 2
-            for cluster in clusters[:_MAX_TOUCHES]
+            np.linalg.norm(self.places[:, None] - self.places[cluster_neurons], axis=-1).min(axis=1) < min_distance / 2
+            for cluster_neurons in clusters[:_MAX_TOUCHES]
         ]
 
 
 def _select_groups(
-    model: _TouchSuperposition, groups: list[np.ndarray], variance: float
+    superposition: _TouchSuperposition, neuron_groups: list[np.ndarray], residual_variance: float
 ) -> list[Bool[np.ndarray, " k"]]:
     """Select groups of neurons by forward selection until no further group reduces the residual of the frame enough."""
     selected_groups: list[np.ndarray] = []
-    residual = float(model.change @ model.change)
-    remaining_groups = list(groups)
+    residual_sum_of_squares = float(superposition.frame_change @ superposition.frame_change)
+    remaining_groups = list(neuron_groups)
     while remaining_groups:
-        new_residuals = [model.fit_weights(np.any([*selected_groups, group], axis=0))[1] for group in remaining_groups]
+        new_residuals = [
+            superposition.fit_weights(np.any([*selected_groups, neuron_group], axis=0))[1]
+            for neuron_group in remaining_groups
+        ]
         best_index = int(np.argmin(new_residuals))
-        if residual - new_residuals[best_index] < _MIN_RESIDUAL_DECREASE * variance:
+        if residual_sum_of_squares - new_residuals[best_index] < _MIN_RESIDUAL_DECREASE * residual_variance:
             break
         selected_groups.append(remaining_groups.pop(best_index))
-        residual = new_residuals[best_index]
+        residual_sum_of_squares = new_residuals[best_index]
     return selected_groups
 
 
@@ -188,11 +207,11 @@ def _create_touch(places: Float[np.ndarray, "k d"], neuron_weights: Float[np.nda
     return MapTouch(centroid, float(standard_distance), float(neuron_weights.sum()))
 
 
-def _check_frame(placed_map: PlacedMap, name: str, value) -> Float[np.ndarray, " M"]:
-    values = real_array(name, value, "one frame (M,)")
-    if values.shape != placed_map.learnt.weights.shape[2:] or not np.isfinite(values).all():
+def _check_frame(placed_map: PlacedMap, frame_name: str, frame_argument) -> Float[np.ndarray, " M"]:
+    frame_values = real_array(frame_name, frame_argument, "one frame (M,)")
+    if frame_values.shape != placed_map.learnt.weights.shape[2:] or not np.isfinite(frame_values).all():
         raise ValueError(
-            f"{name} must be one finite frame of {placed_map.learnt.weights.shape[2]} channels; it has shape "
-            f"{values.shape}" + ("." if np.isfinite(values).all() else ", and NaN or infinite readings.")
+            f"{frame_name} must be one finite frame of {placed_map.learnt.weights.shape[2]} channels; it has shape "
+            f"{frame_values.shape}" + ("." if np.isfinite(frame_values).all() else ", and NaN or infinite readings.")
         )
-    return values
+    return frame_values

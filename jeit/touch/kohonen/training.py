@@ -58,10 +58,12 @@ class MapSchedule(Module):
 
     def __check_init__(self):
         """Check the fields. Raises `ValueError` for invalid numbers of frames, learning rates and radii."""
-        for name in ("ordering", "tuning"):
-            value = getattr(self, name)
-            if not (is_number(value) and int(value) == value and value >= 0):
-                raise ValueError(f"{name} must be a whole number of frames, zero or more; it is {describe(value)}.")
+        for field_name in ("ordering", "tuning"):
+            field_value = getattr(self, field_name)
+            if not (is_number(field_value) and int(field_value) == field_value and field_value >= 0):
+                raise ValueError(
+                    f"{field_name} must be a whole number of frames, zero or more; it is {describe(field_value)}."
+                )
         if not self.ordering + self.tuning:
             raise ValueError("ordering and tuning are both zero: nothing would be learnt.")
         _check_decreasing("rate", self.rate, 1.0, "shares of the way to a frame, at most 1, such as (0.3, 0.02)")
@@ -99,95 +101,105 @@ def train(
     phase, in grid steps. The frames after these are shown in the tuning phase. The function may be mapped by `jax.vmap`
     over weights, orders, rates and radii.
     """
-    shape, mean_frame, num_ordering = weights.shape[:2], frames.mean(axis=0), len(radii)
+    grid_shape, mean_frame, num_ordering = weights.shape[:2], frames.mean(axis=0), len(radii)
 
-    def train_phase(phase, weight_rows, block_size, frame_order, learning_rates, *radii):
+    def train_phase(training_phase, weight_rows, block_size, frame_order, learning_rates, *radii):
         num_padding = -len(frame_order) % block_size
         # Frames are appended to fill the last block; their learning rate is 0, so they change no weights.
-        order_rates = [jnp.pad(values, (0, num_padding)) for values in (frame_order, learning_rates)]
-        blocks = *order_rates, *(jnp.pad(values, (0, num_padding), "edge") for values in radii)
-
-        def train_block(weight_rows, block):
-            frame_indices, *parameters = block
-            return phase(shape, weight_rows, frames[frame_indices] - mean_frame, *parameters)
-
-        weight_rows, curve = jax.lax.scan(
-            train_block, weight_rows, tuple(values.reshape(-1, block_size) for values in blocks)
+        order_rates = [
+            jnp.pad(frame_parameters, (0, num_padding)) for frame_parameters in (frame_order, learning_rates)
+        ]
+        frame_blocks = (
+            *order_rates,
+            *(jnp.pad(frame_parameters, (0, num_padding), "edge") for frame_parameters in radii),
         )
-        return weight_rows, curve.reshape(-1)[: len(frame_order)]
 
-    weight_rows, curves = (weights - mean_frame).reshape(-1, weights.shape[2]), []
+        def train_block(weight_rows, frame_block):
+            frame_indices, *phase_parameters = frame_block
+            return training_phase(grid_shape, weight_rows, frames[frame_indices] - mean_frame, *phase_parameters)
+
+        weight_rows, mean_weight_curve = jax.lax.scan(
+            train_block,
+            weight_rows,
+            tuple(frame_parameters.reshape(-1, block_size) for frame_parameters in frame_blocks),
+        )
+        return weight_rows, mean_weight_curve.reshape(-1)[: len(frame_order)]
+
+    weight_rows, mean_weight_curves = (weights - mean_frame).reshape(-1, weights.shape[2]), []
     if num_ordering:
-        weight_rows, curve = train_phase(
+        weight_rows, mean_weight_curve = train_phase(
             _ordering_phase, weight_rows, _ORDERING_FRAMES, frame_order[:num_ordering], rates[:num_ordering], radii
         )
-        curves.append(curve)
+        mean_weight_curves.append(mean_weight_curve)
     if len(frame_order) > num_ordering:
-        weight_rows, curve = train_phase(
+        weight_rows, mean_weight_curve = train_phase(
             _tuning_phase, weight_rows, _TUNING_FRAMES, frame_order[num_ordering:], rates[num_ordering:]
         )
-        curves.append(curve)
-    return weight_rows.reshape(weights.shape) + mean_frame, jnp.concatenate(curves) + mean_frame.mean()
+        mean_weight_curves.append(mean_weight_curve)
+    return weight_rows.reshape(weights.shape) + mean_frame, jnp.concatenate(mean_weight_curves) + mean_frame.mean()
 
 
-def _ordering_phase(shape, weights, frames, rates, radii):
+def _ordering_phase(grid_shape, weights, frames, learning_rates, radii):
     """Show frames (frames, channels) to a map in the ordering phase, in which all neurons move.
 
     Returns the weights (neurons, channels) after these frames, and the mean of all weights after each frame.
     """
-    row, column = jnp.arange(shape[0])[:, None], jnp.arange(shape[1])
+    grid_rows, grid_columns = jnp.arange(grid_shape[0])[:, None], jnp.arange(grid_shape[1])
 
-    def show_frame(state, step):
-        distances, weight_means = state
-        frame_index, rate, radius, frame_distances, frame_mean = step
-        own_distances = distances[frame_index]
-        best_row, best_column = _find_winner(own_distances, shape)
-        move_fractions = rate * jnp.exp(
-            -((row - best_row) ** 2 + (column - best_column) ** 2) / (2 * radius**2)
+    def show_frame(state, frame_step):
+        neuron_distances, weight_means = state
+        frame_index, learning_rate, radius, frame_distances, frame_mean = frame_step
+        own_distances = neuron_distances[frame_index]
+        best_row, best_column = _find_winner(own_distances, grid_shape)
+        move_fractions = learning_rate * jnp.exp(
+            -((grid_rows - best_row) ** 2 + (grid_columns - best_column) ** 2) / (2 * radius**2)
         ).reshape(-1)
-        distances = (1 - move_fractions) * distances + move_fractions * (
+        neuron_distances = (1 - move_fractions) * neuron_distances + move_fractions * (
             frame_distances[:, None] - (1 - move_fractions) * own_distances
         )
         weight_means = weight_means + move_fractions * (frame_mean - weight_means)
-        return (distances, weight_means), (move_fractions, weight_means.mean())
+        return (neuron_distances, weight_means), (move_fractions, weight_means.mean())
 
     initial_state, frame_distances = (
         (_squared_distances(frames, weights), weights.mean(axis=1)),
         _squared_distances(frames, frames),
     )
-    steps = jnp.arange(len(frames)), rates, radii, frame_distances, frames.mean(axis=1)
-    _, (move_fractions, curve) = jax.lax.scan(show_frame, initial_state, steps)
-    return _move_weights(weights, move_fractions, frames), curve
+    frame_steps = jnp.arange(len(frames)), learning_rates, radii, frame_distances, frames.mean(axis=1)
+    _, (move_fractions, mean_weight_curve) = jax.lax.scan(show_frame, initial_state, frame_steps)
+    return _move_weights(weights, move_fractions, frames), mean_weight_curve
 
 
-def _tuning_phase(shape, weights, frames, rates):
+def _tuning_phase(grid_shape, weights, frames, learning_rates):
     """Show frames (frames, channels) to a map in the tuning phase, in which only the winner moves.
 
     Returns the weights (neurons, channels) after these frames, and the mean of all weights after each frame."""
 
-    def show_frame(state, step):
-        distances, weight_means, (winning_neuron, winning_distances) = state
-        frame_index, rate, frame_distances, frame_mean = step
+    def show_frame(state, frame_step):
+        neuron_distances, weight_means, (winning_neuron, winning_distances) = state
+        frame_index, learning_rate, frame_distances, frame_mean = frame_step
         # The distances of the previous frame's winner are written before any distances are read, which avoids a copy of
         # the array.
-        distances = distances.at[:, winning_neuron].set(winning_distances, mode=_INDEXING_MODE)
-        row, column = _find_winner(distances[frame_index], shape)
-        winning_neuron = row * shape[1] + column
-        distances_before_move = distances.at[:, winning_neuron].get(mode=_INDEXING_MODE)
-        winning_distances = (1 - rate) * distances_before_move + rate * (
-            frame_distances - (1 - rate) * distances_before_move[frame_index]
+        neuron_distances = neuron_distances.at[:, winning_neuron].set(winning_distances, mode=_INDEXING_MODE)
+        winner_row, winner_column = _find_winner(neuron_distances[frame_index], grid_shape)
+        winning_neuron = winner_row * grid_shape[1] + winner_column
+        distances_before_move = neuron_distances.at[:, winning_neuron].get(mode=_INDEXING_MODE)
+        winning_distances = (1 - learning_rate) * distances_before_move + learning_rate * (
+            frame_distances - (1 - learning_rate) * distances_before_move[frame_index]
         )
         weight_means = weight_means.at[winning_neuron].add(
-            rate * (frame_mean - weight_means[winning_neuron]), mode=_INDEXING_MODE
+            learning_rate * (frame_mean - weight_means[winning_neuron]), mode=_INDEXING_MODE
         )
-        return (distances, weight_means, (winning_neuron, winning_distances)), (winning_neuron, weight_means.mean())
+        return (neuron_distances, weight_means, (winning_neuron, winning_distances)), (
+            winning_neuron,
+            weight_means.mean(),
+        )
 
-    distances, frame_distances = _squared_distances(frames, weights), _squared_distances(frames, frames)
-    initial_state = distances, weights.mean(axis=1), (jnp.zeros((), int), distances[:, 0])
-    steps = jnp.arange(len(frames)), rates, frame_distances, frames.mean(axis=1)
-    _, (winners, curve) = jax.lax.scan(show_frame, initial_state, steps)
-    move_fractions = jnp.where(winners[:, None] == winners, rates[:, None], 0.0)
-    return weights.at[winners].set(_move_weights(weights[winners], move_fractions, frames)), curve
+    neuron_distances, frame_distances = _squared_distances(frames, weights), _squared_distances(frames, frames)
+    initial_state = neuron_distances, weights.mean(axis=1), (jnp.zeros((), int), neuron_distances[:, 0])
+    frame_steps = jnp.arange(len(frames)), learning_rates, frame_distances, frames.mean(axis=1)
+    _, (winners, mean_weight_curve) = jax.lax.scan(show_frame, initial_state, frame_steps)
+    move_fractions = jnp.where(winners[:, None] == winners, learning_rates[:, None], 0.0)
+    return weights.at[winners].set(_move_weights(weights[winners], move_fractions, frames)), mean_weight_curve
 
 
 def _squared_distances(frames, weights):
@@ -195,22 +207,22 @@ def _squared_distances(frames, weights):
     return jnp.sum(frames**2, axis=1)[:, None] + jnp.sum(weights**2, axis=1) - 2 * frames @ weights.T
 
 
-def _find_winner(distances, shape):
-    """Find the row and the column of the neuron with the smallest of the `distances` (neurons,).
+def _find_winner(neuron_distances, grid_shape):
+    """Find the row and the column of the neuron with the smallest of the `neuron_distances` (neurons,).
 
     The minimum of each column of the grid is found first, for many columns at once.
     """
-    distances_on_grid = distances.reshape(shape)
-    column = jnp.argmin(distances_on_grid.min(axis=0))
-    return jnp.argmin(distances_on_grid[:, column]), column
+    distances_on_grid = neuron_distances.reshape(grid_shape)
+    winner_column = jnp.argmin(distances_on_grid.min(axis=0))
+    return jnp.argmin(distances_on_grid[:, winner_column]), winner_column
 
 
 def _move_weights(weights, move_fractions, frames):
     """Move the weights of neurons towards frames, one frame after another, by `move_fractions` (frames, neurons) of the
     remaining way."""
 
-    def split_remaining_weight(remaining_weight, share):
-        return remaining_weight * (1 - share), remaining_weight * share
+    def split_remaining_weight(remaining_weight, move_fraction):
+        return remaining_weight * (1 - move_fraction), remaining_weight * move_fraction
 
     # From the last frame to the first: later frames reduce the contribution of a frame by their own shares.
     weight_shares, frame_shares = jax.lax.scan(
@@ -219,9 +231,14 @@ def _move_weights(weights, move_fractions, frames):
     return weight_shares[:, None] * weights + frame_shares.T @ frames
 
 
-def _check_decreasing(name: str, value, maximum: float, requirement: str) -> None:
-    limits = real_array(name, value, f"the first and the last: {requirement}")
-    if limits.shape != (2,) or not 0 < limits[1] <= limits[0] <= maximum or not np.isfinite(limits).all():
+def _check_decreasing(option_name: str, option_value, max_value: float, requirement_text: str) -> None:
+    first_and_last = real_array(option_name, option_value, f"the first and the last: {requirement_text}")
+    if (
+        first_and_last.shape != (2,)
+        or not 0 < first_and_last[1] <= first_and_last[0] <= max_value
+        or not np.isfinite(first_and_last).all()
+    ):
         raise ValueError(
-            f"{name} must be the first and the last, positive and not rising: {requirement}; it is {value!r}."
+            f"{option_name} must be the first and the last, positive and not rising: {requirement_text}; it is "
+            f"{option_value!r}."
         )

@@ -46,10 +46,10 @@ class Neighbourhood:
     def learn(cls, scores: Float[np.ndarray, "N K"]) -> "Neighbourhood":
         """Determine the median norm and the usual distance of the scores (presses, patterns) of training presses."""
         stored_scores = scores[:: -(-len(scores) // _MAX_STORED_PRESSES), :_NUM_SCORES]
-        size = float(np.median(np.linalg.norm(stored_scores, axis=1))) or 1.0
-        unscaled_neighbourhood = cls(stored_scores, size, 1.0)
+        median_norm = float(np.median(np.linalg.norm(stored_scores, axis=1))) or 1.0
+        unscaled_neighbourhood = cls(stored_scores, median_norm, 1.0)
         distances = unscaled_neighbourhood._relative_distances(stored_scores, excludes_nearest=True)
-        return cls(stored_scores, size, max(float(np.quantile(distances, _USUAL_NOVELTY_QUANTILE)), 1e-6))
+        return cls(stored_scores, median_norm, max(float(np.quantile(distances, _USUAL_NOVELTY_QUANTILE)), 1e-6))
 
     def __call__(self, scores: Float[np.ndarray, "n K"]) -> Float[np.ndarray, " n"]:
         """Compute the distance of each frame from the nearest training press, from pattern scores (frames, patterns),
@@ -57,8 +57,8 @@ class Neighbourhood:
         return self._relative_distances(scores[:, :_NUM_SCORES]) / self.usual
 
     def _relative_distances(self, scores: np.ndarray, *, excludes_nearest: bool = False) -> np.ndarray:
-        distance = np.asarray(self._search_tree.query(scores, 2)[0])[:, int(excludes_nearest)]
-        return distance / (np.linalg.norm(scores, axis=1) + _NORM_OFFSET_FRACTION * self.size)
+        nearest_distances = np.asarray(self._search_tree.query(scores, 2)[0])[:, int(excludes_nearest)]
+        return nearest_distances / (np.linalg.norm(scores, axis=1) + _NORM_OFFSET_FRACTION * self.size)
 
     @cached_property
     def _search_tree(self) -> KDTree:
@@ -126,17 +126,17 @@ class Channels:
 
         Raises `ValueError` if all channels have constant readings.
         """
-        missing = np.isnan(changes)
-        is_used = missing.mean(axis=0) < 0.5
-        deviation = np.zeros(changes.shape[1])
-        deviation[is_used] = np.nanstd(changes[:, is_used], axis=0)
+        is_missing = np.isnan(changes)
+        is_used = is_missing.mean(axis=0) < 0.5
+        deviations = np.zeros(changes.shape[1])
+        deviations[is_used] = np.nanstd(changes[:, is_used], axis=0)
         max_change = np.nanmax(np.abs(changes[:, is_used]), initial=0.0)
-        is_used &= deviation > max(1e-9 * deviation.max(initial=0.0), _ROUNDING_ERROR * max_change)
+        is_used &= deviations > max(1e-9 * deviations.max(initial=0.0), _ROUNDING_ERROR * max_change)
         if not is_used.any():
             raise ValueError("frames: no channel changes; are these frames, and the skin connected?")
-        scale = deviation[is_used]
-        scaled = np.where(missing[:, is_used], 0.0, changes[:, is_used]) / scale
-        has_reading, index_of_half = ~missing[:, is_used], len(scaled) // 2
+        scale = deviations[is_used]
+        scaled = np.where(is_missing[:, is_used], 0.0, changes[:, is_used]) / scale
+        has_reading, index_of_half = ~is_missing[:, is_used], len(scaled) // 2
         # Residuals are larger for frames outside the training set than in it, so each half of the frames is evaluated
         # with the patterns that were fitted to the other half.
         residuals, novelties, leave_one_out_errors = (
@@ -148,16 +148,16 @@ class Channels:
             (slice(None, index_of_half), slice(index_of_half, None)),
             (slice(index_of_half, None), slice(None, index_of_half)),
         ):
-            variance, directions = _variances(scaled[training_rows])
+            variance, directions = _principal_variances(scaled[training_rows])
             leave_one_out_errors += _leave_one_out_errors(scaled[test_rows], variance, directions)
-            model = _fit_patterns(scaled[training_rows], variance, directions)
-            scores, residual = _most_likely_scores(scaled[test_rows], has_reading[test_rows], *model)
+            pattern_model = _fit_patterns(scaled[training_rows], variance, directions)
+            scores, residual = _most_likely_scores(scaled[test_rows], has_reading[test_rows], *pattern_model)
             residuals.append(np.where(has_reading[test_rows], np.abs(residual), np.nan))
-            novelties.append(_novelty(scores, residual, has_reading[test_rows], model[1]))
+            novelties.append(_frame_novelty(scores, residual, has_reading[test_rows], pattern_model[1]))
         residuals, novelties = np.concatenate(residuals), np.concatenate(novelties)
         max_residuals = _RESIDUAL_FACTOR * np.nanquantile(residuals, _RESIDUAL_QUANTILE, axis=0)
         max_residuals = np.maximum(max_residuals, max(6.0, float(np.nanquantile(residuals, 0.99))))
-        variance, directions = _variances(scaled)
+        variance, directions = _principal_variances(scaled)
         best_diagonal = int(leave_one_out_errors[0].sum(axis=1).argmin())
         weight, leave_one_out_variance = (
             variance / (variance + _CANDIDATE_DIAGONAL_TERMS[best_diagonal]),
@@ -166,15 +166,15 @@ class Channels:
         patterns, score_deviation, noise = _fit_patterns(scaled, variance, directions)
         scores, _ = _most_likely_scores(scaled, has_reading, patterns, score_deviation, noise)
         usual_novelty = float(np.quantile(novelties, 0.99))
-        minima, maxima = np.nanmin(changes[:, is_used], axis=0) / scale, np.nanmax(changes[:, is_used], axis=0) / scale
-        limits = np.stack(
-            [minima - _MAX_RANGE_EXCESS * (maxima - minima), maxima + _MAX_RANGE_EXCESS * (maxima - minima)]
+        lowest, highest = np.nanmin(changes[:, is_used], axis=0) / scale, np.nanmax(changes[:, is_used], axis=0) / scale
+        reading_limits = np.stack(
+            [lowest - _MAX_RANGE_EXCESS * (highest - lowest), highest + _MAX_RANGE_EXCESS * (highest - lowest)]
         )
         neighbourhood = Neighbourhood.learn(scores)
         return cls(
             is_used,
             scale,
-            limits,
+            reading_limits,
             patterns,
             score_deviation,
             noise,
@@ -203,7 +203,7 @@ class Channels:
         has_reading &= ~out_of_range | (
             out_of_range.sum(axis=1, keepdims=True) > max(1, _MAX_EXCEEDING_FRACTION * completed_changes.shape[1])
         )
-        completed_changes, alive = np.where(has_reading, completed_changes, 0.0), has_reading.copy()
+        completed_changes, is_alive = np.where(has_reading, completed_changes, 0.0), has_reading.copy()
         scores, residual = self._scores_and_residuals(completed_changes)
         remaining_frames, num_unique_frames = (
             np.flatnonzero((np.abs(residual) > self.farthest).any(axis=1) | ~has_reading.all(axis=1)),
@@ -223,16 +223,16 @@ class Channels:
             is_completed = is_consistent_with_pattern.all(axis=1)
             is_completed[0] = True
             num_unique_frames = num_unique_frames + 1 if is_completed.sum() == 1 else 0
-            rows = tried_frames[is_completed]
-            alive[rows], scores[rows] = is_working, tried_scores[is_completed]
-            residual[rows] = np.where(is_working, tried_residual[is_completed], 0.0)
-            completed_changes[np.ix_(rows, ~is_working)] = self._predict_others(
-                completed_changes[np.ix_(rows, is_working)], is_working
+            done_frames = tried_frames[is_completed]
+            is_alive[done_frames], scores[done_frames] = is_working, tried_scores[is_completed]
+            residual[done_frames] = np.where(is_working, tried_residual[is_completed], 0.0)
+            completed_changes[np.ix_(done_frames, ~is_working)] = self._predict_others(
+                completed_changes[np.ix_(done_frames, is_working)], is_working
             )
-            remaining_frames = np.setdiff1d(remaining_frames, rows, assume_unique=True)
-        novelty = _novelty(scores, residual, alive, self.spread) / self.usual
-        novelty = np.maximum(novelty, _NOVELTY_AT_USUAL_DISTANCE * self.neighbourhood(scores))
-        return completed_changes * self.scale, alive, novelty, self._excess_deviations(residual, alive)
+            remaining_frames = np.setdiff1d(remaining_frames, done_frames, assume_unique=True)
+        frame_novelty = _frame_novelty(scores, residual, is_alive, self.spread) / self.usual
+        frame_novelty = np.maximum(frame_novelty, _NOVELTY_AT_USUAL_DISTANCE * self.neighbourhood(scores))
+        return completed_changes * self.scale, is_alive, frame_novelty, self._excess_deviations(residual, is_alive)
 
     def _working_channels(self, frame: np.ndarray, has_reading: np.ndarray) -> np.ndarray:
         """Determine which channels of a frame agree with the prediction from the other channels.
@@ -240,17 +240,17 @@ class Channels:
         The channels with the largest deviations are removed repeatedly; then removed channels that agree with the
         remaining channels are restored.
         """
-        alive, min_alive, is_restored = has_reading.copy(), (1 - _MAX_DEAD_FRACTION) * len(frame), False
-        while alive.sum() > min_alive:
-            (relative_deviations,) = self._deviations(frame[None], has_reading[None], alive)[0]
-            max_deviation = np.max(relative_deviations, where=alive, initial=0.0)
+        is_alive, min_alive, is_restored = has_reading.copy(), (1 - _MAX_DEAD_FRACTION) * len(frame), False
+        while is_alive.sum() > min_alive:
+            (relative_deviations,) = self._deviations(frame[None], has_reading[None], is_alive)[0]
+            max_deviation = np.max(relative_deviations, where=is_alive, initial=0.0)
             if max_deviation <= 1 and is_restored:
                 break
             if max_deviation <= 1:
-                alive, is_restored = relative_deviations <= 1, True
+                is_alive, is_restored = relative_deviations <= 1, True
             else:
-                alive &= relative_deviations < (max_deviation if is_restored else max(1.0, max_deviation / 2))
-        return alive
+                is_alive &= relative_deviations < (max_deviation if is_restored else max(1.0, max_deviation / 2))
+        return is_alive
 
     def _deviations(self, changes, has_reading, alive) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute the deviations (frames, channels) of readings from their prediction by the channels that are `alive`.
@@ -272,13 +272,13 @@ class Channels:
         return relative_deviations, scores, residual
 
     def _predict_others(
-        self, alive_readings: Float[np.ndarray, "n a"], alive: np.ndarray
+        self, alive_readings: Float[np.ndarray, "n a"], is_alive: np.ndarray
     ) -> Float[np.ndarray, "n m-a"]:
-        """Predict the most likely readings of the dead channels from those of the channels that are `alive`."""
-        dead_directions = self.directions[~alive] * self.weight
-        right_hand_sides = dead_directions @ (alive_readings @ self.directions[alive]).T
+        """Predict the most likely readings of the dead channels from those of the alive channels, `is_alive`."""
+        dead_directions = self.directions[~is_alive] * self.weight
+        right_hand_sides = dead_directions @ (alive_readings @ self.directions[is_alive]).T
         return np.linalg.solve(
-            np.eye(len(dead_directions)) - dead_directions @ self.directions[~alive].T, right_hand_sides
+            np.eye(len(dead_directions)) - dead_directions @ self.directions[~is_alive].T, right_hand_sides
         ).T
 
     def prediction_errors(self, alive: Bool[np.ndarray, "n m"], max_errors: int) -> Float[np.ndarray, "q n m"]:
@@ -289,35 +289,38 @@ class Channels:
         changes.
         """
         errors = np.zeros((min(max_errors, int((~alive).sum(axis=1).max(initial=0))), *alive.shape))
-        patterns, pattern_indices = np.unique(alive, axis=0, return_inverse=True)
-        for pattern_index, pattern in enumerate(patterns):
-            dead_directions, deviations = self.directions[~pattern], np.sqrt(self.unpredicted[~pattern])
+        alive_patterns, pattern_indices = np.unique(alive, axis=0, return_inverse=True)
+        for pattern_index, is_alive in enumerate(alive_patterns):
+            dead_directions, deviations = self.directions[~is_alive], np.sqrt(self.unpredicted[~is_alive])
             inverse = np.linalg.inv(np.eye(len(dead_directions)) - (dead_directions * self.weight) @ dead_directions.T)
-            variance, vectors = np.linalg.eigh(deviations[:, None] * inverse * deviations)
-            columns = vectors[:, ::-1] * np.sqrt(np.maximum(variance[::-1], 0.0))
-            frames, channels = np.flatnonzero(pattern_indices.ravel() == pattern_index), np.flatnonzero(~pattern)
-            for error_index in range(min(len(errors), len(channels))):
-                errors[np.ix_(np.array([error_index]), frames, channels)] = (
-                    columns[:, error_index] * self.scale[channels]
+            error_variances, eigenvectors = np.linalg.eigh(deviations[:, None] * inverse * deviations)
+            error_columns = eigenvectors[:, ::-1] * np.sqrt(np.maximum(error_variances[::-1], 0.0))
+            frame_indices, dead_channels = (
+                np.flatnonzero(pattern_indices.ravel() == pattern_index),
+                np.flatnonzero(~is_alive),
+            )
+            for error_index in range(min(len(errors), len(dead_channels))):
+                errors[np.ix_(np.array([error_index]), frame_indices, dead_channels)] = (
+                    error_columns[:, error_index] * self.scale[dead_channels]
                 )
         return errors
 
-    def _excess_deviations(self, residual: np.ndarray, alive: np.ndarray) -> Float[np.ndarray, "n m"]:
+    def _excess_deviations(self, residual: np.ndarray, is_alive: np.ndarray) -> Float[np.ndarray, "n m"]:
         """Estimate the standard deviation of reading errors (frames, channels) in excess of the errors of the training
         presses.
 
         The mean square of a frame's residuals, relative to the noise, is about 1 for the training presses. A
-        significant excess over 1, for example after a drift, is attributed to independent errors of all channels that
-        are `alive`. Of such errors, k patterns of m channels explain a fraction k/m.
+        significant excess over 1, for example after a drift, is attributed to independent errors of all alive
+        channels, `is_alive`. Of such errors, k patterns of m channels explain a fraction k/m.
         """
-        num_alive = np.maximum(alive.sum(axis=1), 1)
+        num_alive = np.maximum(is_alive.sum(axis=1), 1)
         degrees_of_freedom = np.maximum(num_alive - self.patterns.shape[1], 1)
         max_mean_square = 1 + _EXCESS_STANDARD_DEVIATIONS * np.sqrt(2 / degrees_of_freedom)
         excess_mean_square = np.maximum(
-            np.sum(np.where(alive, residual, 0.0) ** 2, axis=1) / num_alive - max_mean_square, 0.0
+            np.sum(np.where(is_alive, residual, 0.0) ** 2, axis=1) / num_alive - max_mean_square, 0.0
         )
         return np.sqrt(excess_mean_square * num_alive / degrees_of_freedom)[:, None] * np.where(
-            alive, self.noise * self.scale, 0.0
+            is_alive, self.noise * self.scale, 0.0
         )
 
     def _scores_and_residuals(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -333,38 +336,40 @@ class Channels:
         return np.linalg.solve(weighted_patterns.T @ self.patterns + np.diag(1 / self.spread**2), weighted_patterns.T).T
 
 
-def _variances(scaled: Float[np.ndarray, "N m"]) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "m r"]]:
+def _principal_variances(
+    scaled_changes: Float[np.ndarray, "N m"],
+) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "m r"]]:
     """Compute the principal directions of frames, and the variance along each direction, in decreasing order."""
-    num_frames, num_channels = scaled.shape
+    num_frames, num_channels = scaled_changes.shape
     if num_channels <= num_frames:
-        eigenvalues, directions = np.linalg.eigh(scaled.T @ scaled)
+        eigenvalues, directions = np.linalg.eigh(scaled_changes.T @ scaled_changes)
     else:  # the Gram matrix of frames is smaller than that of channels
-        eigenvalues, eigenvectors = np.linalg.eigh(scaled @ scaled.T)
-        directions = scaled.T @ eigenvectors / np.sqrt(np.maximum(eigenvalues, 1e-300))
+        eigenvalues, eigenvectors = np.linalg.eigh(scaled_changes @ scaled_changes.T)
+        directions = scaled_changes.T @ eigenvectors / np.sqrt(np.maximum(eigenvalues, 1e-300))
     significant_indices = np.flatnonzero(eigenvalues > _ROUNDING_ERROR * eigenvalues[-1])[::-1]
     return eigenvalues[significant_indices] / num_frames, directions[:, significant_indices]
 
 
-def _fit_patterns(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _fit_patterns(scaled_changes, direction_variances, directions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute the patterns of channels (channels, patterns), and the standard deviations of each pattern's score and of
     each channel's noise.
 
     The noise is the part of each channel's readings that the patterns do not explain.
     """
-    explained_fractions = np.cumsum(variance) / np.sum(variance)
+    explained_fractions = np.cumsum(direction_variances) / np.sum(direction_variances)
     num_patterns = min(
         int(np.searchsorted(explained_fractions, 1 - _NOISE_VARIANCE_FRACTION)) + 1,
         _MAX_PATTERNS,
-        max(1, len(scaled) // _PRESSES_PER_PATTERN),
+        max(1, len(scaled_changes) // _PRESSES_PER_PATTERN),
     )
-    num_patterns = min(num_patterns, max(1, scaled.shape[1] // 2))
+    num_patterns = min(num_patterns, max(1, scaled_changes.shape[1] // 2))
     patterns = directions[:, :num_patterns]
-    residuals = scaled - scaled @ patterns @ patterns.T
-    noise = np.sqrt(np.mean(residuals**2, axis=0) * len(scaled) / max(1, len(scaled) - num_patterns))
-    return patterns, np.sqrt(variance[:num_patterns]), np.maximum(noise, 1e-6)
+    residuals = scaled_changes - scaled_changes @ patterns @ patterns.T
+    noise = np.sqrt(np.mean(residuals**2, axis=0) * len(scaled_changes) / max(1, len(scaled_changes) - num_patterns))
+    return patterns, np.sqrt(direction_variances[:num_patterns]), np.maximum(noise, 1e-6)
 
 
-def _leave_one_out_errors(scaled, variance, directions) -> Float[np.ndarray, "2 D m"]:
+def _leave_one_out_errors(scaled_changes, variance, directions) -> Float[np.ndarray, "2 D m"]:
     """Compute mean squared prediction errors of channels for each candidate value that is added to the diagonal of
     their covariance.
 
@@ -372,35 +377,37 @@ def _leave_one_out_errors(scaled, variance, directions) -> Float[np.ndarray, "2 
     error times `residual_factor`, one minus the weight of the channel in its own prediction; `prediction_errors` uses
     the second array.
     """
-    scores, errors = scaled @ directions, []
-    for diagonal in _CANDIDATE_DIAGONAL_TERMS:
-        weight = variance / (variance + diagonal)
-        residual_factor = 1 - np.sum(directions**2 * weight, axis=1)
-        mean_square = np.mean((scaled - (scores * weight) @ directions.T) ** 2, axis=0)
-        errors.append((mean_square / residual_factor**2, mean_square / residual_factor))
-    return np.swapaxes(np.array(errors), 0, 1)
+    scores, squared_errors = scaled_changes @ directions, []
+    for diagonal_term in _CANDIDATE_DIAGONAL_TERMS:
+        direction_weights = variance / (variance + diagonal_term)
+        residual_factor = 1 - np.sum(directions**2 * direction_weights, axis=1)
+        mean_squares = np.mean((scaled_changes - (scores * direction_weights) @ directions.T) ** 2, axis=0)
+        squared_errors.append((mean_squares / residual_factor**2, mean_squares / residual_factor))
+    return np.swapaxes(np.array(squared_errors), 0, 1)
 
 
-def _most_likely_scores(changes, alive, patterns, score_deviation, noise) -> tuple[np.ndarray, np.ndarray]:
+def _most_likely_scores(changes, is_alive, patterns, score_deviation, noise) -> tuple[np.ndarray, np.ndarray]:
     """Compute the most likely pattern scores of frames (frames, patterns), and the residuals of their readings divided
     by the noise.
 
-    Residuals are 0 for readings that are not `alive` (frames, channels).
+    Residuals are 0 for readings that are not alive; `is_alive` (frames, channels).
     """
     weighted_patterns = patterns / noise[:, None] ** 2
-    prior = np.diag(1 / score_deviation**2)
-    scores = np.linalg.solve(weighted_patterns.T @ patterns + prior, weighted_patterns.T @ changes.T).T
-    for frame in np.flatnonzero(~alive.all(axis=1)):
-        alive_patterns = weighted_patterns * alive[frame, :, None]
-        scores[frame] = np.linalg.solve(alive_patterns.T @ patterns + prior, alive_patterns.T @ changes[frame])
-    return scores, np.where(alive, (changes - scores @ patterns.T) / noise, 0.0)
+    prior_precision = np.diag(1 / score_deviation**2)
+    scores = np.linalg.solve(weighted_patterns.T @ patterns + prior_precision, weighted_patterns.T @ changes.T).T
+    for frame_index in np.flatnonzero(~is_alive.all(axis=1)):
+        alive_patterns = weighted_patterns * is_alive[frame_index, :, None]
+        scores[frame_index] = np.linalg.solve(
+            alive_patterns.T @ patterns + prior_precision, alive_patterns.T @ changes[frame_index]
+        )
+    return scores, np.where(is_alive, (changes - scores @ patterns.T) / noise, 0.0)
 
 
-def _novelty(scores, residual, alive, score_deviation) -> np.ndarray:
+def _frame_novelty(scores, residual, is_alive, score_deviation) -> np.ndarray:
     """Compute the novelty of each frame: the larger of the root mean squares of its residuals, relative to the noise,
     and of its pattern scores, relative to their standard deviations.
     """
-    residual_size = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(alive.sum(axis=1), 1))
+    residual_size = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(is_alive.sum(axis=1), 1))
     return np.maximum(residual_size, np.sqrt(np.mean((scores / score_deviation) ** 2, axis=1)))
 
 
@@ -414,22 +421,26 @@ def choose_channels(
     selected channels leave unexplained. Products of targets count as further targets, since places are not linear
     functions of voltages.
     """
-    products = [targets[:, i] * targets[:, j] for i in range(targets.shape[1]) for j in range(i + 1)]
-    unexplained_targets = np.column_stack([targets, *(product - product.mean() for product in products[:20])])
+    target_products = [targets[:, i] * targets[:, j] for i in range(targets.shape[1]) for j in range(i + 1)]
+    unexplained_targets = np.column_stack(
+        [targets, *(target_product - target_product.mean() for target_product in target_products[:20])]
+    )
     unexplained_targets = unexplained_targets - unexplained_targets.mean(axis=0)
-    candidates = scaled - scaled.mean(axis=0)
-    initial_norms = np.sum(candidates**2, axis=0)
+    candidate_changes = scaled - scaled.mean(axis=0)
+    initial_norms = np.sum(candidate_changes**2, axis=0)
     selected_channels: list[int] = []
     for _ in range(min(num_channels, scaled.shape[1])):
-        squared_norms = np.sum(candidates**2, axis=0)
-        gain = np.sum((candidates.T @ unexplained_targets) ** 2, axis=1) / np.where(
+        squared_norms = np.sum(candidate_changes**2, axis=0)
+        explained_energy = np.sum((candidate_changes.T @ unexplained_targets) ** 2, axis=1) / np.where(
             squared_norms > 1e-8 * initial_norms, squared_norms, np.inf
         )
-        gain[selected_channels] = -1
-        best_channel = int(gain.argmax())
+        explained_energy[selected_channels] = -1
+        best_channel = int(explained_energy.argmax())
         selected_channels.append(best_channel)
         if squared_norms[best_channel] > 1e-8 * initial_norms[best_channel]:
-            direction = candidates[:, best_channel] / np.sqrt(squared_norms[best_channel])
-            unexplained_targets = unexplained_targets - np.outer(direction, direction @ unexplained_targets)
-            candidates = candidates - np.outer(direction, direction @ candidates)
+            channel_direction = candidate_changes[:, best_channel] / np.sqrt(squared_norms[best_channel])
+            unexplained_targets = unexplained_targets - np.outer(
+                channel_direction, channel_direction @ unexplained_targets
+            )
+            candidate_changes = candidate_changes - np.outer(channel_direction, channel_direction @ candidate_changes)
     return np.array(selected_channels)

@@ -52,36 +52,48 @@ class ImageReconstruction:
         If a `reference` frame is given, the forward model is calibrated on this frame. The sign of the images is
         determined from the voltage `changes` of presses. Also returns notes on the calibration as text.
         """
-        notes, conductivity, mask = [], 1.0, as_array(is_used)
+        notes, conductivity, channel_mask = [], 1.0, as_array(is_used)
         if reference is not None and np.abs(reference[is_used]).max() > 0:
             # -1 if the polarity of the channels is reversed.
             polarity_sign = np.sign(np.where(is_used, model.voltages(1.0), 0.0) @ reference)
-            calibration = calibrate(model, as_array(polarity_sign * reference), mask=mask, contact="fixed")
+            calibration = calibrate(model, as_array(polarity_sign * reference), mask=channel_mask, contact="fixed")
             if np.isfinite(calibration.misfit):
                 model, conductivity = calibration.model, calibration.conductivity
                 notes += [calibration.note] if calibration.note else []
-        matrix = np.asarray(one_step(model, conductivity, mask=mask).matrix).T[is_used]
-        centres, sizes = np.asarray(centroids(model.mesh)), np.asarray(measures(model.mesh))
-        neighbour_indices = KDTree(centres).query(centres, max(1, int(_NEIGHBOUR_FRACTION * len(centres))))[1]
-        image = changes @ matrix
-        sign = np.sign(np.median(image.max(axis=1) + image.min(axis=1))) or 1.0
-        return cls(sign * matrix, centres, sizes, np.reshape(neighbour_indices, (len(centres), -1))), notes
+        reconstruction_matrix = np.asarray(one_step(model, conductivity, mask=channel_mask).matrix).T[is_used]
+        cell_centres, cell_sizes = np.asarray(centroids(model.mesh)), np.asarray(measures(model.mesh))
+        neighbour_indices = KDTree(cell_centres).query(
+            cell_centres, max(1, int(_NEIGHBOUR_FRACTION * len(cell_centres)))
+        )[1]
+        press_images = changes @ reconstruction_matrix
+        touch_sign = np.sign(np.median(press_images.max(axis=1) + press_images.min(axis=1))) or 1.0
+        return cls(
+            touch_sign * reconstruction_matrix,
+            cell_centres,
+            cell_sizes,
+            np.reshape(neighbour_indices, (len(cell_centres), -1)),
+        ), notes
 
     def contacts(self, images: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n d+3"]:
         """Compute features of the strongest contact of each image: the centroid, and the logarithms of the peak, the
         integral and the area or volume."""
         row_indices = np.arange(len(images))[:, None]
-        cells = self.around[images.argmax(axis=1)]
-        neighbour_values, sizes = images[row_indices, cells], self.sizes[cells]
-        peak = np.maximum(images.max(axis=1), 1e-300)[:, None]
-        weights_above_level = sizes * np.maximum(neighbour_values - _CONTACT_LEVEL * peak, 0.0)
+        neighbour_cells = self.around[images.argmax(axis=1)]
+        neighbour_values, neighbour_sizes = images[row_indices, neighbour_cells], self.sizes[neighbour_cells]
+        image_peaks = np.maximum(images.max(axis=1), 1e-300)[:, None]
+        weights_above_level = neighbour_sizes * np.maximum(neighbour_values - _CONTACT_LEVEL * image_peaks, 0.0)
         total_weight = np.maximum(weights_above_level.sum(axis=1, keepdims=True), 1e-300)
-        centroid = np.einsum("nk,nkd->nd", weights_above_level / total_weight, self.centres[cells])
-        integral, area = (
-            (sizes * np.maximum(neighbour_values, 0.0)).sum(axis=1),
-            (sizes * (weights_above_level > 0)).sum(axis=1),
+        contact_centroids = np.einsum("nk,nkd->nd", weights_above_level / total_weight, self.centres[neighbour_cells])
+        contact_integrals, contact_areas = (
+            (neighbour_sizes * np.maximum(neighbour_values, 0.0)).sum(axis=1),
+            (neighbour_sizes * (weights_above_level > 0)).sum(axis=1),
         )
-        return np.column_stack([centroid, np.log(np.maximum(np.column_stack([peak, integral, area]), 1e-300))])
+        return np.column_stack(
+            [
+                contact_centroids,
+                np.log(np.maximum(np.column_stack([image_peaks, contact_integrals, contact_areas]), 1e-300)),
+            ]
+        )
 
 
 @dataclass(frozen=True)
@@ -93,7 +105,9 @@ class ContactFeatures:
 
     def __call__(self, changes: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n p"]:
         """Compute the features (frames, features) of voltage changes (frames, channels)."""
-        return apply_in_parts(lambda rows: self.imaged.contacts(rows @ self.imaged.matrix), changes, _CHUNK_SIZE)
+        return apply_in_parts(
+            lambda change_rows: self.imaged.contacts(change_rows @ self.imaged.matrix), changes, _CHUNK_SIZE
+        )
 
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
         """Return the unit by which each feature is divided: its standard deviation over the presses."""
@@ -112,12 +126,12 @@ class ImageFeatures:
     def __call__(self, changes: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n p"]:
         """Compute the features (frames, features) of voltage changes (frames, channels)."""
 
-        def features(rows: np.ndarray) -> np.ndarray:
-            image = rows @ self.imaged.matrix
-            size = np.maximum(np.sqrt(np.mean(image**2, axis=1, keepdims=True)), 1e-300)
-            return np.hstack([self.imaged.contacts(image), np.log(size), image / size])
+        def image_features(change_rows: np.ndarray) -> np.ndarray:
+            image_rows = change_rows @ self.imaged.matrix
+            rms_values = np.maximum(np.sqrt(np.mean(image_rows**2, axis=1, keepdims=True)), 1e-300)
+            return np.hstack([self.imaged.contacts(image_rows), np.log(rms_values), image_rows / rms_values])
 
-        return apply_in_parts(features, changes, _CHUNK_SIZE)
+        return apply_in_parts(image_features, changes, _CHUNK_SIZE)
 
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
         """Return the unit by which each feature is divided.
@@ -126,11 +140,14 @@ class ImageFeatures:
         the image, the unit is the root mean square of the standard deviations of all cells.
         """
         num_other_features = values.shape[1] - len(self.imaged.sizes)
-        deviations = values.std(axis=0)
+        feature_deviations = values.std(axis=0)
         return np.concatenate(
             [
-                deviations[:num_other_features] / _CONTACT_WEIGHT,
-                np.full(len(deviations) - num_other_features, np.sqrt(np.mean(deviations[num_other_features:] ** 2))),
+                feature_deviations[:num_other_features] / _CONTACT_WEIGHT,
+                np.full(
+                    len(feature_deviations) - num_other_features,
+                    np.sqrt(np.mean(feature_deviations[num_other_features:] ** 2)),
+                ),
             ]
         )
 
@@ -161,19 +178,19 @@ class WhitenedChanges:
         """
         from sklearn.covariance import ledoit_wolf
 
-        scale = np.maximum(changes.std(axis=0), 1e-300)
-        group, count = _group_equal_rows(targets)
-        mean_changes = np.zeros((len(count), changes.shape[1]))
-        np.add.at(mean_changes, group, changes / count[group, None])
-        residuals = ((changes - mean_changes[group]) / scale)[count[group] > 1]
-        if not residuals.any():
-            return cls(np.diag(1 / scale))
-        degrees_of_freedom = len(residuals) - np.sum(count > 1)
-        values, vectors = np.linalg.eigh(
-            len(residuals) / degrees_of_freedom * ledoit_wolf(residuals, assume_centered=True)[0]
+        channel_deviations = np.maximum(changes.std(axis=0), 1e-300)
+        group_indices, group_sizes = _group_equal_rows(targets)
+        mean_changes = np.zeros((len(group_sizes), changes.shape[1]))
+        np.add.at(mean_changes, group_indices, changes / group_sizes[group_indices, None])
+        group_residuals = ((changes - mean_changes[group_indices]) / channel_deviations)[group_sizes[group_indices] > 1]
+        if not group_residuals.any():
+            return cls(np.diag(1 / channel_deviations))
+        degrees_of_freedom = len(group_residuals) - np.sum(group_sizes > 1)
+        eigenvalues, eigenvectors = np.linalg.eigh(
+            len(group_residuals) / degrees_of_freedom * ledoit_wolf(group_residuals, assume_centered=True)[0]
         )
-        values = np.maximum(values, 1e-12 * values.max())
-        return cls((vectors / np.sqrt(values)) @ vectors.T / scale[:, None])
+        eigenvalues = np.maximum(eigenvalues, 1e-12 * eigenvalues.max())
+        return cls((eigenvectors / np.sqrt(eigenvalues)) @ eigenvectors.T / channel_deviations[:, None])
 
     def __call__(self, changes: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
         """Compute the whitened features of voltage changes, both (frames, channels)."""
@@ -192,8 +209,8 @@ def are_repeated(targets: Float[np.ndarray, "N d"]) -> bool:
 
 def _group_equal_rows(targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Number the groups of frames with equal `targets`; returns the group of each frame and the size of each group."""
-    group, count = np.unique(targets, axis=0, return_inverse=True, return_counts=True)[1:]
-    return group.ravel(), count
+    group_indices, group_sizes = np.unique(targets, axis=0, return_inverse=True, return_counts=True)[1:]
+    return group_indices.ravel(), group_sizes
 
 
 # Maximum number of principal components.
@@ -202,37 +219,37 @@ _MAX_COMPONENTS = 60
 _PRESSES_PER_COMPONENT = 3
 
 
-def _divide_by_unit(changes, reference, unit):
-    """Compute features (frames, channels): voltage changes divided by the `unit` of each channel."""
-    return changes / unit
+def _divide_by_unit(changes, reference, channel_units):
+    """Compute features (frames, channels): voltage changes divided by the `channel_units` of each channel."""
+    return changes / channel_units
 
 
-def _divide_by_reference(changes, reference, unit):
+def _divide_by_reference(changes, reference, channel_units):
     """Compute features (frames, channels): voltage changes relative to the reference voltages."""
-    size = np.maximum(np.abs(reference), 1e-3 * np.sqrt(np.mean(reference**2, axis=1, keepdims=True)))
-    return changes / np.where(size > 0, size, 1.0)
+    reference_magnitudes = np.maximum(np.abs(reference), 1e-3 * np.sqrt(np.mean(reference**2, axis=1, keepdims=True)))
+    return changes / np.where(reference_magnitudes > 0, reference_magnitudes, 1.0)
 
 
-def _compress_changes(changes, reference, unit):
-    """Compute features (frames, channels): sign(u) log(1 + |u|) of the voltage changes u in the `unit` of each
+def _compress_changes(changes, reference, channel_units):
+    """Compute features (frames, channels): sign(u) log(1 + |u|) of the voltage changes u in the `channel_units` of each
     channel."""
-    return np.sign(changes) * np.log1p(np.abs(changes) / unit)
+    return np.sign(changes) * np.log1p(np.abs(changes) / channel_units)
 
 
-def _normalise_scaled_changes(changes, reference, unit):
-    """Compute features: voltage changes in the `unit` of each channel, divided by their root mean square in the frame,
-    and the logarithm of this root mean square."""
-    size = np.sqrt(np.mean((changes / unit) ** 2, axis=1, keepdims=True))
-    size = np.where(size > 0, size, 1.0)
-    return np.hstack([changes / unit / size, np.log(size)])
+def _normalise_scaled_changes(changes, reference, channel_units):
+    """Compute features: voltage changes in the `channel_units` of each channel, divided by their root mean square in
+    the frame, and the logarithm of this root mean square."""
+    rms_changes = np.sqrt(np.mean((changes / channel_units) ** 2, axis=1, keepdims=True))
+    rms_changes = np.where(rms_changes > 0, rms_changes, 1.0)
+    return np.hstack([changes / channel_units / rms_changes, np.log(rms_changes)])
 
 
-def _normalise_changes(changes, reference, unit):
+def _normalise_changes(changes, reference, channel_units):
     """Compute features: voltage changes divided by their root mean square in the frame, and the logarithm of this root
-    mean square, without `unit`."""
-    size = np.sqrt(np.mean(changes**2, axis=1, keepdims=True))
-    size = np.where(size > 0, size, 1.0)
-    return np.hstack([changes / size, np.log(size)])
+    mean square, without `channel_units`."""
+    rms_changes = np.sqrt(np.mean(changes**2, axis=1, keepdims=True))
+    rms_changes = np.where(rms_changes > 0, rms_changes, 1.0)
+    return np.hstack([changes / rms_changes, np.log(rms_changes)])
 
 
 # Forms of features: functions of changes and reference, both (frames, channels), and of the unit of each channel.
@@ -279,20 +296,23 @@ class Features:
         image.
         """
         if learnt_function is None:
-            unit, values, mean, deviation = standardisation(form, changes, reference)
+            channel_units, feature_values, feature_means, feature_deviations = standardisation(form, changes, reference)
         else:
-            unit, values = np.ones(changes.shape[1]), learnt_function(changes)
-            mean, deviation = values.mean(axis=0), _replace_zeros_by_infinity(learnt_function.deviation(values))
+            channel_units, feature_values = np.ones(changes.shape[1]), learnt_function(changes)
+            feature_means, feature_deviations = (
+                feature_values.mean(axis=0),
+                _replace_zeros_by_infinity(learnt_function.deviation(feature_values)),
+            )
         if not rotated or isinstance(learnt_function, ContactFeatures):
-            return cls(form, unit, mean, deviation, None, learnt_function)
-        rows = np.linalg.svd((values - mean) / deviation, full_matrices=False)[2]
-        components = rows[: max(2, min(_MAX_COMPONENTS, len(values) // _PRESSES_PER_COMPONENT))].T
-        return cls(form, unit, mean, deviation, components, learnt_function)
+            return cls(form, channel_units, feature_means, feature_deviations, None, learnt_function)
+        principal_axes = np.linalg.svd((feature_values - feature_means) / feature_deviations, full_matrices=False)[2]
+        components = principal_axes[: max(2, min(_MAX_COMPONENTS, len(feature_values) // _PRESSES_PER_COMPONENT))].T
+        return cls(form, channel_units, feature_means, feature_deviations, components, learnt_function)
 
     def __call__(self, changes: np.ndarray, reference: np.ndarray) -> Float[np.ndarray, "n k"]:
         """Compute the features (frames, features) of changes and reference voltages (frames, channels)."""
-        values = FORMS[self.form](changes, reference, self.unit) if self.made is None else self.made(changes)
-        standardised_values = (values - self.mean) / self.deviation
+        feature_values = FORMS[self.form](changes, reference, self.unit) if self.made is None else self.made(changes)
+        standardised_values = (feature_values - self.mean) / self.deviation
         return standardised_values if self.components is None else standardised_values @ self.components
 
 
@@ -303,17 +323,22 @@ def standardisation(form: str, changes: np.ndarray, reference: np.ndarray) -> tu
     0; the features (presses, features); the mean of each feature; and the standard deviation of each feature, infinite
     for a constant feature.
     """
-    size = np.abs(changes)
-    unit = np.median(size, axis=0)
-    unit = np.where(unit > 0, unit, np.mean(size, axis=0))
-    values = FORMS[form](changes, reference, np.where(unit > 0, unit, 1.0))
-    return np.where(unit > 0, unit, 1.0), values, values.mean(axis=0), _replace_zeros_by_infinity(values.std(axis=0))
+    change_magnitudes = np.abs(changes)
+    channel_units = np.median(change_magnitudes, axis=0)
+    channel_units = np.where(channel_units > 0, channel_units, np.mean(change_magnitudes, axis=0))
+    feature_values = FORMS[form](changes, reference, np.where(channel_units > 0, channel_units, 1.0))
+    return (
+        np.where(channel_units > 0, channel_units, 1.0),
+        feature_values,
+        feature_values.mean(axis=0),
+        _replace_zeros_by_infinity(feature_values.std(axis=0)),
+    )
 
 
-def _replace_zeros_by_infinity(deviation: np.ndarray) -> np.ndarray:
+def _replace_zeros_by_infinity(feature_deviations: np.ndarray) -> np.ndarray:
     """Replace standard deviations of features by infinity if they are negligible compared with the largest."""
-    is_nonzero_deviation = deviation > 1e-9 * max(deviation.max(), 1e-300)
-    return np.where(is_nonzero_deviation, deviation, np.inf)
+    is_nonzero_deviation = feature_deviations > 1e-9 * max(feature_deviations.max(), 1e-300)
+    return np.where(is_nonzero_deviation, feature_deviations, np.inf)
 
 
 @dataclass(frozen=True)

@@ -179,7 +179,7 @@ class LearntSkin:
             changes = standardise_sessions(changes, group)
         changes = np.where(self._stuck_channels(frames, changes), np.nan, changes)
         predictions = apply_over_threads(
-            self._predict,
+            self._predict_frames,
             changes,
             fill_reference(reference, self.mean_reference, self.channels.used, len(changes)),
             chunk_size=_CHUNK_SIZE,
@@ -196,10 +196,14 @@ class LearntSkin:
         is_constant = (frames == frames[0]).all(axis=0)
         if is_constant.all() or not is_constant.any() or len(frames) < _MIN_TOUCHED_FRAMES:
             return np.zeros_like(is_constant)
-        scaled = np.where(is_constant, 0.0, np.nan_to_num(changes))[:, self.channels.used] / self.channels.scale
-        return is_constant & (np.count_nonzero(np.sqrt(np.mean(scaled**2, axis=1)) > self.quiet) >= _MIN_TOUCHED_FRAMES)
+        scaled_changes = np.where(is_constant, 0.0, np.nan_to_num(changes))[:, self.channels.used] / self.channels.scale
+        return is_constant & (
+            np.count_nonzero(np.sqrt(np.mean(scaled_changes**2, axis=1)) > self.quiet) >= _MIN_TOUCHED_FRAMES
+        )
 
-    def _predict(self, changes: Float[np.ndarray, "n M"], reference: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
+    def _predict_frames(
+        self, changes: Float[np.ndarray, "n M"], reference: Float[np.ndarray, "n m"]
+    ) -> dict[str, np.ndarray]:
         """Predict the learnt fields of `Touches`, by name, from the voltage changes of frames."""
         completed_changes, alive, novelty, excess_mean_square = self.channels.complete(changes)
         is_touched = np.sqrt(np.mean((completed_changes / self.channels.scale) ** 2, axis=1)) > self.quiet
@@ -215,15 +219,15 @@ class LearntSkin:
             is_touched &= label != NO_TOUCH
         has_prediction = (is_touched & ~is_unlike)[:, None]
         if self.place is not None:
-            values, std = self._predict_targets(self.place, completed_changes, reference, alive, excess_mean_square)
+            targets, std = self._predict_targets(self.place, completed_changes, reference, alive, excess_mean_square)
             predictions |= {
-                "position": np.where(has_prediction, values, np.nan),
+                "position": np.where(has_prediction, targets, np.nan),
                 "position_std": np.where(has_prediction, std, np.nan),
             }
         if self.force is not None:
-            values, std = self._predict_targets(self.force, completed_changes, reference, alive, excess_mean_square)
+            targets, std = self._predict_targets(self.force, completed_changes, reference, alive, excess_mean_square)
             is_untouched = ~is_touched & ~is_unlike
-            forces = np.where(has_prediction, np.maximum(values, 0.0), np.nan)[:, 0]
+            forces = np.where(has_prediction, np.maximum(targets, 0.0), np.nan)[:, 0]
             predictions |= {
                 "force": np.where(is_untouched, 0.0, forces),
                 "force_std": np.where(has_prediction, std, np.nan)[:, 0],
@@ -295,11 +299,11 @@ class LearntSkin:
             )
         if not b.any():  # the frames of the training set were voltage changes
             return reference
-        cosine = float(a @ b / np.sqrt((a @ a) * (b @ b))) if a.any() else 0.0
+        similarity = float(a @ b / np.sqrt((a @ a) * (b @ b))) if a.any() else 0.0
         norm_ratio = np.sqrt((a @ a) / (b @ b))
-        if cosine < _MIN_COSINE_SIMILARITY or not 1 / _MAX_NORM_RATIO < norm_ratio < _MAX_NORM_RATIO:
+        if similarity < _MIN_COSINE_SIMILARITY or not 1 / _MAX_NORM_RATIO < norm_ratio < _MAX_NORM_RATIO:
             raise ValueError(
-                f"reference is unlike that of the training set (cosine {cosine:.2f}, {norm_ratio:.3g} "
+                f"reference is unlike that of the training set (cosine {similarity:.2f}, {norm_ratio:.3g} "
                 "times as large): is it of this skin, with its channels in the same order and units?"
             )
         return reference
@@ -395,18 +399,18 @@ def _reduce_channels(
 def _standardised_targets(presses: Presses) -> np.ndarray:
     """Return all quantities of the presses as standardised columns (presses, columns); 0 where a quantity is
     unknown."""
-    columns = []
+    target_columns = []
     if presses.positions is not None:
-        columns.append(presses.positions)
+        target_columns.append(presses.positions)
     if presses.force is not None:
-        columns.append(presses.force[:, None])
+        target_columns.append(presses.force[:, None])
     if presses.label is not None:
-        columns.append(presses.label[:, None] == np.unique(presses.label))
+        target_columns.append(presses.label[:, None] == np.unique(presses.label))
     if presses.touched is not None:
-        columns.append(presses.touched)
-    values = np.column_stack(columns).astype(float)
-    deviation = np.nanstd(values, axis=0)
-    return np.nan_to_num((values - np.nanmean(values, axis=0)) / np.where(deviation > 0, deviation, 1.0))
+        target_columns.append(presses.touched)
+    targets = np.column_stack(target_columns).astype(float)
+    deviations = np.nanstd(targets, axis=0)
+    return np.nan_to_num((targets - np.nanmean(targets, axis=0)) / np.where(deviations > 0, deviations, 1.0))
 
 
 def _quiet_threshold(scaled: np.ndarray, presses: Presses) -> float:
@@ -422,15 +426,16 @@ def _quiet_threshold(scaled: np.ndarray, presses: Presses) -> float:
         is_untouched |= presses.label == NO_TOUCH
     if presses.touched is not None:
         is_untouched |= ~presses.touched.any(axis=1)
-    size = np.sqrt(np.mean(scaled**2, axis=1))
+    rms_size = np.sqrt(np.mean(scaled**2, axis=1))
     if is_untouched.sum() < 5:
-        return 0.5 * float(np.quantile(size[~is_untouched], 0.01))
-    sizes = np.sort(size)
+        return 0.5 * float(np.quantile(rms_size[~is_untouched], 0.01))
+    thresholds = np.sort(rms_size)
     # Choose the threshold with the lowest sum of the error rates for untouched and for touched frames.
     error_sums = [
-        np.mean(size[is_untouched] > threshold) + np.mean(size[~is_untouched] <= threshold) for threshold in sizes
+        np.mean(rms_size[is_untouched] > threshold) + np.mean(rms_size[~is_untouched] <= threshold)
+        for threshold in thresholds
     ]
-    return float(sizes[int(np.argmin(error_sums))])
+    return float(thresholds[int(np.argmin(error_sums))])
 
 
 def _align_frames(changes: np.ndarray, presses: Presses) -> tuple[np.ndarray, Presses, int, list[str]]:
@@ -440,8 +445,8 @@ def _align_frames(changes: np.ndarray, presses: Presses) -> tuple[np.ndarray, Pr
     """
     if presses.positions is None:
         return changes, presses, 0, []
-    rows, folds, _ = places_and_folds(presses)
-    lag, error_without_lag, error_with_lag = estimate_lag(changes[rows], presses.positions[rows], folds)
+    placed, folds, _ = places_and_folds(presses)
+    lag, error_without_lag, error_with_lag = estimate_lag(changes[placed], presses.positions[placed], folds)
     if not lag:
         return changes, presses, 0, []
     frame_rows, press_rows = aligned_slices(len(changes), lag)
@@ -455,6 +460,6 @@ def _align_frames(changes: np.ndarray, presses: Presses) -> tuple[np.ndarray, Pr
     return changes[frame_rows], aligned_presses, lag, [alignment_note]
 
 
-def _list_briefly(numbers: np.ndarray, max_listed: int = 12) -> str:
-    text = ", ".join(str(number) for number in numbers[:max_listed])
-    return text if len(numbers) <= max_listed else f"{text}, … ({len(numbers)} in all)"
+def _list_briefly(channel_numbers: np.ndarray, max_listed: int = 12) -> str:
+    listed_text = ", ".join(str(channel_number) for channel_number in channel_numbers[:max_listed])
+    return listed_text if len(channel_numbers) <= max_listed else f"{listed_text}, … ({len(channel_numbers)} in all)"

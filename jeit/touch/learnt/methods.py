@@ -50,34 +50,42 @@ class GaussianProcess:
         """Fit a Gaussian process to features (presses, features) and standardised targets (presses, targets)."""
         random_order = np.random.default_rng(0).permutation(len(features))
         tuning_presses = random_order[:_NUM_TUNING_PRESSES]
-        length, noise = _estimate_length_and_noise(features[tuning_presses], targets[tuning_presses])
+        kernel_length, noise_ratio = _estimate_length_and_noise(features[tuning_presses], targets[tuning_presses])
         centre_indices = np.sort(random_order[:_MAX_CENTRES])
         centres = features[centre_indices]
-        centre_kernel = _matern_kernel(cdist(centres, centres) / length)
+        centre_kernel = _matern_kernel(cdist(centres, centres) / kernel_length)
         if len(centres) == len(features):
-            matrix, right_hand_side = centre_kernel + noise * np.eye(len(centre_kernel)), targets[centre_indices]
+            system_matrix, right_hand_side = (
+                centre_kernel + noise_ratio * np.eye(len(centre_kernel)),
+                targets[centre_indices],
+            )
         else:
-            press_kernel = _matern_kernel(cdist(features, centres) / length)
-            matrix, right_hand_side = press_kernel.T @ press_kernel + noise * centre_kernel, press_kernel.T @ targets
-            matrix += 1e-8 * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
-        return cls(centres, cho_solve(cho_factor(matrix), right_hand_side), length)
+            press_kernel = _matern_kernel(cdist(features, centres) / kernel_length)
+            system_matrix, right_hand_side = (
+                press_kernel.T @ press_kernel + noise_ratio * centre_kernel,
+                press_kernel.T @ targets,
+            )
+            system_matrix += 1e-8 * np.trace(system_matrix) / len(system_matrix) * np.eye(len(system_matrix))
+        return cls(centres, cho_solve(cho_factor(system_matrix), right_hand_side), kernel_length)
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
         """Predict standardised targets (frames, targets) from features (frames, features)."""
         scaled_centres = self.centres / self.length
         squared_norms = np.sum(scaled_centres**2, axis=1)
 
-        def predict_rows(rows: np.ndarray) -> np.ndarray:
-            rows = rows / self.length
-            squared_distances = np.sum(rows**2, axis=1)[:, None] + squared_norms - 2 * rows @ scaled_centres.T
+        def predict_rows(feature_rows: np.ndarray) -> np.ndarray:
+            feature_rows = feature_rows / self.length
+            squared_distances = (
+                np.sum(feature_rows**2, axis=1)[:, None] + squared_norms - 2 * feature_rows @ scaled_centres.T
+            )
             return _matern_kernel(np.sqrt(np.maximum(squared_distances, 0.0))) @ self.weights
 
         return apply_in_parts(predict_rows, features, _CHUNK_SIZE)
 
 
-def _matern_kernel(distance: np.ndarray) -> np.ndarray:
+def _matern_kernel(relative_distance: np.ndarray) -> np.ndarray:
     """Evaluate the Matérn kernel of order 3/2 at distances divided by the kernel length."""
-    scaled_distance = np.sqrt(3.0) * distance
+    scaled_distance = np.sqrt(3.0) * relative_distance
     return (1 + scaled_distance) * np.exp(-scaled_distance)
 
 
@@ -86,28 +94,36 @@ def _estimate_length_and_noise(features: np.ndarray, targets: np.ndarray) -> tup
 
     The variance of the process follows from the length and the ratio in closed form.
     """
-    distances = cdist(features, features)
-    mean_distance = float(np.sqrt(np.mean(distances**2))) or 1.0
+    feature_distances = cdist(features, features)
+    mean_distance = float(np.sqrt(np.mean(feature_distances**2))) or 1.0
 
     def negative_log_likelihood(log_parameters: np.ndarray) -> float:
-        matrix = _matern_kernel(distances / (mean_distance * np.exp(log_parameters[0]))) + np.exp(
+        covariance_matrix = _matern_kernel(feature_distances / (mean_distance * np.exp(log_parameters[0]))) + np.exp(
             log_parameters[1]
-        ) * np.eye(len(distances))
+        ) * np.eye(len(feature_distances))
         try:
-            factor = cho_factor(matrix, lower=True)
+            cholesky_factor = cho_factor(covariance_matrix, lower=True)
         except np.linalg.LinAlgError:
             return 1e12
-        variance = np.mean(np.sum(targets * cho_solve(factor, targets), axis=0) / len(targets))
-        return float(2 * np.sum(np.log(np.diag(factor[0]))) + len(targets) * np.log(max(variance, 1e-300)))
+        process_variance = np.mean(np.sum(targets * cho_solve(cholesky_factor, targets), axis=0) / len(targets))
+        return float(
+            2 * np.sum(np.log(np.diag(cholesky_factor[0]))) + len(targets) * np.log(max(process_variance, 1e-300))
+        )
 
-    bounds = [(np.log(0.05), np.log(50.0)), (np.log(1e-6), np.log(1e3))]
-    starts = [(0.5, np.log(0.05)), (2.0, np.log(0.3))]
+    parameter_bounds = [(np.log(0.05), np.log(50.0)), (np.log(1e-6), np.log(1e3))]
+    initial_guesses = [(0.5, np.log(0.05)), (2.0, np.log(0.3))]
     best_minimum = min(
         (
-            minimize(negative_log_likelihood, start, method="Nelder-Mead", bounds=bounds, options={"maxfev": 60})
-            for start in starts
+            minimize(
+                negative_log_likelihood,
+                initial_guess,
+                method="Nelder-Mead",
+                bounds=parameter_bounds,
+                options={"maxfev": 60},
+            )
+            for initial_guess in initial_guesses
         ),
-        key=lambda result: result.fun,
+        key=lambda minimum: minimum.fun,
     )
     return mean_distance * float(np.exp(best_minimum.x[0])), float(np.exp(best_minimum.x[1]))
 
@@ -129,9 +145,12 @@ def fit_gradient_boosting(features, targets) -> Any:
     """Fit gradient-boosted regression trees, one ensemble of trees for each target."""
     from sklearn.ensemble import HistGradientBoostingRegressor
 
-    options = {"max_iter": 100, "max_leaf_nodes": 15, "min_samples_leaf": 8, "l2_regularization": 1.0}
-    models = [HistGradientBoostingRegressor(random_state=0, **options).fit(features, target) for target in targets.T]
-    return Forest.from_boosted_regressors(models)
+    boosting_options = {"max_iter": 100, "max_leaf_nodes": 15, "min_samples_leaf": 8, "l2_regularization": 1.0}
+    boosted_models = [
+        HistGradientBoostingRegressor(random_state=0, **boosting_options).fit(features, target_column)
+        for target_column in targets.T
+    ]
+    return Forest.from_boosted_regressors(boosted_models)
 
 
 def fit_extra_trees(features, targets) -> Any:
@@ -226,27 +245,35 @@ class QuadraticDiscriminant:
         classes, class_indices = np.unique(label, return_inverse=True)
         shrinkage, num_features = covariance_shrinkage(features, label), features.shape[1]
         mean_variance = np.mean(np.var(features, axis=0))
-        class_means, whiten, offset = [], [], []
+        class_means, whitening_matrices, class_offsets = [], [], []
         for class_index in range(len(classes)):
             class_features = features[class_indices == class_index]
-            covariance = np.cov(class_features.T, bias=len(class_features) < 2).reshape(num_features, num_features)
-            covariance = (1 - shrinkage) * covariance + shrinkage * np.trace(covariance) / num_features * np.eye(
-                num_features
+            class_covariance = np.cov(class_features.T, bias=len(class_features) < 2).reshape(
+                num_features, num_features
             )
-            values, axes = np.linalg.eigh(covariance)
-            values = np.maximum(values, _MIN_VARIANCE_RATIO * max(values.max(), _MIN_VARIANCE_RATIO * mean_variance))
+            class_covariance = (1 - shrinkage) * class_covariance + shrinkage * np.trace(
+                class_covariance
+            ) / num_features * np.eye(num_features)
+            eigenvalues, eigenvectors = np.linalg.eigh(class_covariance)
+            eigenvalues = np.maximum(
+                eigenvalues, _MIN_VARIANCE_RATIO * max(eigenvalues.max(), _MIN_VARIANCE_RATIO * mean_variance)
+            )
             class_means.append(class_features.mean(axis=0))
-            whiten.append(axes / np.sqrt(values))
-            offset.append(np.log(len(class_features) / len(features)) - 0.5 * np.sum(np.log(values)))
-        return cls(np.array(class_means), np.array(whiten), np.array(offset), classes)
+            whitening_matrices.append(eigenvectors / np.sqrt(eigenvalues))
+            class_offsets.append(np.log(len(class_features) / len(features)) - 0.5 * np.sum(np.log(eigenvalues)))
+        return cls(np.array(class_means), np.array(whitening_matrices), np.array(class_offsets), classes)
 
     def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
         """Compute the logarithm (frames, classes) of each class's density times its share of the presses, up to a
         constant."""
-        scores = np.empty((len(features), len(self.offset)))
-        for class_index, (mean, whiten, offset) in enumerate(zip(self.mean, self.whiten, self.offset, strict=True)):
-            scores[:, class_index] = offset - 0.5 * np.sum(((features - mean) @ whiten) ** 2, axis=1)
-        return scores
+        class_scores = np.empty((len(features), len(self.offset)))
+        for class_index, (class_mean, whitening_matrix, class_offset) in enumerate(
+            zip(self.mean, self.whiten, self.offset, strict=True)
+        ):
+            class_scores[:, class_index] = class_offset - 0.5 * np.sum(
+                ((features - class_mean) @ whitening_matrix) ** 2, axis=1
+            )
+        return class_scores
 
 
 def fit_linear_svm(features, label) -> Any:
@@ -272,12 +299,15 @@ def fit_boosted_trees(features, label) -> Any:
     boosted_classifier = AdaBoostClassifier(weak_classifier, n_estimators=_NUM_ENSEMBLE_MEMBERS, random_state=0).fit(
         features, label
     )
-    members, weights = (
+    ensemble_members, tree_weights = (
         boosted_classifier.estimators_,
         boosted_classifier.estimator_weights_[: len(boosted_classifier.estimators_)],
     )
     return Forest.from_classification_trees(
-        [_number_classes(member, boosted_classifier) for member in members], weights, np.unique(label), is_voting=True
+        [_number_classes(ensemble_member, boosted_classifier) for ensemble_member in ensemble_members],
+        tree_weights,
+        np.unique(label),
+        is_voting=True,
     )
 
 
@@ -292,10 +322,10 @@ def fit_bagged_trees(features, label) -> Any:
     )
     with parallel_config("threading"):
         bagged_classifier = classifier.fit(features, label)
-    weights = np.full(_NUM_ENSEMBLE_MEMBERS, 1 / _NUM_ENSEMBLE_MEMBERS)
+    tree_weights = np.full(_NUM_ENSEMBLE_MEMBERS, 1 / _NUM_ENSEMBLE_MEMBERS)
     return Forest.from_classification_trees(
-        [_number_classes(member) for member in bagged_classifier.estimators_],
-        weights,
+        [_number_classes(ensemble_member) for ensemble_member in bagged_classifier.estimators_],
+        tree_weights,
         np.unique(label),
         is_voting=False,
     )
@@ -328,34 +358,40 @@ class LinearEnsemble:
     @classmethod
     def from_bagged(cls, bagging_classifier, num_features: int) -> "LinearEnsemble":
         """Convert a scikit-learn ensemble of linear discriminants, each fitted to some of `num_features` features."""
-        members = bagging_classifier.estimators_
-        weights = np.zeros((len(members), len(bagging_classifier.classes_), num_features))
+        ensemble_members = bagging_classifier.estimators_
+        weights = np.zeros((len(ensemble_members), len(bagging_classifier.classes_), num_features))
         intercepts = np.zeros(weights.shape[:2])
-        for member, feature_indices, weight, intercept in zip(
-            members, bagging_classifier.estimators_features_, weights, intercepts, strict=True
+        for ensemble_member, feature_indices, member_weights, member_intercepts in zip(
+            ensemble_members, bagging_classifier.estimators_features_, weights, intercepts, strict=True
         ):
-            is_binary = len(member.coef_) == 1  # with two classes, scikit-learn gives only the log-odds of the second
-            weight[-1 if is_binary else slice(None), feature_indices] = member.coef_[0] if is_binary else member.coef_
-            intercept[-1 if is_binary else slice(None)] = member.intercept_[0] if is_binary else member.intercept_
+            is_binary = (
+                len(ensemble_member.coef_) == 1
+            )  # with two classes, scikit-learn gives only the log-odds of the second
+            member_weights[-1 if is_binary else slice(None), feature_indices] = (
+                ensemble_member.coef_[0] if is_binary else ensemble_member.coef_
+            )
+            member_intercepts[-1 if is_binary else slice(None)] = (
+                ensemble_member.intercept_[0] if is_binary else ensemble_member.intercept_
+            )
         return cls(weights, intercepts, bagging_classifier.classes_)
 
     def predict_proba(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
         """Compute the probabilities of the classes (frames, classes), averaged over the members of the ensemble."""
         summed_probabilities = np.zeros((len(features), len(self.classes_)))
-        for weight, intercept in zip(self.weights, self.intercepts, strict=True):
-            summed_probabilities += probabilities(features @ weight.T + intercept, 1.0)
+        for member_weights, member_intercepts in zip(self.weights, self.intercepts, strict=True):
+            summed_probabilities += probabilities(features @ member_weights.T + member_intercepts, 1.0)
         return summed_probabilities / len(self.weights)
 
 
-def _number_classes(tree, fitted_ensemble=None):
+def _number_classes(classification_tree, fitted_ensemble=None):
     """Replace the classes of a tree by their indices among the classes of the `fitted_ensemble`, or else of the tree
     itself."""
-    tree.classes_ = (
-        np.arange(len(tree.classes_))
+    classification_tree.classes_ = (
+        np.arange(len(classification_tree.classes_))
         if fitted_ensemble is None
-        else np.searchsorted(fitted_ensemble.classes_, tree.classes_)
+        else np.searchsorted(fitted_ensemble.classes_, classification_tree.classes_)
     )
-    return tree
+    return classification_tree
 
 
 CLASSIFIERS: dict[str, Callable[..., Any]] = {
@@ -388,24 +424,24 @@ def log_odds(model, features) -> Float[np.ndarray, "n C"]:
         return np.log(np.maximum(model.predict_proba(features), 1e-6))
     if hasattr(model, "pair_odds"):
         return model.pair_odds(features)
-    scores = model.decision_function(features)
-    return np.column_stack([-scores, scores]) if scores.ndim == 1 else scores
+    class_scores = model.decision_function(features)
+    return np.column_stack([-class_scores, class_scores]) if class_scores.ndim == 1 else class_scores
 
 
 def probabilities(odds: np.ndarray, sharpness: float) -> Float[np.ndarray, "n C"]:
     """Compute the probability of each class (frames, classes) as the softmax of its log-odds times the `sharpness`."""
     scaled_log_odds = sharpness * odds
-    exponentials = np.exp(scaled_log_odds - scaled_log_odds.max(axis=1, keepdims=True))
-    return exponentials / exponentials.sum(axis=1, keepdims=True)
+    exponential_odds = np.exp(scaled_log_odds - scaled_log_odds.max(axis=1, keepdims=True))
+    return exponential_odds / exponential_odds.sum(axis=1, keepdims=True)
 
 
 def fit_sharpness(odds: np.ndarray, true_classes: np.ndarray) -> float:
     """Choose the factor of log-odds, the sharpness, that maximises the likelihood of the `true_classes` of held-out
     presses."""
-    candidates = np.geomspace(0.02, 50, 60)
-    rows = np.arange(len(true_classes))
+    candidate_factors = np.geomspace(0.02, 50, 60)
+    press_indices = np.arange(len(true_classes))
     log_likelihoods = [
-        np.mean(np.log(np.maximum(probabilities(odds, candidate)[rows, true_classes], 1e-9)))
-        for candidate in candidates
+        np.mean(np.log(np.maximum(probabilities(odds, candidate_factor)[press_indices, true_classes], 1e-9)))
+        for candidate_factor in candidate_factors
     ]
-    return float(candidates[int(np.argmax(log_likelihoods))])
+    return float(candidate_factors[int(np.argmax(log_likelihoods))])

@@ -47,11 +47,11 @@ class Network:
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
         """Predict targets (frames, targets) from features (frames, features)."""
-        values = features / self.scale
-        for layer_index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            values = values @ weight.T + bias
-            values = np.tanh(values) if layer_index + 1 < len(self.weights) else values
-        return values
+        activations = features / self.scale
+        for layer_index, (layer_weights, layer_bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            activations = activations @ layer_weights.T + layer_bias
+            activations = np.tanh(activations) if layer_index + 1 < len(self.weights) else activations
+        return activations
 
     @classmethod
     def train(cls, features, targets) -> "Network":
@@ -60,17 +60,24 @@ class Network:
         import jax
         import jax.numpy as jnp
 
-        size = float(np.sqrt(np.mean(features**2))) or 1.0
-        scale = np.full(features.shape[1], size)
+        rms_feature = float(np.sqrt(np.mean(features**2))) or 1.0
+        feature_scale = np.full(features.shape[1], rms_feature)
         batches = _draw_batches(len(features), _NUM_FRAME_EPOCHS)
-        layers = _compiled_frame_training(len(batches))(
-            jnp.asarray(_pad_rows(features / scale), jnp.float32),
+        trained_layers = _compiled_frame_training(len(batches))(
+            jnp.asarray(_pad_rows(features / feature_scale), jnp.float32),
             jnp.asarray(_pad_rows(targets), jnp.float32),
             jnp.asarray(batches),
             jax.random.split(jax.random.key(0)),
         )
-        layers = [(np.asarray(layer.weight, float), np.asarray(layer.bias, float)) for layer in layers]
-        return cls([weight for weight, _ in layers], [bias for _, bias in layers], scale)
+        trained_layers = [
+            (np.asarray(trained_layer.weight, float), np.asarray(trained_layer.bias, float))
+            for trained_layer in trained_layers
+        ]
+        return cls(
+            [layer_weights for layer_weights, _ in trained_layers],
+            [layer_bias for _, layer_bias in trained_layers],
+            feature_scale,
+        )
 
 
 @functools.cache
@@ -86,32 +93,36 @@ def _compiled_frame_training(num_steps: int) -> Callable[..., Any]:
     import jax.numpy as jnp
     import optax
 
-    optimiser = optax.adamw(
+    adam_optimiser = optax.adamw(
         optax.cosine_decay_schedule(_FRAME_LEARNING_RATE, num_steps), weight_decay=_FRAME_WEIGHT_DECAY
     )
 
     @jax.jit
     def train(features, targets, batches, keys):
-        sizes = features.shape[1], targets.shape[1], _FRAME_HIDDEN_SIZE, 2
-        network = eqx.nn.MLP(*sizes, activation=jnp.tanh, dtype=jnp.float32, key=keys[0])
-        parameters, static_fields = eqx.partition(network, eqx.is_inexact_array)
+        layer_sizes = features.shape[1], targets.shape[1], _FRAME_HIDDEN_SIZE, 2
+        network = eqx.nn.MLP(*layer_sizes, activation=jnp.tanh, dtype=jnp.float32, key=keys[0])
+        network_parameters, static_fields = eqx.partition(network, eqx.is_inexact_array)
 
-        def loss(parameters, batch_rows, key):
+        def training_loss(network_parameters, batch_rows, key):
             noisy_features = features[batch_rows] + _FRAME_FEATURE_NOISE * jax.random.normal(
                 key, (_BATCH_SIZE, features.shape[1]), features.dtype
             )
             return jnp.mean(
-                (jax.vmap(eqx.combine(parameters, static_fields))(noisy_features) - targets[batch_rows]) ** 2
+                (jax.vmap(eqx.combine(network_parameters, static_fields))(noisy_features) - targets[batch_rows]) ** 2
             )
 
-        def update(carry, batch_rows):
-            parameters, state, key = carry
+        def update_step(training_state, batch_rows):
+            network_parameters, optimiser_state, key = training_state
             key, step_key = jax.random.split(key)
-            updates, state = optimiser.update(jax.grad(loss)(parameters, batch_rows, step_key), state, parameters)
-            return (eqx.apply_updates(parameters, updates), state, key), None
+            parameter_updates, optimiser_state = adam_optimiser.update(
+                jax.grad(training_loss)(network_parameters, batch_rows, step_key), optimiser_state, network_parameters
+            )
+            return (eqx.apply_updates(network_parameters, parameter_updates), optimiser_state, key), None
 
-        parameters = jax.lax.scan(update, (parameters, optimiser.init(parameters), keys[1]), batches)[0][0]
-        return parameters.layers
+        network_parameters = jax.lax.scan(
+            update_step, (network_parameters, adam_optimiser.init(network_parameters), keys[1]), batches
+        )[0][0]
+        return network_parameters.layers
 
     return train
 
@@ -144,21 +155,21 @@ class TemporalNetwork:
         time_course = features[:, self.whole :].reshape(len(features), -1, self.first.shape[2] // _KERNEL_SIZE)
         summed_probabilities = np.zeros((len(features), len(self.classes_)))
         for network_index in range(len(self.first)):
-            hidden = _relu(
+            hidden_values = _relu(
                 _concatenate_neighbouring_steps(time_course, np) @ self.first[network_index].T
                 + self.first_bias[network_index]
             )
-            hidden = _relu(
-                _concatenate_neighbouring_steps(hidden, np) @ self.second[network_index].T
+            hidden_values = _relu(
+                _concatenate_neighbouring_steps(hidden_values, np) @ self.second[network_index].T
                 + self.second_bias[network_index]
             )
             pooled_features = np.concatenate(
-                [features[:, : self.whole], hidden.mean(axis=1), hidden.max(axis=1)], axis=1
+                [features[:, : self.whole], hidden_values.mean(axis=1), hidden_values.max(axis=1)], axis=1
             )
-            dense = _relu(pooled_features @ self.dense[network_index].T + self.dense_bias[network_index])
-            odds = dense @ self.last[network_index].T + self.last_bias[network_index]
-            exponentials = np.exp(odds - odds.max(axis=1, keepdims=True))
-            summed_probabilities += exponentials / exponentials.sum(axis=1, keepdims=True)
+            dense_values = _relu(pooled_features @ self.dense[network_index].T + self.dense_bias[network_index])
+            class_log_odds = dense_values @ self.last[network_index].T + self.last_bias[network_index]
+            exponential_odds = np.exp(class_log_odds - class_log_odds.max(axis=1, keepdims=True))
+            summed_probabilities += exponential_odds / exponential_odds.sum(axis=1, keepdims=True)
         return summed_probabilities / len(self.first)
 
     @classmethod
@@ -174,17 +185,21 @@ class TemporalNetwork:
 
         classes, class_indices = np.unique(label, return_inverse=True)
         batches = _draw_batches(len(features), _NUM_COURSE_EPOCHS)
-        parameters = _compiled_course_training(len(batches), whole, values, len(classes))(
+        network_parameters = _compiled_course_training(len(batches), whole, values, len(classes))(
             jnp.asarray(_pad_rows(features), jnp.float32),
             jnp.asarray(_pad_rows(class_indices)),
             jnp.asarray(batches),
             jax.random.split(jax.random.key(0), _NUM_NETWORKS),
         )
-        return cls(*(np.asarray(parameter, float) for parameter in parameters), whole=whole, classes_=classes)
+        return cls(
+            *(np.asarray(network_parameter, float) for network_parameter in network_parameters),
+            whole=whole,
+            classes_=classes,
+        )
 
 
-def _relu(values):
-    return np.maximum(values, 0.0)
+def _relu(activations):
+    return np.maximum(activations, 0.0)
 
 
 def _concatenate_neighbouring_steps(time_course, array_module):
@@ -210,59 +225,63 @@ def _compiled_course_training(
     import jax.numpy as jnp
     import optax
 
-    optimiser = optax.adamw(
+    adam_optimiser = optax.adamw(
         optax.cosine_decay_schedule(_COURSE_LEARNING_RATE, num_steps), weight_decay=_COURSE_WEIGHT_DECAY
     )
-    sizes = [
+    weight_shapes = [
         (_COURSE_HIDDEN_SIZE, _KERNEL_SIZE * num_values),
         (_COURSE_HIDDEN_SIZE, _KERNEL_SIZE * _COURSE_HIDDEN_SIZE),
         (_DENSE_SIZE, num_whole_features + 2 * _COURSE_HIDDEN_SIZE),
         (num_classes, _DENSE_SIZE),
     ]
 
-    def log_odds(weights, features, key):
+    def class_log_odds(weights, features, key):
         first_weights, first_bias, second_weights, second_bias, dense, dense_bias, last_weights, last_bias = weights
         time_course = features[:, num_whole_features:].reshape(len(features), -1, num_values)
-        hidden = jax.nn.relu(_concatenate_neighbouring_steps(time_course, jnp) @ first_weights.T + first_bias)
-        hidden = jax.nn.relu(_concatenate_neighbouring_steps(hidden, jnp) @ second_weights.T + second_bias)
+        hidden_values = jax.nn.relu(_concatenate_neighbouring_steps(time_course, jnp) @ first_weights.T + first_bias)
+        hidden_values = jax.nn.relu(
+            _concatenate_neighbouring_steps(hidden_values, jnp) @ second_weights.T + second_bias
+        )
         pooled_features = jnp.concatenate(
-            [features[:, :num_whole_features], hidden.mean(axis=1), hidden.max(axis=1)], axis=1
+            [features[:, :num_whole_features], hidden_values.mean(axis=1), hidden_values.max(axis=1)], axis=1
         )
         pooled_features = (
             pooled_features * jax.random.bernoulli(key, 1 - _DROPOUT_RATE, pooled_features.shape) / (1 - _DROPOUT_RATE)
         )
         return jax.nn.relu(pooled_features @ dense.T + dense_bias) @ last_weights.T + last_bias
 
-    def loss(weights, features, class_indices, key):
+    def training_loss(weights, features, class_indices, key):
         noise_key, dropout_key = jax.random.split(key)
         noisy_features = features + _COURSE_FEATURE_NOISE * jax.random.normal(noise_key, features.shape, features.dtype)
         target_probabilities = (1 - _LABEL_SMOOTHING) * jax.nn.one_hot(
             class_indices, num_classes
         ) + _LABEL_SMOOTHING / num_classes
         return -jnp.mean(
-            jnp.sum(target_probabilities * jax.nn.log_softmax(log_odds(weights, noisy_features, dropout_key)), axis=1)
+            jnp.sum(
+                target_probabilities * jax.nn.log_softmax(class_log_odds(weights, noisy_features, dropout_key)), axis=1
+            )
         )
 
     def draw_weights(key):
         weights = []
-        for layer_key, size in zip(jax.random.split(key, len(sizes)), sizes, strict=True):
-            weights += [jnp.sqrt(2 / size[1]) * jax.random.normal(layer_key, size, jnp.float32)]
-            weights += [jnp.zeros(size[0], jnp.float32)]
+        for layer_key, weight_shape in zip(jax.random.split(key, len(weight_shapes)), weight_shapes, strict=True):
+            weights += [jnp.sqrt(2 / weight_shape[1]) * jax.random.normal(layer_key, weight_shape, jnp.float32)]
+            weights += [jnp.zeros(weight_shape[0], jnp.float32)]
         return tuple(weights)
 
     @jax.jit
     def train(features, class_indices, batches, keys):
-        def update(carry, batch_rows):
-            weights, state, key = carry
+        def update_step(training_state, batch_rows):
+            weights, optimiser_state, key = training_state
             key, step_key = jax.random.split(key)
-            gradients = jax.grad(loss)(weights, features[batch_rows], class_indices[batch_rows], step_key)
-            updates, state = optimiser.update(gradients, state, weights)
-            return (optax.apply_updates(weights, updates), state, key), None
+            loss_gradients = jax.grad(training_loss)(weights, features[batch_rows], class_indices[batch_rows], step_key)
+            weight_updates, optimiser_state = adam_optimiser.update(loss_gradients, optimiser_state, weights)
+            return (optax.apply_updates(weights, weight_updates), optimiser_state, key), None
 
         def train_network(key):
             init_key, training_key = jax.random.split(key)
             weights = draw_weights(init_key)
-            return jax.lax.scan(update, (weights, optimiser.init(weights), training_key), batches)[0][0]
+            return jax.lax.scan(update_step, (weights, adam_optimiser.init(weights), training_key), batches)[0][0]
 
         return jax.vmap(train_network)(keys)
 

@@ -35,7 +35,7 @@ def standardise_sessions(changes: np.ndarray, group) -> np.ndarray:
     group = np.zeros(len(changes), int) if group is None else np.asarray(group)
     if group.shape != (len(changes),):
         raise ValueError(f"group has shape {group.shape}; give ({len(changes)},), the session of each frame.")
-    result = np.empty_like(changes)
+    standardised = np.empty_like(changes)
     for session in np.unique(group):
         session_changes = changes[group == session]
         if len(session_changes) < _MIN_SESSION_FRAMES:
@@ -43,17 +43,17 @@ def standardise_sessions(changes: np.ndarray, group) -> np.ndarray:
                 f"group: session {session} has {len(session_changes)} frames; {_MIN_SESSION_FRAMES} are needed to "
                 "standardise one."
             )
-        deviation = np.nanstd(session_changes, axis=0)
-        result[group == session] = (session_changes - np.nanmedian(session_changes, axis=0)) / np.where(
-            deviation > 0, deviation, np.inf
+        deviations = np.nanstd(session_changes, axis=0)
+        standardised[group == session] = (session_changes - np.nanmedian(session_changes, axis=0)) / np.where(
+            deviations > 0, deviations, np.inf
         )
-    return result
+    return standardised
 
 
 def mean_reference(reference: np.ndarray) -> np.ndarray:
     """Compute the mean of each channel over reference frames; 0 for channels without any reading."""
-    is_finite = np.isfinite(reference)
-    return np.where(is_finite, reference, 0.0).sum(axis=0) / np.maximum(is_finite.sum(axis=0), 1)
+    has_reading = np.isfinite(reference)
+    return np.where(has_reading, reference, 0.0).sum(axis=0) / np.maximum(has_reading.sum(axis=0), 1)
 
 
 def fill_reference(
@@ -147,18 +147,22 @@ class Presses:
             "group": None if group is None else _one_dimensional("group", group),
             "time": None if time is None else _check_time(time),
         }
-        for key, values in optional_arrays.items():
+        for field_name, values in optional_arrays.items():
             if values is not None and len(values) != len(frames):
-                raise ValueError(f"{key} has {len(values)} rows and frames {len(frames)}; give one for each press.")
-        if all(optional_arrays[key] is None for key in ("positions", "force", "label", "touched")):
+                raise ValueError(
+                    f"{field_name} has {len(values)} rows and frames {len(frames)}; give one for each press."
+                )
+        if all(optional_arrays[field_name] is None for field_name in ("positions", "force", "label", "touched")):
             raise ValueError("frames: there is nothing to learn from them; give positions, force, label or touched.")
         reference = None if reference is None else check_reference(reference, frames)
         return replace(cls(frames, reference, name=name), **optional_arrays)
 
     def rows(self, index: ArrayLike | slice) -> "Presses":
         """Select presses by index or by slice."""
-        arrays = {key: getattr(self, key) for key in ("frames", "reference", *_OPTIONAL_FIELDS)}
-        return replace(self, **{key: None if values is None else values[index] for key, values in arrays.items()})
+        arrays = {field_name: getattr(self, field_name) for field_name in ("frames", "reference", *_OPTIONAL_FIELDS)}
+        return replace(
+            self, **{field_name: None if values is None else values[index] for field_name, values in arrays.items()}
+        )
 
 
 def read_presses(path: str | Path) -> Presses:
@@ -202,15 +206,15 @@ def read_frames(path: str | Path) -> dict[str, np.ndarray]:
         return arrays | {"frames": check_frames("frames", arrays["frames"])}
 
 
-def _read_arrays(path: str | Path, *keys: str) -> dict[str, np.ndarray]:
-    """Read the arrays named `keys` from an NPZ file: `frames`, which is required, and the other arrays if present."""
+def _read_arrays(path: str | Path, *array_names: str) -> dict[str, np.ndarray]:
+    """Read the arrays named `array_names` from an NPZ file: `frames`, which is required, and the others if present."""
     if Path(path).is_dir():
         raise ValueError("it is a folder; give an NPZ file.")
     if not Path(path).is_file():
         raise FileNotFoundError(f"'{path}': there is no such file.")
-    arrays = npz_arrays(Path(path), *keys)
+    arrays = npz_arrays(Path(path), *array_names)
     require_arrays(arrays, "frames")
-    return {key: array for key, array in arrays.items() if key}
+    return {array_name: array for array_name, array in arrays.items() if array_name}
 
 
 @contextmanager
@@ -309,14 +313,14 @@ def _check_label(values) -> np.ndarray:
     if any(not text.strip() for text in label):
         raise ValueError("label: some are empty; give every press one, and 'none' where nothing touched.")
     label = np.array([NO_TOUCH if text.strip().lower() in _NO_TOUCH_SYNONYMS else text.strip() for text in label])
-    classes, counts = np.unique(label, return_counts=True)
+    classes, class_counts = np.unique(label, return_counts=True)
     if len(classes) < 2:
         raise ValueError(f"label: all presses are '{classes[0]}'; give two kinds or more, or leave label out.")
-    if counts.min() < _MIN_PRESSES_PER_CLASS:
-        rarest_class = classes[counts.argmin()]
+    if class_counts.min() < _MIN_PRESSES_PER_CLASS:
+        rarest_class = classes[class_counts.argmin()]
         raise ValueError(
-            f"label: '{rarest_class}' has {counts.min()} of the presses; give {_MIN_PRESSES_PER_CLASS} or more of "
-            "each kind, better twenty."
+            f"label: '{rarest_class}' has {class_counts.min()} of the presses; give {_MIN_PRESSES_PER_CLASS} or "
+            "more of each kind, better twenty."
         )
     return label
 
@@ -377,11 +381,11 @@ def estimate_lag(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) 
     """
     features = Features.learn("normalised", changes, np.zeros_like(changes))
     scores = features(changes, np.zeros_like(changes))[:, :_NUM_COMPONENTS]
-    errors = {lag: _place_errors(scores, positions, folds, lag) for lag in range(-_MAX_LAG, _MAX_LAG + 1)}
+    lag_errors = {lag: _place_errors(scores, positions, folds, lag) for lag in range(-_MAX_LAG, _MAX_LAG + 1)}
     error_of_mean_position = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean())
-    mean_errors = {lag: float(place_errors.mean()) for lag, place_errors in errors.items()}
+    mean_errors = {lag: float(place_errors.mean()) for lag, place_errors in lag_errors.items()}
     best_lag, second_best_lag = sorted(mean_errors, key=lambda lag: mean_errors[lag])[:2]
-    min_difference = _MIN_STANDARD_ERRORS * float(errors[best_lag].std()) / np.sqrt(len(positions))
+    min_difference = _MIN_STANDARD_ERRORS * float(lag_errors[best_lag].std()) / np.sqrt(len(positions))
     is_clear_lag = (
         mean_errors[0] > _MAX_GUESS_ERROR_RATIO * error_of_mean_position > mean_errors[best_lag]
         and mean_errors[second_best_lag] - mean_errors[best_lag] > min_difference
@@ -398,21 +402,21 @@ def aligned_slices(num_rows: int, lag: int) -> tuple[slice, slice]:
 def _place_errors(scores: np.ndarray, positions: np.ndarray, folds: np.ndarray, lag: int) -> np.ndarray:
     """Compute the errors, metres, of places estimated as the mean place of the frames with the most similar `scores` in
     other folds."""
-    frames, presses = aligned_slices(len(scores), lag)
-    scores, positions, folds = scores[frames], positions[presses], folds[presses]
-    errors = np.empty(len(scores))
-    for fold in np.unique(folds):
-        is_held_out = folds == fold
+    frame_rows, press_rows = aligned_slices(len(scores), lag)
+    scores, positions, folds = scores[frame_rows], positions[press_rows], folds[press_rows]
+    place_errors = np.empty(len(scores))
+    for fold_index in np.unique(folds):
+        is_held_out = folds == fold_index
         training_positions = positions[~is_held_out]
         neighbours = (
             KDTree(scores[~is_held_out])
             .query(scores[is_held_out], min(_NUM_NEIGHBOURS, len(training_positions)))[1]
             .reshape(is_held_out.sum(), -1)
         )
-        errors[is_held_out] = np.linalg.norm(
+        place_errors[is_held_out] = np.linalg.norm(
             training_positions[neighbours].mean(axis=1) - positions[is_held_out], axis=1
         )
-    return errors
+    return place_errors
 
 
 @dataclass(frozen=True)

@@ -56,23 +56,29 @@ class DeviationModel:
         presses, too, are recorded after the training set.
         """
         features = np.column_stack([predictions, _log_size(changes)])
-        low, unit = features.mean(axis=0), features.std(axis=0)
-        unit = np.where(unit > 0, unit, 1.0)
-        unit[-1] /= _PREDICTION_SIZE_WEIGHT
+        feature_means, feature_units = features.mean(axis=0), features.std(axis=0)
+        feature_units = np.where(feature_units > 0, feature_units, 1.0)
+        feature_units[-1] /= _PREDICTION_SIZE_WEIGHT
         max_errors = np.quantile(
             np.abs(errors), 0.99, axis=0
         )  # a single large error is not representative of similar presses
-        squares = np.minimum(np.abs(errors), max_errors) ** 2
-        uncalibrated_model = cls((features - low) / unit, squares, low, unit, np.ones(errors.shape[1]))
+        squared_errors = np.minimum(np.abs(errors), max_errors) ** 2
+        uncalibrated_model = cls(
+            (features - feature_means) / feature_units,
+            squared_errors,
+            feature_means,
+            feature_units,
+            np.ones(errors.shape[1]),
+        )
         local_deviations = uncalibrated_model._local_deviations(uncalibrated_model.where, leave_one_out=True)
         last_presses = last_presses if last_presses.sum() >= _MIN_CALIBRATION_PRESSES else np.ones_like(last_presses)
-        factors = [
+        deviation_factors = [
             _calibration_factor(np.abs(errors_of_target) / deviations)
             for errors_of_target, deviations in zip(
                 errors[last_presses].T, local_deviations[last_presses].T, strict=True
             )
         ]
-        return cls(uncalibrated_model.where, squares, low, unit, np.array(factors))
+        return cls(uncalibrated_model.where, squared_errors, feature_means, feature_units, np.array(deviation_factors))
 
     def __call__(self, predictions: np.ndarray, changes: np.ndarray) -> Float[np.ndarray, "n d"]:
         """Compute the standard deviations of predictions (frames, targets) from the voltage changes of the frames."""
@@ -89,10 +95,10 @@ class DeviationModel:
         """Estimate standard deviations (frames, targets) from the errors of the held-out presses nearest to
         `features`."""
         num_neighbours = min(_NUM_SIMILAR_PRESSES, len(self.where) - 1)
-        neighbours = np.asarray(self._search_tree.query(features, num_neighbours + leave_one_out)[1])[
+        nearest_presses = np.asarray(self._search_tree.query(features, num_neighbours + leave_one_out)[1])[
             :, int(leave_one_out) :
         ]
-        similar_variance = self.squares[neighbours].mean(axis=1)
+        similar_variance = self.squares[nearest_presses].mean(axis=1)
         mean_variance = self.squares.mean(axis=0)
         return np.maximum(
             np.sqrt((1 - _GLOBAL_VARIANCE_FRACTION) * similar_variance + _GLOBAL_VARIANCE_FRACTION * mean_variance),
@@ -108,18 +114,21 @@ def _log_size(changes: np.ndarray) -> np.ndarray:
     return np.log(np.sqrt(np.mean(changes**2, axis=1)) + 1e-300)
 
 
-def _calibration_factor(ratios: np.ndarray) -> float:
+def _calibration_factor(error_ratios: np.ndarray) -> float:
     """Compute the calibration factor of standard deviations from the ratios of errors to standard deviations.
 
     The factor is chosen such that the shares of errors within 1 and 1.96 standard deviations are closest to those of a
     normal distribution.
     """
-    candidates = np.geomspace(0.2, 5, 200)
+    candidate_factors = np.geomspace(0.2, 5, 200)
     coverage_deviations = [
-        max(abs(np.mean(ratios <= multiple * candidate) - share) for multiple, share in _TARGET_COVERAGES)
-        for candidate in candidates
+        max(
+            abs(np.mean(error_ratios <= num_deviations * candidate_factor) - target_coverage)
+            for num_deviations, target_coverage in _TARGET_COVERAGES
+        )
+        for candidate_factor in candidate_factors
     ]
-    return float(candidates[int(np.argmin(coverage_deviations))])
+    return float(candidate_factors[int(np.argmin(coverage_deviations))])
 
 
 BLEND = "blend"
@@ -195,69 +204,87 @@ def learn_numbers(
     reference = np.zeros_like(changes) if reference is None else reference
     forms = Forms.available(targets, imaged, has_reference=has_reference)
     cross_validation = _CrossValidation(changes, reference, targets, folds, forms)
-    results = []
+    method_results = []
     for form in forms.names:
         for quick_method in QUICK_METHODS:
             progress(f"{quick_method} on {form}")
-            results.append(cross_validation.evaluate_method(quick_method, form))
-    best_forms = list(dict.fromkeys(result.form for result in sorted(results, key=_mean_error)))[:2]
-    slower_methods = [name for name in REGRESSORS if name not in QUICK_METHODS and method in ("auto", BLEND, name)]
+            method_results.append(cross_validation.evaluate_method(quick_method, form))
+    best_forms = list(dict.fromkeys(method_result.form for method_result in sorted(method_results, key=_mean_error)))[
+        :2
+    ]
+    slower_methods = [
+        method_name
+        for method_name in REGRESSORS
+        if method_name not in QUICK_METHODS and method in ("auto", BLEND, method_name)
+    ]
     for slower_method in slower_methods:
         for form in best_forms if slower_method in ("gaussian-process", "forest") else best_forms[:1]:
             progress(f"{slower_method} on {form}")
-            results.append(cross_validation.evaluate_method(slower_method, form))
-    results.sort(key=_mean_error)
+            method_results.append(cross_validation.evaluate_method(slower_method, form))
+    method_results.sort(key=_mean_error)
     if method not in ("auto", BLEND):
-        results = [result for result in results if result.method == method]
+        method_results = [method_result for method_result in method_results if method_result.method == method]
     chosen_results = (
-        _choose_methods(results, targets, blend=method == BLEND) if method in ("auto", BLEND) else results[:1]
+        _choose_methods(method_results, targets, is_blend_wanted=method == BLEND)
+        if method in ("auto", BLEND)
+        else method_results[:1]
     )
-    predictions = np.mean([result.held_out for result in chosen_results], axis=0)
+    predictions = np.mean([method_result.held_out for method_result in chosen_results], axis=0)
     if len(chosen_results) > 1:
-        results.insert(
+        method_results.insert(
             0,
             MethodResult(
                 BLEND,
-                " + ".join(result.name for result in chosen_results),
+                " + ".join(method_result.name for method_result in chosen_results),
                 predictions,
                 _mean_distance(predictions, targets),
             ),
         )
-    members = []
-    for result in chosen_results:
-        progress(f"{result.method}, all presses")
-        features = forms.learn(result.form, changes, reference, targets, rotated=result.method not in CHANNEL_METHODS)
-        model = REGRESSORS[result.method](
-            features(changes, reference), (targets - cross_validation.mean) / cross_validation.scale
+    ensemble_members = []
+    for method_result in chosen_results:
+        progress(f"{method_result.method}, all presses")
+        fitted_features = forms.learn(
+            method_result.form, changes, reference, targets, rotated=method_result.method not in CHANNEL_METHODS
         )
-        members.append((features, model))
+        fitted_regressor = REGRESSORS[method_result.method](
+            fitted_features(changes, reference), (targets - cross_validation.mean) / cross_validation.scale
+        )
+        ensemble_members.append((fitted_features, fitted_regressor))
     is_in_end_fold = (folds == 0) | (folds == folds.max())
     deviation_model = DeviationModel.learn(predictions, changes, predictions - targets, is_in_end_fold)
-    return LearntNumbers(members, cross_validation.mean, cross_validation.scale, deviation_model), results
+    return LearntNumbers(
+        ensemble_members, cross_validation.mean, cross_validation.scale, deviation_model
+    ), method_results
 
 
-def _choose_methods(results: list[MethodResult], targets: np.ndarray, *, blend: bool) -> list[MethodResult]:
-    """Choose the regression method with the lowest error, or a blend of methods if its error is lower or `blend` is
-    true."""
-    best_of_each_method = list({result.method: result for result in reversed(results)}.values())
+def _choose_methods(
+    method_results: list[MethodResult], targets: np.ndarray, *, is_blend_wanted: bool
+) -> list[MethodResult]:
+    """Choose the regression method with the lowest error, or a blend of methods if its error is lower or
+    `is_blend_wanted` is true."""
+    best_of_each_method = list(
+        {method_result.method: method_result for method_result in reversed(method_results)}.values()
+    )
     best_of_each_method = sorted(best_of_each_method, key=_mean_error)[:_MAX_BLENDED_METHODS]
     method_combinations = [best_of_each_method[:num_members] for num_members in range(2, len(best_of_each_method) + 1)]
     best_method_combination = min(
         method_combinations,
         key=lambda blend_results: _mean_distance(
-            np.mean([result.held_out for result in blend_results], axis=0), targets
+            np.mean([method_result.held_out for method_result in blend_results], axis=0), targets
         ),
     )
-    error = _mean_distance(np.mean([result.held_out for result in best_method_combination], axis=0), targets)
+    blend_error = _mean_distance(
+        np.mean([method_result.held_out for method_result in best_method_combination], axis=0), targets
+    )
     return (
         best_method_combination
-        if blend or error < _MAX_BLEND_ERROR_RATIO * best_of_each_method[0].error
+        if is_blend_wanted or blend_error < _MAX_BLEND_ERROR_RATIO * best_of_each_method[0].error
         else best_of_each_method[:1]
     )
 
 
-def _mean_error(result: MethodResult) -> float:
-    return result.error
+def _mean_error(method_result: MethodResult) -> float:
+    return method_result.error
 
 
 def _mean_distance(predictions: np.ndarray, targets: np.ndarray) -> float:
@@ -278,26 +305,29 @@ class _CrossValidation:
     def evaluate_method(self, method: str, form: str) -> MethodResult:
         predictions = np.empty_like(self.targets)
 
-        def predict(fold: int) -> None:
-            is_held_out = self.folds == fold
+        def predict_fold(fold_index: int) -> None:
+            is_held_out = self.folds == fold_index
             training_features, held_out_features = self._fold_features(
-                form, fold, is_held_out, rotated_data=method not in CHANNEL_METHODS
+                form, fold_index, is_held_out, rotated_data=method not in CHANNEL_METHODS
             )
-            model = REGRESSORS[method](training_features, (self.targets[~is_held_out] - self.mean) / self.scale)
-            predictions[is_held_out] = self.mean + self.scale * np.asarray(model.predict(held_out_features)).reshape(
-                int(is_held_out.sum()), -1
+            fitted_regressor = REGRESSORS[method](
+                training_features, (self.targets[~is_held_out] - self.mean) / self.scale
             )
+            predictions[is_held_out] = self.mean + self.scale * np.asarray(
+                fitted_regressor.predict(held_out_features)
+            ).reshape(int(is_held_out.sum()), -1)
 
-        apply_over_folds(predict, self.folds.max() + 1)
+        apply_over_folds(predict_fold, self.folds.max() + 1)
         return MethodResult(method, form, predictions, _mean_distance(predictions, self.targets))
 
     def _fold_features(
-        self, form: str, fold: int, is_held_out: np.ndarray, *, rotated_data: bool
+        self, form: str, fold_index: int, is_held_out: np.ndarray, *, rotated_data: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        if (form, fold, rotated_data) not in self.features:
+        if (form, fold_index, rotated_data) not in self.features:
             training_data = self.changes[~is_held_out], self.reference[~is_held_out], self.targets[~is_held_out]
-            features = self.forms.learn(form, *training_data, rotated=rotated_data)
-            self.features[form, fold, rotated_data] = tuple(
-                features(self.changes[rows], self.reference[rows]) for rows in (~is_held_out, is_held_out)
+            fitted_features = self.forms.learn(form, *training_data, rotated=rotated_data)
+            self.features[form, fold_index, rotated_data] = tuple(
+                fitted_features(self.changes[is_selected_press], self.reference[is_selected_press])
+                for is_selected_press in (~is_held_out, is_held_out)
             )
-        return self.features[form, fold, rotated_data]
+        return self.features[form, fold_index, rotated_data]

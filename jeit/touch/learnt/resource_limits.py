@@ -27,7 +27,7 @@ def limit_to_one_thread() -> AbstractContextManager:
 
 def apply_in_parts(function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, chunk_size: int) -> np.ndarray:
     """Apply `function` to `chunk_size` rows of an array at a time, which limits memory, and concatenate the results."""
-    return np.concatenate([function(rows[chunk]) for chunk in _chunk_slices(len(rows), chunk_size)])
+    return np.concatenate([function(rows[chunk_slice]) for chunk_slice in _chunk_slices(len(rows), chunk_size)])
 
 
 def apply_over_threads(
@@ -38,13 +38,18 @@ def apply_over_threads(
 
     If there are many parts of `chunk_size` rows, they are computed in parallel.
     """
-    chunks = _chunk_slices(len(arrays[0]), chunk_size)
-    if len(chunks) < 4:
-        results = [function(*(array[chunk] for array in arrays)) for chunk in chunks]
+    chunk_slices = _chunk_slices(len(arrays[0]), chunk_size)
+    if len(chunk_slices) < 4:
+        chunk_results = [function(*(array[chunk_slice] for array in arrays)) for chunk_slice in chunk_slices]
     else:
-        with limit_to_one_thread(), ThreadPoolExecutor(number_of_cores()) as pool:
-            results = list(pool.map(lambda chunk: function(*(array[chunk] for array in arrays)), chunks))
-    return {key: np.concatenate([result[key] for result in results]) for key in results[0]}
+        with limit_to_one_thread(), ThreadPoolExecutor(number_of_cores()) as thread_pool:
+            chunk_results = list(
+                thread_pool.map(lambda chunk_slice: function(*(array[chunk_slice] for array in arrays)), chunk_slices)
+            )
+    return {
+        array_name: np.concatenate([chunk_result[array_name] for chunk_result in chunk_results])
+        for array_name in chunk_results[0]
+    }
 
 
 def apply_over_folds(function: Callable[[int], Any], num_folds: int) -> list[Any]:
@@ -55,13 +60,13 @@ def apply_over_folds(function: Callable[[int], Any], num_folds: int) -> list[Any
     thread.
     """
 
-    def apply_with_one_thread(fold: int) -> Any:
+    def apply_with_one_thread(fold_index: int) -> Any:
         with limit_to_one_thread():
-            return function(fold)
+            return function(fold_index)
 
-    with ThreadPoolExecutor(number_of_cores()) as pool:
-        return list(pool.map(apply_with_one_thread, range(num_folds)))
+    with ThreadPoolExecutor(number_of_cores()) as thread_pool:
+        return list(thread_pool.map(apply_with_one_thread, range(num_folds)))
 
 
 def _chunk_slices(num_rows: int, chunk_size: int) -> list[slice]:
-    return [slice(start, start + chunk_size) for start in range(0, max(num_rows, 1), chunk_size)]
+    return [slice(chunk_start, chunk_start + chunk_size) for chunk_start in range(0, max(num_rows, 1), chunk_size)]

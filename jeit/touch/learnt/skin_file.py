@@ -41,35 +41,37 @@ def write_with_checksum(content: Any, file: BinaryIO) -> None:
     from skops.io import dumps
 
     with zipfile.ZipFile(io.BytesIO(dumps(content))) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
+        archive_files = {file_name: archive.read(file_name) for file_name in archive.namelist()}
     new_numbers: dict[str, str] = {}
 
-    def renumber(match: re.Match[str]) -> str:
-        return match[1] + new_numbers.setdefault(match[2], str(len(new_numbers)))
+    def renumber(number_match: re.Match[str]) -> str:
+        return number_match[1] + new_numbers.setdefault(number_match[2], str(len(new_numbers)))
 
-    schema = _OBJECT_NUMBER.sub(renumber, members.pop(_SCHEMA_FILE).decode())
-    renamed_members = {f"{new_numbers[Path(name).stem]}.npy": values for name, values in members.items()}
+    schema = _OBJECT_NUMBER.sub(renumber, archive_files.pop(_SCHEMA_FILE).decode())
+    renamed_members = {
+        f"{new_numbers[Path(file_name).stem]}.npy": file_content for file_name, file_content in archive_files.items()
+    }
     renamed_members = {_SCHEMA_FILE: schema.encode(), **dict(sorted(renamed_members.items()))}
     with zipfile.ZipFile(file, "w") as archive:
-        for name, values in renamed_members.items():
-            archive.writestr(zipfile.ZipInfo(name), values)
-        archive.comment = _checksum(renamed_members)
+        for file_name, file_content in renamed_members.items():
+            archive.writestr(zipfile.ZipInfo(file_name), file_content)
+        archive.comment = _archive_checksum(renamed_members)
 
 
 def verify_checksum(path: Path) -> None:
     """Verify the checksum of an archive. Raises `ValueError` if the archive was changed after it was written."""
     with zipfile.ZipFile(path) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-        if archive.comment != _checksum(members):
+        archive_files = {file_name: archive.read(file_name) for file_name in archive.namelist()}
+        if archive.comment != _archive_checksum(archive_files):
             raise ValueError("it was changed since it was written, or an earlier jeit wrote it")
 
 
-def _checksum(members: dict[str, bytes]) -> bytes:
+def _archive_checksum(archive_files: dict[str, bytes]) -> bytes:
     """Compute the checksum of the names and contents of the files in an archive."""
-    sha256 = hashlib.sha256()
-    for name in sorted(members):
-        sha256.update(f"{name} {len(members[name])}\n".encode() + members[name])
-    return b"jeit " + sha256.hexdigest().encode()
+    content_hash = hashlib.sha256()
+    for file_name in sorted(archive_files):
+        content_hash.update(f"{file_name} {len(archive_files[file_name])}\n".encode() + archive_files[file_name])
+    return b"jeit " + content_hash.hexdigest().encode()
 
 
 _FILE_KIND, _FILE_VERSION = "a jeit learnt skin", 2
@@ -120,7 +122,11 @@ def write_skin(skin: LearntSkin, path: str | Path) -> None:
     learnt = read_skin("skin.skops")
     ```
     """
-    fields_by_name = {item.name: getattr(skin, item.name) for item in fields(skin) if item.name != "standing"}
+    fields_by_name = {
+        stored_field.name: getattr(skin, stored_field.name)
+        for stored_field in fields(skin)
+        if stored_field.name != "standing"
+    }
     write_fields(path, _FILE_KIND, _FILE_VERSION, fields_by_name, "skin.skops")
 
 
@@ -193,26 +199,35 @@ def read_fields(path: Path, kind: str, version: int, description: str, make: Cal
         ) from None
 
 
-def _to_dictionaries(value):
+def _to_dictionaries(stored_value):
     """Convert objects of jeit's classes (those in `_STORED_CLASSES`) to dictionaries of their fields, recursively."""
-    if type(value) in _STORED_NAMES:
+    if type(stored_value) in _STORED_NAMES:
         return {
-            "jeit": _STORED_NAMES[type(value)],
-            **{item.name: _to_dictionaries(getattr(value, item.name)) for item in fields(value)},
+            "jeit": _STORED_NAMES[type(stored_value)],
+            **{
+                stored_item.name: _to_dictionaries(getattr(stored_value, stored_item.name))
+                for stored_item in fields(stored_value)
+            },
         }
-    if isinstance(value, dict):
-        return {key: _to_dictionaries(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_to_dictionaries(item) for item in value]
-    return value
+    if isinstance(stored_value, dict):
+        return {stored_key: _to_dictionaries(stored_item) for stored_key, stored_item in stored_value.items()}
+    if isinstance(stored_value, list | tuple):
+        return [_to_dictionaries(stored_item) for stored_item in stored_value]
+    return stored_value
 
 
-def _from_dictionaries(value):
+def _from_dictionaries(stored_value):
     """Convert dictionaries of fields, which `_to_dictionaries` returned, back to objects of jeit's classes,
     recursively."""
-    if isinstance(value, dict):
+    if isinstance(stored_value, dict):
         restored_values = {
-            _RENAMED_FIELDS.get(key, key): _from_dictionaries(item) for key, item in value.items() if key != "jeit"
+            _RENAMED_FIELDS.get(stored_key, stored_key): _from_dictionaries(stored_item)
+            for stored_key, stored_item in stored_value.items()
+            if stored_key != "jeit"
         }
-        return _STORED_CLASSES[value["jeit"]](**restored_values) if "jeit" in value else restored_values
-    return [_from_dictionaries(item) for item in value] if isinstance(value, list) else value
+        return _STORED_CLASSES[stored_value["jeit"]](**restored_values) if "jeit" in stored_value else restored_values
+    return (
+        [_from_dictionaries(stored_item) for stored_item in stored_value]
+        if isinstance(stored_value, list)
+        else stored_value
+    )

@@ -58,7 +58,7 @@ class SoundImages:
 
     def __getitem__(self, window_selection) -> "SoundImages":
         """Select windows by a slice, indices or a boolean mask."""
-        return SoundImages(*(getattr(self, name)[window_selection] for name in self.__dataclass_fields__))
+        return SoundImages(*(getattr(self, field_name)[window_selection] for field_name in self.__dataclass_fields__))
 
     @property
     def loudness(self) -> Float[np.ndarray, " W"]:
@@ -74,7 +74,12 @@ class SoundImages:
     @classmethod
     def concatenate(cls, blocks: "list[SoundImages]") -> "SoundImages":
         """Concatenate the windows of several recordings; times remain relative to the start of each recording."""
-        return cls(*(np.concatenate([getattr(block, name) for block in blocks]) for name in cls.__dataclass_fields__))
+        return cls(
+            *(
+                np.concatenate([getattr(block, field_name) for block in blocks])
+                for field_name in cls.__dataclass_fields__
+            )
+        )
 
 
 def check_highest(highest: float) -> float:
@@ -99,8 +104,8 @@ def band_edges(highest: float) -> Float[np.ndarray, " 65"]:
     # The edges are half a bin plus a (e^(bk) - 1), where a b is the width of a bin; `brentq` finds b such that the last
     # edge is half a bin above `highest`.
     band_index = np.arange(NUM_BANDS + 1)
-    factor: Any = brentq(lambda b: bin_width * np.expm1(b * NUM_BANDS) / b - highest, 1e-9, 1.0)
-    return bin_width * (0.5 + np.expm1(factor * band_index) / factor)
+    band_growth_rate: Any = brentq(lambda b: bin_width * np.expm1(b * NUM_BANDS) / b - highest, 1e-9, 1.0)
+    return bin_width * (0.5 + np.expm1(band_growth_rate * band_index) / band_growth_rate)
 
 
 def sound_images(recording: Recording, highest: float = MAX_EVEN_FREQUENCY) -> SoundImages:
@@ -143,68 +148,93 @@ def image_blocks(recording: Recording, highest: float = MAX_EVEN_FREQUENCY) -> I
 
 
 def _compute_image_blocks(recording: Recording, highest: float) -> Iterator[SoundImages]:
-    rate, samples = recording.rate, recording.samples
-    length, hop = round(FRAME_DURATION * rate), round(FRAME_INTERVAL * rate)
-    window_length = length + (NUM_FRAMES - 1) * hop
+    sampling_rate, samples = recording.rate, recording.samples
+    frame_length, frame_hop = round(FRAME_DURATION * sampling_rate), round(FRAME_INTERVAL * sampling_rate)
+    window_length = frame_length + (NUM_FRAMES - 1) * frame_hop
     padding_before = 0
     if samples.shape[1] < window_length:
-        padding_before = round(0.3 * rate)
+        padding_before = round(0.3 * sampling_rate)
         padding_after = max(padding_before, window_length - padding_before - samples.shape[1])
         samples = np.pad(samples, ((0, 0), (padding_before, padding_after)))
-    num_frames = 1 + (samples.shape[1] - length) // hop
-    num_windows = 1 + int((num_frames - NUM_FRAMES + 0.5) * hop / (WINDOW_INTERVAL * rate))
+    num_frames = 1 + (samples.shape[1] - frame_length) // frame_hop
+    num_windows = 1 + int((num_frames - NUM_FRAMES + 0.5) * frame_hop / (WINDOW_INTERVAL * sampling_rate))
     # Each window begins with the frame nearest to a multiple of 0.1 s.
-    starts = np.minimum(
-        np.round(WINDOW_INTERVAL * rate * np.arange(num_windows) / hop).astype(int), num_frames - NUM_FRAMES
+    window_starts = np.minimum(
+        np.round(WINDOW_INTERVAL * sampling_rate * np.arange(num_windows) / frame_hop).astype(int),
+        num_frames - NUM_FRAMES,
     )
-    weights = _band_weights(length, rate, highest)
-    taper = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)
-    scale = 2 / (length * (taper**2).sum())
-    bins_per_band = np.maximum(weights.sum(axis=0), 1.0)
+    band_weights = _band_weights(frame_length, sampling_rate, highest)
+    hann_taper = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(frame_length) / frame_length)
+    power_scale = 2 / (frame_length * (hann_taper**2).sum())
+    bins_per_band = np.maximum(band_weights.sum(axis=0), 1.0)
     for first_window in range(0, num_windows, _MAX_BLOCK_WINDOWS):
-        block_starts = starts[first_window : first_window + _MAX_BLOCK_WINDOWS]
-        block_samples = samples[:, block_starts[0] * hop : (block_starts[-1] + NUM_FRAMES - 1) * hop + length]
-        finite = np.isfinite(block_samples)
-        missing_share = 0.0 if finite.all() else 1 - _finite_share(finite, length, hop).mean(axis=0)
-        power = (
-            np.stack([_band_powers(channel, taper, hop, weights) for channel in np.where(finite, block_samples, 0.0)])
-            * scale
+        block_window_starts = window_starts[first_window : first_window + _MAX_BLOCK_WINDOWS]
+        block_samples = samples[
+            :,
+            block_window_starts[0] * frame_hop : (block_window_starts[-1] + NUM_FRAMES - 1) * frame_hop + frame_length,
+        ]
+        is_finite_sample = np.isfinite(block_samples)
+        missing_fractions = (
+            0.0
+            if is_finite_sample.all()
+            else 1 - _finite_sample_share(is_finite_sample, frame_length, frame_hop).mean(axis=0)
         )
-        frame_indices = block_starts[:, None] - block_starts[0] + np.arange(NUM_FRAMES)
-        intensity = power.sum(axis=-1)[:, frame_indices].transpose(1, 0, 2)
-        strongest_microphones = intensity.sum(axis=2).argmax(axis=1)
-        spectrum = (power / bins_per_band)[strongest_microphones[:, None], frame_indices].transpose(0, 2, 1)
-        is_known = np.broadcast_to(missing_share, power.shape[1])[frame_indices].mean(axis=1) < 0.5
-        times = (block_starts * hop + window_length / 2 - padding_before) / rate
+        band_powers = (
+            np.stack(
+                [
+                    _band_powers(channel_samples, hann_taper, frame_hop, band_weights)
+                    for channel_samples in np.where(is_finite_sample, block_samples, 0.0)
+                ]
+            )
+            * power_scale
+        )
+        frame_indices = block_window_starts[:, None] - block_window_starts[0] + np.arange(NUM_FRAMES)
+        microphone_intensities = band_powers.sum(axis=-1)[:, frame_indices].transpose(1, 0, 2)
+        strongest_microphones = microphone_intensities.sum(axis=2).argmax(axis=1)
+        window_spectra = (band_powers / bins_per_band)[strongest_microphones[:, None], frame_indices].transpose(0, 2, 1)
+        is_known = np.broadcast_to(missing_fractions, band_powers.shape[1])[frame_indices].mean(axis=1) < 0.5
+        window_times = (block_window_starts * frame_hop + window_length / 2 - padding_before) / sampling_rate
         yield SoundImages(
-            times, intensity.astype(np.float32), spectrum.astype(np.float32), strongest_microphones, is_known
+            window_times,
+            microphone_intensities.astype(np.float32),
+            window_spectra.astype(np.float32),
+            strongest_microphones,
+            is_known,
         )
 
 
-def _band_powers(channel: np.ndarray, taper: np.ndarray, hop: int, weights: np.ndarray) -> Float[np.ndarray, "F 64"]:
+def _band_powers(
+    channel_samples: np.ndarray, hann_taper: np.ndarray, frame_hop: int, band_weights: np.ndarray
+) -> Float[np.ndarray, "F 64"]:
     """Compute the power (F, 64) of a microphone's samples in each of F frames and 64 bands, not yet scaled."""
-    frames = sliding_window_view(channel, len(taper))[::hop]
+    sample_frames = sliding_window_view(channel_samples, len(hann_taper))[::frame_hop]
     # The mean is subtracted, since a constant offset would leak into the lowest band.
-    spectrum = np.fft.rfft((frames - frames.mean(axis=1, keepdims=True)) * taper)
-    return (np.real(spectrum) ** 2 + np.imag(spectrum) ** 2) @ weights
+    fourier_spectra = np.fft.rfft((sample_frames - sample_frames.mean(axis=1, keepdims=True)) * hann_taper)
+    return (np.real(fourier_spectra) ** 2 + np.imag(fourier_spectra) ** 2) @ band_weights
 
 
-def _finite_share(finite: np.ndarray, length: int, hop: int) -> np.ndarray:
+def _finite_sample_share(is_finite_sample: np.ndarray, frame_length: int, frame_hop: int) -> np.ndarray:
     """Compute the share (M, F) of finite samples in each of F frames of M microphones."""
-    return sliding_window_view(finite, length, axis=1)[:, ::hop].mean(axis=-1)
+    return sliding_window_view(is_finite_sample, frame_length, axis=1)[:, ::frame_hop].mean(axis=-1)
 
 
-def _band_weights(length: int, rate: float, highest: float) -> Float[np.ndarray, "K 64"]:
+def _band_weights(frame_length: int, sampling_rate: float, highest: float) -> Float[np.ndarray, "K 64"]:
     """Compute the share (K, 64) of the frequency interval of each bin k, (k ± 1/2) rate / length, in each band.
 
     The share is 0 for bin 0, and for frequencies above half the rate or above `highest`.
     """
-    edges = band_edges(highest)
-    width = rate / length
-    low = (np.arange(length // 2 + 1) - 0.5) * width
-    high = np.minimum(low + width, highest + 0.5 / FRAME_DURATION)
+    frequency_edges = band_edges(highest)
+    bin_width = sampling_rate / frame_length
+    low_bin_edges = (np.arange(frame_length // 2 + 1) - 0.5) * bin_width
+    high_bin_edges = np.minimum(low_bin_edges + bin_width, highest + 0.5 / FRAME_DURATION)
     overlap_fractions = (
-        np.clip(np.minimum(high[:, None], edges[1:]) - np.maximum(low[:, None], edges[:-1]), 0, None) / width
+        np.clip(
+            np.minimum(high_bin_edges[:, None], frequency_edges[1:])
+            - np.maximum(low_bin_edges[:, None], frequency_edges[:-1]),
+            0,
+            None,
+        )
+        / bin_width
     )
     overlap_fractions[0] = 0.0
     return overlap_fractions

@@ -24,14 +24,14 @@ _RATE_TOLERANCE = 1e-3
 class _RecordingFiles(Sequence):
     """Recordings read from files on access, so that they need not all fit into memory at once."""
 
-    def __init__(self, paths: list[Path]):
-        self.paths = paths
+    def __init__(self, clip_paths: list[Path]):
+        self.clip_paths = clip_paths
 
     def __len__(self) -> int:
-        return len(self.paths)
+        return len(self.clip_paths)
 
-    def __getitem__(self, index: Any) -> Any:
-        return read_recording(self.paths[index])
+    def __getitem__(self, clip_index: Any) -> Any:
+        return read_recording(self.clip_paths[clip_index])
 
 
 @dataclass(frozen=True)
@@ -95,24 +95,24 @@ class LabelledClips:
                 f"labels: there {'is one class only, ' + repr(str(classes[0])) if len(classes) else 'are no clips'}; "
                 "give clips of two classes or more."
             )
-        channels, rates = [], []
+        clip_channel_counts, clip_rates = [], []
         for clip_index in range(len(recordings)):
             recording = recordings[clip_index]
             check_kind(
                 f"recordings[{clip_index}]", recording, Recording, "a Recording of samples, as of read_recording(path)"
             )
-            channels.append(len(recording.samples))
-            rates.append(recording.rate)
-        all_notes, channel_counts = list(notes), sorted(set(channels))
+            clip_channel_counts.append(len(recording.samples))
+            clip_rates.append(recording.rate)
+        all_notes, channel_counts = list(notes), sorted(set(clip_channel_counts))
         if len(channel_counts) > 1:
             all_notes.append(f"clips have {' or '.join(map(str, channel_counts))} channels: all were mixed to one.")
-        lowest_rate, highest_rate = min(rates), max(rates)
+        lowest_rate, highest_rate = min(clip_rates), max(clip_rates)
         if highest_rate > lowest_rate * (1 + _RATE_TOLERANCE):
-            num_lower_rates = sum(rate < highest_rate * (1 - _RATE_TOLERANCE) for rate in rates)
+            num_lower_rates = sum(clip_rate < highest_rate * (1 - _RATE_TOLERANCE) for clip_rate in clip_rates)
             all_notes.append(
-                f"{num_lower_rates} of {counted(len(rates), 'clip')} have fewer than {highest_rate:g} samples a "
-                f"second, the fewest '{recordings[int(np.argmin(rates))].name}': nothing above {lowest_rate / 2:g} Hz "
-                "is used, which all of them have."
+                f"{num_lower_rates} of {counted(len(clip_rates), 'clip')} have fewer than {highest_rate:g} samples a "
+                f"second, the fewest '{recordings[int(np.argmin(clip_rates))].name}': nothing above "
+                f"{lowest_rate / 2:g} Hz is used, which all of them have."
             )
         num_channels = channel_counts[0] if len(channel_counts) == 1 else 1
         return cls(
@@ -122,8 +122,8 @@ class LabelledClips:
     @classmethod
     def of(cls, *arguments: Any, **keywords: Any) -> "LabelledClips":
         """Former name of `from_recordings`; the next version no longer has this name."""
-        text = "LabelledClips.of is now LabelledClips.from_recordings; the old name goes with the next version."
-        warnings.warn(text, DeprecationWarning, stacklevel=2)
+        warning_text = "LabelledClips.of is now LabelledClips.from_recordings; the old name goes with the next version."
+        warnings.warn(warning_text, DeprecationWarning, stacklevel=2)
         return cls.from_recordings(*arguments, **keywords)
 
     def clip(self, number: int) -> Recording:
@@ -162,53 +162,63 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
     folder = Path(folder)
     if not folder.is_dir():
         raise ValueError(f"'{folder}' is no folder; give one with a sub-folder of clips for each class.")
-    class_folders = sorted(entry for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith("."))
+    class_folders = sorted(
+        folder_entry
+        for folder_entry in folder.iterdir()
+        if folder_entry.is_dir() and not folder_entry.name.startswith(".")
+    )
     if len(class_folders) < 2:
-        description = f"only '{class_folders[0].name}'" if class_folders else "none"
+        class_folder_text = f"only '{class_folders[0].name}'" if class_folders else "none"
         raise ValueError(
-            f"'{folder}' must have a sub-folder of clips for each of two classes or more; it has {description}."
+            f"'{folder}' must have a sub-folder of clips for each of two classes or more; it has {class_folder_text}."
         )
-    outside_files = [entry.name for entry in folder.iterdir() if entry.is_file() and not entry.name.startswith(".")]
-    paths, labels, groups, failures = [], [], [], []
+    outside_files = [
+        folder_entry.name
+        for folder_entry in folder.iterdir()
+        if folder_entry.is_file() and not folder_entry.name.startswith(".")
+    ]
+    clip_paths, class_labels, group_names, unread_files = [], [], [], []
     for class_folder in class_folders:
-        files = sorted(
-            path for path in class_folder.rglob("*") if path.is_file() and not _is_hidden(path.relative_to(folder))
+        class_files = sorted(
+            clip_path
+            for clip_path in class_folder.rglob("*")
+            if clip_path.is_file() and not _is_hidden(clip_path.relative_to(folder))
         )
-        num_files = len(paths)
-        for path in files:
+        num_earlier_files = len(clip_paths)
+        for clip_path in class_files:
             try:
-                _check_clip(read_recording(path), path.name)
+                _check_clip(read_recording(clip_path), clip_path.name)
             except (ValueError, OSError) as error:
-                failures.append((path.suffix.lower() or "no suffix", str(error).rstrip(".")))
+                unread_files.append((clip_path.suffix.lower() or "no suffix", str(error).rstrip(".")))
                 continue
-            group_parts = path.relative_to(class_folder).parts[:-1]
-            paths.append(path)
-            labels.append(class_folder.name)
-            groups.append("/".join(group_parts) if group_parts else f"{class_folder.name}/{path.name}")
+            group_parts = clip_path.relative_to(class_folder).parts[:-1]
+            clip_paths.append(clip_path)
+            class_labels.append(class_folder.name)
+            group_names.append("/".join(group_parts) if group_parts else f"{class_folder.name}/{clip_path.name}")
             if progress is not None:
-                progress(f"{counted(len(paths), 'clip')}")
-        if len(paths) == num_files:
-            reason = failures[-1][1] if files else "it is empty"
-            raise ValueError(f"'{class_folder}': there is no clip in it that can be read ({reason}).")
-    notes = [_describe_unread(failures)] if failures else []
+                progress(f"{counted(len(clip_paths), 'clip')}")
+        if len(clip_paths) == num_earlier_files:
+            failure_reason = unread_files[-1][1] if class_files else "it is empty"
+            raise ValueError(f"'{class_folder}': there is no clip in it that can be read ({failure_reason}).")
+    notes = [_describe_unread(unread_files)] if unread_files else []
     if outside_files:
         notes.append(
             f"{counted(len(outside_files), 'file')} of no class, beside their folders, left out "
             f"('{min(outside_files)}')."
         )
     return LabelledClips.from_recordings(
-        _RecordingFiles(paths), labels, groups, notes=notes, name=folder.name or str(folder)
+        _RecordingFiles(clip_paths), class_labels, group_names, notes=notes, name=folder.name or str(folder)
     )
 
 
-def _describe_unread(failures: list[tuple[str, str]]) -> str:
+def _describe_unread(unread_files: list[tuple[str, str]]) -> str:
     """Describe how many files could not be read, and for which reasons. One file of each format is described first."""
     num_previous: dict[str, int] = {}
     sort_keys = []
-    for failure_index, (suffix, reason) in enumerate(failures):
-        num_previous[suffix] = num_previous.get(suffix, -1) + 1
-        sort_keys.append((num_previous[suffix], failure_index, reason))
-    reasons = [reason for *_, reason in sorted(sort_keys)]
+    for failure_index, (file_suffix, failure_reason) in enumerate(unread_files):
+        num_previous[file_suffix] = num_previous.get(file_suffix, -1) + 1
+        sort_keys.append((num_previous[file_suffix], failure_index, failure_reason))
+    reasons = [failure_reason for *_, failure_reason in sorted(sort_keys)]
     number_of_omitted_text = (
         f"; and {len(reasons) - _MAX_DESCRIBED_FILES} more" if len(reasons) > _MAX_DESCRIBED_FILES else ""
     )
@@ -217,26 +227,26 @@ def _describe_unread(failures: list[tuple[str, str]]) -> str:
     )
 
 
-def _check_clip(clip: Recording | Intensities, name: str) -> None:
+def _check_clip(clip: Recording | Intensities, clip_name: str) -> None:
     """Raise `ValueError` for a clip that cannot be used for training: intensities, silence, or a low sampling rate."""
     if not isinstance(clip, Recording):
-        raise ValueError(f"{name}: it holds intensities, not samples.")
+        raise ValueError(f"{clip_name}: it holds intensities, not samples.")
     finite_samples = clip.samples[np.isfinite(clip.samples)]
     if not finite_samples.size:
-        raise ValueError(f"{name}: none of its samples is a number.")
+        raise ValueError(f"{clip_name}: none of its samples is a number.")
     if clip.rate < 2 * MIN_HIGHEST:
-        raise ValueError(f"{name}: {clip.rate:g} samples a second are too few; give {2 * MIN_HIGHEST:g} or more.")
+        raise ValueError(f"{clip_name}: {clip.rate:g} samples a second are too few; give {2 * MIN_HIGHEST:g} or more.")
     if finite_samples.min() == finite_samples.max():
-        raise ValueError(f"{name}: it is silent, all of its samples are {finite_samples[0]:g}.")
+        raise ValueError(f"{clip_name}: it is silent, all of its samples are {finite_samples[0]:g}.")
 
 
 def mix_channels(recording: Recording) -> Recording:
     """Mix all channels of a recording to one channel by averaging."""
     if len(recording.samples) == 1:
         return recording
-    mean = recording.samples.mean(axis=0, keepdims=True)
-    return Recording(mean, recording.rate, full_scale=recording.full_scale, name=recording.name)
+    mean_samples = recording.samples.mean(axis=0, keepdims=True)
+    return Recording(mean_samples, recording.rate, full_scale=recording.full_scale, name=recording.name)
 
 
 def _is_hidden(path: Path) -> bool:
-    return any(part.startswith(".") for part in path.parts)
+    return any(path_part.startswith(".") for path_part in path.parts)

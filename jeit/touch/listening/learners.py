@@ -84,8 +84,10 @@ class NetworkListener:
 
     def to_stored(self) -> tuple[dict[str, Any], Any]:
         """Return the header and the arrays to store in a classifier's file."""
-        levels = {name: getattr(self.levels, name).tolist() for name in Levels.__dataclass_fields__}
-        return {"levels": levels}, self.network
+        stored_levels = {
+            field_name: getattr(self.levels, field_name).tolist() for field_name in Levels.__dataclass_fields__
+        }
+        return {"levels": stored_levels}, self.network
 
 
 @dataclass(frozen=True)
@@ -100,14 +102,14 @@ class NetworkLearner:
         Of the groups of clips of each class, one in six is held out; of three to five groups, one is held out.
         """
         is_held_out = select_early_stopping_windows(training_set.labels, training_set.groups)
-        levels = Levels.from_images(training_set.images[~is_held_out])
-        level_images = levels(training_set.images)
+        input_levels = Levels.from_images(training_set.images[~is_held_out])
+        level_images = input_levels(training_set.images)
         if training_set.checkpoint is not None:
             training_set.checkpoint.parent.mkdir(parents=True, exist_ok=True)
         num_windows = int((~is_held_out).sum())
         max_batches = max(_MIN_BATCHES, _MAX_TRAINING_PASSES * num_windows // 64)
-        plan = self.plan(num_windows, batches=min(training_set.batches, max_batches))
-        result = train_network(
+        training_plan = self.plan(num_windows, batches=min(training_set.batches, max_batches))
+        training_result = train_network(
             level_images[~is_held_out],
             training_set.labels[~is_held_out],
             (level_images[is_held_out], training_set.labels[is_held_out])
@@ -115,11 +117,11 @@ class NetworkLearner:
             else (level_images, training_set.labels),
             classes=training_set.classes,
             key=training_set.key,
-            plan=plan,
+            plan=training_plan,
             checkpoint=training_set.checkpoint,
             progress=training_set.progress,
         )
-        return NetworkListener.from_network(result.network, levels)
+        return NetworkListener.from_network(training_result.network, input_levels)
 
     @staticmethod
     def stored_shapes(header: dict[str, Any], classes: int, rows: int) -> Any:
@@ -130,7 +132,8 @@ class NetworkLearner:
     def from_stored(header: dict[str, Any], arrays: Any) -> NetworkListener:
         """Restore a network from the header and arrays that `NetworkListener.to_stored` returned."""
         return NetworkListener.from_network(
-            arrays, Levels(**{name: np.array(value) for name, value in header["levels"].items()})
+            arrays,
+            Levels(**{field_name: np.array(stored_level) for field_name, stored_level in header["levels"].items()}),
         )
 
 
@@ -146,7 +149,7 @@ class TreesListener:
         from sklearn.ensemble import HistGradientBoostingClassifier
 
         min_class_windows = int(np.bincount(training_set.labels, minlength=training_set.classes).min())
-        model = HistGradientBoostingClassifier(
+        boosted_classifier = HistGradientBoostingClassifier(
             max_iter=_NUM_BOOSTING_ROUNDS,
             max_leaf_nodes=_NUM_LEAVES,
             min_samples_leaf=int(np.clip(min_class_windows // 4, 1, _MIN_LEAF_WINDOWS)),
@@ -156,8 +159,8 @@ class TreesListener:
             random_state=0,
         )
         with limit_to_one_thread():
-            model.fit(sound_features(training_set.images), training_set.labels)
-        return cls(Forest.from_boosted_classifier(model))
+            boosted_classifier.fit(sound_features(training_set.images), training_set.labels)
+        return cls(Forest.from_boosted_classifier(boosted_classifier))
 
     def log_odds(self, images: SoundImages) -> Float[np.ndarray, "W C"]:
         """Compute the log-odds (W, C) of C classes for W windows."""
@@ -167,19 +170,22 @@ class TreesListener:
         """Return the header and the arrays to store in a classifier's file."""
         forest = self.forest
         header = {"trees": forest.value.shape[0], "nodes": forest.value.shape[1], "depth": forest.depth}
-        arrays = [forest.feature, forest.left, forest.right, forest.threshold, forest.value, forest.start]
-        return header, [np.asarray(array, np.int32 if index < 3 else np.float32) for index, array in enumerate(arrays)]
+        forest_arrays = [forest.feature, forest.left, forest.right, forest.threshold, forest.value, forest.start]
+        return header, [
+            np.asarray(forest_array, np.int32 if array_index < 3 else np.float32)
+            for array_index, forest_array in enumerate(forest_arrays)
+        ]
 
     @staticmethod
     def stored_shapes(header: dict[str, Any], classes: int, rows: int) -> Any:
         """Create arrays with the shapes of the arrays in a file with this `header`."""
         node_shape = (int(header["trees"]), int(header["nodes"]))
-        shapes = [(node_shape, np.int32)] * 3 + [
+        array_shapes = [(node_shape, np.int32)] * 3 + [
             (node_shape, np.float32),
             ((*node_shape, classes), np.float32),
             ((classes,), np.float32),
         ]
-        return [jax.numpy.zeros(shape, dtype) for shape, dtype in shapes]
+        return [jax.numpy.zeros(array_shape, dtype) for array_shape, dtype in array_shapes]
 
     @classmethod
     def from_stored(cls, header: dict[str, Any], arrays: Any) -> "TreesListener":
@@ -187,23 +193,31 @@ class TreesListener:
 
         Raises `ValueError` for trees with features or nodes that do not exist.
         """
-        feature, left, right, threshold, value, start = (np.asarray(array) for array in arrays)
-        num_nodes = value.shape[1]
-        has_valid_features = (
-            (feature >= 0).all() and (feature < num_features()).all() and 0 < int(header["depth"]) < 1000
+        split_features, left_children, right_children, split_thresholds, node_values, initial_values = (
+            np.asarray(array) for array in arrays
         )
-        if not (has_valid_features and all(((child >= 0) & (child < num_nodes)).all() for child in (left, right))):
+        num_nodes = node_values.shape[1]
+        has_valid_features = (
+            (split_features >= 0).all() and (split_features < num_features()).all() and 0 < int(header["depth"]) < 1000
+        )
+        if not (
+            has_valid_features
+            and all(
+                ((child_nodes >= 0) & (child_nodes < num_nodes)).all()
+                for child_nodes in (left_children, right_children)
+            )
+        ):
             raise ValueError("its trees refer to features or nodes that do not exist")
         return cls(
             Forest(
-                feature,
-                threshold.astype(float),
-                left,
-                right,
-                value.astype(float),
+                split_features,
+                split_thresholds.astype(float),
+                left_children,
+                right_children,
+                node_values.astype(float),
                 int(header["depth"]),
-                start.astype(float),
-                np.arange(len(start)),
+                initial_values.astype(float),
+                np.arange(len(initial_values)),
             )
         )
 
@@ -228,7 +242,10 @@ class LinearListener:
 
     def to_stored(self) -> tuple[dict[str, Any], Any]:
         """Return the header and the arrays to store in a classifier's file."""
-        return {}, [np.asarray(array, np.float32) for array in (self.mean, self.deviation, self.weights, self.offset)]
+        return {}, [
+            np.asarray(model_array, np.float32)
+            for model_array in (self.mean, self.deviation, self.weights, self.offset)
+        ]
 
 
 @dataclass(frozen=True)
@@ -240,27 +257,32 @@ class LinearLearner:
     def learn(self, training_set: TrainingSet) -> LinearListener:
         """Fit the discriminant to a training set; all classes have the same prior probability, whatever their numbers
         of windows."""
-        features = self.features(training_set.images)
-        mean, deviation = features.mean(axis=0), features.std(axis=0)
+        window_features = self.features(training_set.images)
+        feature_means, feature_deviations = window_features.mean(axis=0), window_features.std(axis=0)
         # Features that are constant except for rounding errors carry no information, and would make the covariance
         # singular.
-        is_variable = deviation > 1e-5
-        deviation = np.where(is_variable, deviation, 1.0)
-        model = CLASSIFIERS["linear-discriminant"](((features - mean) / deviation)[:, is_variable], training_set.labels)
-        log_priors = np.log(model.priors_)
-        weights = np.zeros((len(mean), len(model.coef_)))
-        weights[is_variable] = model.coef_.T
-        offset = model.intercept_ - (log_priors if len(log_priors) > 2 else log_priors[1] - log_priors[0])
-        if weights.shape[1] == 1:  # with two classes, scikit-learn stores only the log-odds of the second
-            weights, offset = np.hstack([-weights, weights]) / 2, np.concatenate([-offset, offset]) / 2
-        return LinearListener(self.features, mean, deviation, weights, offset)
+        is_variable_feature = feature_deviations > 1e-5
+        feature_deviations = np.where(is_variable_feature, feature_deviations, 1.0)
+        discriminant = CLASSIFIERS["linear-discriminant"](
+            ((window_features - feature_means) / feature_deviations)[:, is_variable_feature], training_set.labels
+        )
+        log_priors = np.log(discriminant.priors_)
+        class_weights = np.zeros((len(feature_means), len(discriminant.coef_)))
+        class_weights[is_variable_feature] = discriminant.coef_.T
+        class_offsets = discriminant.intercept_ - (log_priors if len(log_priors) > 2 else log_priors[1] - log_priors[0])
+        if class_weights.shape[1] == 1:  # with two classes, scikit-learn stores only the log-odds of the second
+            class_weights, class_offsets = (
+                np.hstack([-class_weights, class_weights]) / 2,
+                np.concatenate([-class_offsets, class_offsets]) / 2,
+            )
+        return LinearListener(self.features, feature_means, feature_deviations, class_weights, class_offsets)
 
     def stored_shapes(self, header: dict[str, Any], classes: int, rows: int) -> Any:
         """Create arrays with the shapes of the arrays in a file with this `header`."""
         num_inputs = self.features(_NO_WINDOWS).shape[1]
         return [
-            jax.numpy.zeros(shape, np.float32)
-            for shape in ((num_inputs,), (num_inputs,), (num_inputs, classes), (classes,))
+            jax.numpy.zeros(array_shape, np.float32)
+            for array_shape in ((num_inputs,), (num_inputs,), (num_inputs, classes), (classes,))
         ]
 
     def from_stored(self, header: dict[str, Any], arrays: Any) -> LinearListener:
@@ -296,15 +318,18 @@ def select_early_stopping_windows(window_classes: Int[np.ndarray, " W"], groups:
     held_out_groups: set[int] = set()
     for class_index in np.unique(window_classes):
         class_groups = np.unique(groups[window_classes == class_index])
-        num_wanted = (
+        num_wanted_groups = (
             len(class_groups) // _GROUPS_PER_HELD_OUT_GROUP
             if len(class_groups) >= _GROUPS_PER_HELD_OUT_GROUP
             else int(len(class_groups) >= 3)
         )
         already_held_out = held_out_groups & set(class_groups.tolist())
-        candidates = [group for group in class_groups.tolist() if group not in held_out_groups]
-        random_order = np.random.default_rng(int(class_index)).permutation(len(candidates))
-        held_out_groups |= {candidates[index] for index in random_order[: max(0, num_wanted - len(already_held_out))]}
+        candidate_groups = [group for group in class_groups.tolist() if group not in held_out_groups]
+        random_order = np.random.default_rng(int(class_index)).permutation(len(candidate_groups))
+        held_out_groups |= {
+            candidate_groups[group_index]
+            for group_index in random_order[: max(0, num_wanted_groups - len(already_held_out))]
+        }
     is_held_out = np.isin(groups, sorted(held_out_groups))
     # If a class would not remain in the training set, nothing is held out.
     return (

@@ -38,7 +38,7 @@ _MIN_RECORDING_GAIN = 1 / 16
 _MIN_NETWORK_WINDOWS = 3000
 # Number of samples within which the readings of a working microphone change.
 _MAX_CHECKED_SAMPLES = 100_000
-_KIND, _VERSION = "a jeit listener", 2
+_FILE_KIND, _FILE_VERSION = "a jeit listener", 2
 
 
 @dataclass(frozen=True)
@@ -106,8 +106,8 @@ class Listener:
         check_name("method", method, METHODS)
         key = jax.random.key(0) if key is None else key
         check_key(key)
-        report = progress or (lambda step: None)
-        windows = Windows.from_clips(clips, report)
+        report_progress = progress or (lambda message: None)
+        windows = Windows.from_clips(clips, report_progress)
         clip_folds = held_out_folds(windows.clip_labels, windows.clip_groups, _MAX_FOLDS)
         notes = [*clips.notes, *windows.notes]
         untested_classes = np.array(windows.names)[np.unique(windows.clip_labels[clip_folds < 0])]
@@ -116,9 +116,9 @@ class Listener:
                 f"{', '.join(untested_classes)}: clips of one group only, which are never held out; their accuracy is "
                 "not known."
             )
-        names = _AUTO_METHODS if method == "auto" else (method,)
+        candidate_methods = _AUTO_METHODS if method == "auto" else (method,)
         if method == "auto" and len(windows.clip) < _MIN_NETWORK_WINDOWS:
-            names = tuple(name for name in names if name != "network")
+            candidate_methods = tuple(method_name for method_name in candidate_methods if method_name != "network")
             notes.append(
                 f"no network was tried: {len(windows.clip)} windows are few for one, and {_MIN_NETWORK_WINDOWS} would "
                 "not be."
@@ -126,26 +126,31 @@ class Listener:
         window_loudness = windows.images.loudness
         clip_loudness = np.maximum.reduceat(window_loudness, np.flatnonzero(np.diff(windows.clip, prepend=-1)))
         if loudness is None:
-            loudness = _is_loudness_useful(windows, clip_folds, key, report)
+            loudness = _is_loudness_useful(windows, clip_folds, key, report_progress)
         if not loudness:
             windows = windows.normalised
-        method_odds = []
-        for name in names:
-            method_odds.append((name, _held_out_odds(name, windows, clip_folds, key, batches, folder, report)))
-        ranked_methods = [(windows.errors(odds), order, name, odds) for order, (name, odds) in enumerate(method_odds)]
+        log_odds_of_methods = []
+        for method_name in candidate_methods:
+            log_odds_of_methods.append(
+                (method_name, _held_out_odds(method_name, windows, clip_folds, key, batches, folder, report_progress))
+            )
+        ranked_methods = [
+            (windows.errors(window_log_odds), method_order, method_name, window_log_odds)
+            for method_order, (method_name, window_log_odds) in enumerate(log_odds_of_methods)
+        ]
         # Methods are listed with the simplest last, which is chosen among methods with equal errors.
-        ranked_methods.sort(key=lambda entry: (*entry[0], -entry[1]))
-        (_, _, best_method, odds) = ranked_methods[0]
-        report(f"{best_method}, all clips")
+        ranked_methods.sort(key=lambda ranked_method: (*ranked_method[0], -ranked_method[1]))
+        (_, _, best_method, window_log_odds) = ranked_methods[0]
+        report_progress(f"{best_method}, all clips")
         full_training_set = windows.training_set(
-            np.ones(len(windows.clip), bool), key, batches, _checkpoint_path(folder, best_method), report
+            np.ones(len(windows.clip), bool), key, batches, _checkpoint_path(folder, best_method), report_progress
         )
-        model = LEARNERS[best_method].learn(full_training_set)
-        is_held_out = np.isfinite(odds).all(axis=1)
+        trained_learner = LEARNERS[best_method].learn(full_training_set)
+        is_held_out = np.isfinite(window_log_odds).all(axis=1)
         standing = None
         if is_held_out.any():
-            predicted_classes, true_classes = windows.predict_clips(odds)
-            method_errors = [(name, errors[0]) for errors, _, name, _ in ranked_methods]
+            predicted_classes, true_classes = windows.predict_clips(window_log_odds)
+            method_errors = [(method_name, error_rates[0]) for error_rates, _, method_name, _ in ranked_methods]
             standing = Standing(
                 best_method,
                 method_errors,
@@ -159,13 +164,15 @@ class Listener:
         # If all of a few held-out clips are classified correctly, the likelihood alone does not limit the confidence;
         # `doubt`, from the rule of succession, does.
         sharpness = (
-            min(1.0, fit_sharpness(odds[is_held_out], windows.labels[is_held_out])) if is_held_out.any() else 1.0
+            min(1.0, fit_sharpness(window_log_odds[is_held_out], windows.labels[is_held_out]))
+            if is_held_out.any()
+            else 1.0
         )
         num_held_out = 0 if standing is None else len(standing.right)
         return cls(
             windows.names,
             best_method,
-            model,
+            trained_learner,
             clips.channels,
             clips.highest,
             loudness,
@@ -208,34 +215,34 @@ class Listener:
             notes.append(f"{counted(num_not_finite, 'sample')} not finite: taken for silence.")
         dead_channels = np.flatnonzero(
             [
-                len(np.unique(channel[np.isfinite(channel)][:_MAX_CHECKED_SAMPLES])) < 2
-                for channel in original_recording.samples
+                len(np.unique(channel_samples[np.isfinite(channel_samples)][:_MAX_CHECKED_SAMPLES])) < 2
+                for channel_samples in original_recording.samples
             ]
         )
         if dead_channels.size:
             notes.append(f"microphones that never move: {', '.join(map(str, dead_channels))}.")
         block_results = [
             (
-                block.times,
-                block.loudness,
-                block.known,
-                block.strongest,
-                self.model.log_odds(block if self.loudness else block.normalised),
+                image_block.times,
+                image_block.loudness,
+                image_block.known,
+                image_block.strongest,
+                self.model.log_odds(image_block if self.loudness else image_block.normalised),
             )
-            for block in image_blocks(recording, self.highest)
+            for image_block in image_blocks(recording, self.highest)
         ]
-        times, loudness, is_known, strongest_microphones, odds = (
-            np.concatenate(columns) for columns in zip(*block_results, strict=True)
+        window_times, loudness, is_known, strongest_microphones, window_log_odds = (
+            np.concatenate(result_columns) for result_columns in zip(*block_results, strict=True)
         )
         is_quiet = loudness < self._quiet_threshold(float(loudness.max()))
         if is_quiet.all() and loudness.max() > 0:
             notes.append("all of it is quieter than anything learnt from: is the gain another?")
-        positions, deviations = (
-            (None, None) if calibration is None else _estimate_positions(original_recording, calibration, times)
+        touch_positions, position_deviations = (
+            (None, None) if calibration is None else _estimate_positions(original_recording, calibration, window_times)
         )
-        class_probabilities = probabilities(odds, self.sharpness)
+        class_probabilities = probabilities(window_log_odds, self.sharpness)
         return SoundLabels(
-            times,
+            window_times,
             (1 - self.doubt) * class_probabilities + self.doubt / class_probabilities.shape[1],
             self.names,
             is_quiet,
@@ -244,8 +251,8 @@ class Listener:
             (loudness >= MIN_RELATIVE_LOUDNESS * loudness.max()) & (loudness > 0),
             recording.name,
             tuple(notes),
-            positions,
-            deviations,
+            touch_positions,
+            position_deviations,
         )
 
     def _quiet_threshold(self, max_loudness: float) -> float:
@@ -256,13 +263,13 @@ class Listener:
         lower, or any amount higher.
         """
         softest_clip, loudest_clip = self.clips_loudness
-        gain = (
+        recording_gain = (
             1.0
             if self.loudness
             else float(np.clip(max_loudness / softest_clip, _MIN_RECORDING_GAIN, 1))
             * max(1.0, max_loudness / loudest_clip)
         )
-        return _MAX_QUIET_POWER_RATIO * self.quietest * gain
+        return _MAX_QUIET_POWER_RATIO * self.quietest * recording_gain
 
     def write(self, path: str | Path) -> None:
         """Write the listener, without its `standing`, to one file that consists of a JSON header and arrays.
@@ -284,7 +291,7 @@ class Listener:
             "name": self.name,
             "model": model_header,
         }
-        write_model(path, _KIND, _VERSION, header, arrays)
+        write_model(path, _FILE_KIND, _FILE_VERSION, header, arrays)
 
     @classmethod
     def read(cls, path: str | Path) -> "Listener":
@@ -305,20 +312,20 @@ class Listener:
                 header["model"], len(header["names"]), header["channels"] + NUM_BANDS
             )
 
-        header, arrays = read_model(path, _KIND, _VERSION, create_arrays)
+        header, stored_arrays = read_model(path, _FILE_KIND, _FILE_VERSION, create_arrays)
         try:
-            model = LEARNERS[header["method"]].from_stored(header["model"], arrays)
-            values = (float(header[name]) for name in ("highest_Hz", "quietest", "sharpness", "doubt"))
-            highest, quietest, sharpness, doubt = values
+            stored_learner = LEARNERS[header["method"]].from_stored(header["model"], stored_arrays)
+            header_numbers = (float(header[name]) for name in ("highest_Hz", "quietest", "sharpness", "doubt"))
+            highest, quietest, sharpness, doubt = header_numbers
             softest_clip, loudest_clip = map(float, header["clips_loudness"])
             names, notes, name = tuple(map(str, header["names"])), tuple(map(str, header["notes"])), str(header["name"])
             channels, loudness = int(header["channels"]), bool(header["loudness_counts"])
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise ValueError(f"'{path}' is not {_KIND} that can be read: {error_text(error)}.") from None
+            raise ValueError(f"'{path}' is not {_FILE_KIND} that can be read: {error_text(error)}.") from None
         return cls(
             names,
             header["method"],
-            model,
+            stored_learner,
             channels,
             highest,
             loudness,
@@ -332,22 +339,32 @@ class Listener:
 
 
 def _held_out_odds(
-    name: str, windows: Windows, clip_folds: np.ndarray, key: Array, batches: int, folder, report
+    method_name: str,
+    windows: Windows,
+    clip_folds: np.ndarray,
+    key: Array,
+    max_batches: int,
+    checkpoint_folder,
+    report_progress,
 ) -> np.ndarray:
     """Compute the log-odds (W, C) of windows by classifiers that are fitted without the fold of the window's clip; NaN
     for windows that are never held out."""
-    odds = np.full((len(windows.images), windows.classes), np.nan)
+    window_log_odds = np.full((len(windows.images), windows.classes), np.nan)
     for fold_index in range(int(clip_folds.max()) + 1):
-        report(f"{name}, fold {fold_index + 1} of {int(clip_folds.max()) + 1}")
+        report_progress(f"{method_name}, fold {fold_index + 1} of {int(clip_folds.max()) + 1}")
         is_held_out = (clip_folds == fold_index)[windows.clip]
         training_set = windows.training_set(
-            ~is_held_out, key, batches, _checkpoint_path(folder, f"{name}-{fold_index}"), report
+            ~is_held_out,
+            key,
+            max_batches,
+            _checkpoint_path(checkpoint_folder, f"{method_name}-{fold_index}"),
+            report_progress,
         )
-        odds[is_held_out] = LEARNERS[name].learn(training_set).log_odds(windows.images[is_held_out])
-    return odds
+        window_log_odds[is_held_out] = LEARNERS[method_name].learn(training_set).log_odds(windows.images[is_held_out])
+    return window_log_odds
 
 
-def _is_loudness_useful(windows: Windows, clip_folds: np.ndarray, key: Array, report) -> bool:
+def _is_loudness_useful(windows: Windows, clip_folds: np.ndarray, key: Array, report_progress) -> bool:
     """Determine whether loudness as a feature increases the number of clips that a linear discriminant classifies
     correctly, by more than one standard deviation.
 
@@ -358,31 +375,34 @@ def _is_loudness_useful(windows: Windows, clip_folds: np.ndarray, key: Array, re
     is_correct = []
     for window_set in (windows, windows.normalised):
         predicted_classes, true_classes = window_set.predict_clips(
-            _held_out_odds("linear", window_set, clip_folds, key, 1, None, report)
+            _held_out_odds("linear", window_set, clip_folds, key, 1, None, report_progress)
         )
         is_correct.append(predicted_classes == true_classes)
     num_improved, num_worsened = (is_correct[0] & ~is_correct[1]).sum(), (is_correct[1] & ~is_correct[0]).sum()
     return bool(num_improved - num_worsened > np.sqrt(num_improved + num_worsened))
 
 
-def _checkpoint_path(folder: str | Path | None, name: str) -> Path | None:
-    return None if folder is None else Path(folder) / f"{name}.training"
+def _checkpoint_path(folder: str | Path | None, training_name: str) -> Path | None:
+    return None if folder is None else Path(folder) / f"{training_name}.training"
 
 
 def _estimate_positions(
-    recording: Recording, calibration: Calibration, times: np.ndarray
+    recording: Recording, calibration: Calibration, window_times: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Estimate the touched position in each of W windows, (W, d), and its standard deviations (W, d), metres.
 
     Positions and standard deviations are means over the frames of the smoothed track that are at most 0.05 s from the
     middle of the window; NaN without such frames.
     """
-    located = locate_touches(recording, calibration)
-    positions, deviations = located.track.position, np.sqrt(np.diagonal(located.track.covariance, axis1=1, axis2=2))
-    is_near = np.abs(located.locations.times - times[:, None]) <= WINDOW_INTERVAL / 2
-    is_near &= np.isfinite(positions).all(axis=1)
-    num_frames = is_near.sum(axis=1, keepdims=True)
+    located_touches = locate_touches(recording, calibration)
+    track_positions, track_deviations = (
+        located_touches.track.position,
+        np.sqrt(np.diagonal(located_touches.track.covariance, axis1=1, axis2=2)),
+    )
+    is_in_window = np.abs(located_touches.locations.times - window_times[:, None]) <= WINDOW_INTERVAL / 2
+    is_in_window &= np.isfinite(track_positions).all(axis=1)
+    num_located_frames = is_in_window.sum(axis=1, keepdims=True)
     with np.errstate(invalid="ignore"):
-        return (is_near @ np.nan_to_num(positions)) / np.where(num_frames, num_frames, np.nan), (
-            is_near @ np.nan_to_num(deviations)
-        ) / np.where(num_frames, num_frames, np.nan)
+        return (is_in_window @ np.nan_to_num(track_positions)) / np.where(
+            num_located_frames, num_located_frames, np.nan
+        ), (is_in_window @ np.nan_to_num(track_deviations)) / np.where(num_located_frames, num_located_frames, np.nan)

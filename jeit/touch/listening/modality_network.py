@@ -62,30 +62,43 @@ class ModalityNetwork(Module):
 
         Kernels are drawn from normal distributions with the variance of He et al. (2015).
         """
-        for size, pool_size in zip(_KERNEL_SIZES, _POOL_SIZES, strict=True):
-            rows, columns = ((side - size + 1) // pool_size for side in (rows, columns))
-        keys = jax.random.split(key, 3)
-        size_1, size_2 = _KERNEL_SIZES
-        shapes = (
-            (size_1, size_1, 1, _NUM_CHANNELS[0]),
-            (size_2, size_2, *_NUM_CHANNELS),
+        for kernel_size, pool_size in zip(_KERNEL_SIZES, _POOL_SIZES, strict=True):
+            rows, columns = ((image_side - kernel_size + 1) // pool_size for image_side in (rows, columns))
+        layer_keys = jax.random.split(key, 3)
+        first_kernel_size, second_kernel_size = _KERNEL_SIZES
+        kernel_shapes = (
+            (first_kernel_size, first_kernel_size, 1, _NUM_CHANNELS[0]),
+            (second_kernel_size, second_kernel_size, *_NUM_CHANNELS),
             (rows * columns * _NUM_CHANNELS[1], classes),
         )
-        first_kernels, second_kernels, dense = (
-            jax.random.normal(layer_key, shape, jnp.float32) * jnp.float32(np.sqrt(2 / np.prod(shape[:-1])))
-            for layer_key, shape in zip(keys, shapes, strict=True)
+        first_kernels, second_kernels, dense_weights = (
+            jax.random.normal(layer_key, kernel_shape, jnp.float32)
+            * jnp.float32(np.sqrt(2 / np.prod(kernel_shape[:-1])))
+            for layer_key, kernel_shape in zip(layer_keys, kernel_shapes, strict=True)
         )
         num_first_channels, num_second_channels = _NUM_CHANNELS
-        ones, zeros = (
-            (jnp.full(num_first_channels, value, jnp.float32), jnp.full(num_second_channels, value, jnp.float32))
-            for value in (1.0, 0.0)
+        channel_ones, channel_zeros = (
+            (
+                jnp.full(num_first_channels, fill_value, jnp.float32),
+                jnp.full(num_second_channels, fill_value, jnp.float32),
+            )
+            for fill_value in (1.0, 0.0)
         )
-        dense, bias = 0.1 * dense, jnp.zeros(classes, jnp.float32)
-        return cls(first_kernels, second_kernels, ones, zeros, zeros, ones, dense, bias)
+        dense_weights, dense_bias = 0.1 * dense_weights, jnp.zeros(classes, jnp.float32)
+        return cls(
+            first_kernels,
+            second_kernels,
+            channel_ones,
+            channel_zeros,
+            channel_zeros,
+            channel_ones,
+            dense_weights,
+            dense_bias,
+        )
 
     def log_odds(self, images: Float[Array, "b rows columns"]) -> Float[Array, "b C"]:
         """Compute the log-odds (b, C) of C classes for b images, with batch normalisation by running statistics."""
-        return self._forward(images, self.mean, self.variance)[0]
+        return self._forward_pass(images, self.mean, self.variance)[0]
 
     def log_odds_in_training(
         self, images: Float[Array, "b rows columns"]
@@ -94,42 +107,49 @@ class ModalityNetwork(Module):
 
         Also returns the network with updated running means and variances.
         """
-        log_odds, means, variances = self._forward(images, None, None)
+        class_log_odds, batch_means, batch_variances = self._forward_pass(images, None, None)
         running_statistics = jax.tree.map(
-            lambda old, new: (
-                (1 - _RUNNING_MEAN_UPDATE_WEIGHT) * old + _RUNNING_MEAN_UPDATE_WEIGHT * jax.lax.stop_gradient(new)
+            lambda running_value, batch_value: (
+                (1 - _RUNNING_MEAN_UPDATE_WEIGHT) * running_value
+                + _RUNNING_MEAN_UPDATE_WEIGHT * jax.lax.stop_gradient(batch_value)
             ),
             (self.mean, self.variance),
-            (means, variances),
+            (batch_means, batch_variances),
         )
-        return log_odds, eqx.tree_at(lambda tree: (tree.mean, tree.variance), self, running_statistics)
+        return class_log_odds, eqx.tree_at(lambda network: (network.mean, network.variance), self, running_statistics)
 
-    def _forward(self, images, mean, variance):
-        values, means, variances = images[..., None], [], []
-        for layer, kernel in enumerate((self.first, self.second)):
-            values = jax.lax.conv_general_dilated(
-                values, kernel, (1, 1), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
+    def _forward_pass(self, images, running_means, running_variances):
+        activations, layer_means, layer_variances = images[..., None], [], []
+        for layer_index, layer_kernel in enumerate((self.first, self.second)):
+            activations = jax.lax.conv_general_dilated(
+                activations, layer_kernel, (1, 1), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
             )
-            if mean is None:
-                batch_mean = values.mean((0, 1, 2))
-                statistics = batch_mean, (values**2).mean((0, 1, 2)) - batch_mean**2
+            if running_means is None:
+                batch_mean = activations.mean((0, 1, 2))
+                mean_and_variance = batch_mean, (activations**2).mean((0, 1, 2)) - batch_mean**2
             else:
-                statistics = mean[layer], variance[layer]
-            means.append(statistics[0])
-            variances.append(statistics[1])
-            factor = self.gain[layer] / jnp.sqrt(statistics[1] + _VARIANCE_FLOOR)
-            values = values * factor + (self.shift[layer] - statistics[0] * factor)
-            values = _max_pool(jnp.maximum(values, 0), _POOL_SIZES[layer], jnp)
-        return values.reshape(len(images), -1) @ self.dense + self.bias, tuple(means), tuple(variances)
+                mean_and_variance = running_means[layer_index], running_variances[layer_index]
+            layer_means.append(mean_and_variance[0])
+            layer_variances.append(mean_and_variance[1])
+            channel_factors = self.gain[layer_index] / jnp.sqrt(mean_and_variance[1] + _VARIANCE_FLOOR)
+            activations = activations * channel_factors + (
+                self.shift[layer_index] - mean_and_variance[0] * channel_factors
+            )
+            activations = _max_pool(jnp.maximum(activations, 0), _POOL_SIZES[layer_index], jnp)
+        return activations.reshape(len(images), -1) @ self.dense + self.bias, tuple(layer_means), tuple(layer_variances)
 
 
-def _max_pool(values, pool_size: int, namespace):
+def _max_pool(activations, pool_size: int, array_namespace):
     """Compute the maximum of every `pool_size` × `pool_size` block of values (b, h, w, c). Rows and columns that do not
     fill a block are left out."""
-    height, width = (side // pool_size * pool_size for side in values.shape[1:3])
-    values = values[:, :height, :width]
-    row_maxima = reduce(namespace.maximum, [values[:, row::pool_size] for row in range(pool_size)])
-    return reduce(namespace.maximum, [row_maxima[:, :, column::pool_size] for column in range(pool_size)])
+    used_height, used_width = (image_side // pool_size * pool_size for image_side in activations.shape[1:3])
+    activations = activations[:, :used_height, :used_width]
+    row_maxima = reduce(
+        array_namespace.maximum, [activations[:, row_offset::pool_size] for row_offset in range(pool_size)]
+    )
+    return reduce(
+        array_namespace.maximum, [row_maxima[:, :, column_offset::pool_size] for column_offset in range(pool_size)]
+    )
 
 
 class NetworkAnswers:
@@ -139,36 +159,44 @@ class NetworkAnswers:
         host_network = jax.tree.map(np.asarray, network)
         # Batch normalisation multiplies each channel by a factor and adds an offset; the factor is merged into the
         # kernels.
-        factors = [
-            gain / np.sqrt(variance + _VARIANCE_FLOOR)
-            for gain, variance in zip(host_network.gain, host_network.variance, strict=True)
+        layer_factors = [
+            channel_gains / np.sqrt(channel_variances + _VARIANCE_FLOOR)
+            for channel_gains, channel_variances in zip(host_network.gain, host_network.variance, strict=True)
         ]
         self.kernels = [
-            np.ascontiguousarray((kernel * factor).transpose(2, 0, 1, 3).reshape(-1, kernel.shape[-1]))
-            for kernel, factor in zip((host_network.first, host_network.second), factors, strict=True)
+            np.ascontiguousarray(
+                (layer_kernel * channel_factors).transpose(2, 0, 1, 3).reshape(-1, layer_kernel.shape[-1])
+            )
+            for layer_kernel, channel_factors in zip(
+                (host_network.first, host_network.second), layer_factors, strict=True
+            )
         ]
         self.offsets = [
-            shift - factor * mean
-            for shift, factor, mean in zip(host_network.shift, factors, host_network.mean, strict=True)
+            channel_shifts - channel_factors * channel_means
+            for channel_shifts, channel_factors, channel_means in zip(
+                host_network.shift, layer_factors, host_network.mean, strict=True
+            )
         ]
         self.dense, self.bias = host_network.dense, host_network.bias
 
     def log_odds(self, images: Float[np.ndarray, "W rows columns"]) -> Float[np.ndarray, "W C"]:
         """Compute the log-odds (W, C) of C classes for W images."""
-        blocks = [
-            self._evaluate_block(images[start : start + _MAX_BLOCK_WINDOWS])
-            for start in range(0, len(images), _MAX_BLOCK_WINDOWS)
+        log_odds_of_blocks = [
+            self._evaluate_block(images[block_start : block_start + _MAX_BLOCK_WINDOWS])
+            for block_start in range(0, len(images), _MAX_BLOCK_WINDOWS)
         ]
-        return np.concatenate([np.zeros((0, len(self.bias)), np.float32), *blocks]).astype(float)
+        return np.concatenate([np.zeros((0, len(self.bias)), np.float32), *log_odds_of_blocks]).astype(float)
 
     def _evaluate_block(self, images: np.ndarray) -> np.ndarray:
-        values = images[..., None]
-        for kernel, offset, size, pool_size in zip(self.kernels, self.offsets, _KERNEL_SIZES, _POOL_SIZES, strict=True):
-            image_patches = sliding_window_view(values, (size, size), axis=(1, 2))
-            values = image_patches.reshape(*image_patches.shape[:3], -1) @ kernel
-            values += offset
-            values = _max_pool(np.maximum(values, 0, out=values), pool_size, np)
-        return values.reshape(len(images), -1) @ self.dense + self.bias
+        activations = images[..., None]
+        for layer_kernel, layer_offset, kernel_size, pool_size in zip(
+            self.kernels, self.offsets, _KERNEL_SIZES, _POOL_SIZES, strict=True
+        ):
+            image_patches = sliding_window_view(activations, (kernel_size, kernel_size), axis=(1, 2))
+            activations = image_patches.reshape(*image_patches.shape[:3], -1) @ layer_kernel
+            activations += layer_offset
+            activations = _max_pool(np.maximum(activations, 0, out=activations), pool_size, np)
+        return activations.reshape(len(images), -1) @ self.dense + self.bias
 
 
 def paper_plan(windows: int, *, batches: int, batch: int = 64) -> TrainingPlan:
@@ -220,26 +248,28 @@ def train_network(
     draw_key, training_key = jax.random.split(key)
     network = ModalityNetwork.draw(draw_key, images.shape[1], images.shape[2], classes)
     is_running_statistic = eqx.tree_at(
-        lambda tree: (tree.mean, tree.variance), jax.tree.map(lambda _: True, network), ((False, False), (False, False))
+        lambda network_tree: (network_tree.mean, network_tree.variance),
+        jax.tree.map(lambda _: True, network),
+        ((False, False), (False, False)),
     )
 
-    def loss(network: ModalityNetwork, batch: Any, key: Array):
+    def training_loss(network: ModalityNetwork, batch: Any, key: Array):
         batch_images, batch_labels = batch
-        log_odds, updated_network = network.log_odds_in_training(
+        class_log_odds, updated_network = network.log_odds_in_training(
             batch_images + noise * jax.random.normal(key, batch_images.shape, jnp.float32)
         )
-        return _cross_entropy(log_odds, batch_labels).mean(), updated_network
+        return _cross_entropy(class_log_odds, batch_labels).mean(), updated_network
 
     def validation_loss(network: ModalityNetwork, batch: Any):
         return _cross_entropy(network.log_odds(batch[0]), batch[1])
 
-    data = (np.asarray(images, np.float32), np.asarray(labels, np.int32))
-    validation = (np.asarray(validation_set[0], np.float32), np.asarray(validation_set[1], np.int32))
+    training_arrays = (np.asarray(images, np.float32), np.asarray(labels, np.int32))
+    validation_arrays = (np.asarray(validation_set[0], np.float32), np.asarray(validation_set[1], np.int32))
     return fit_network(
         network,
-        TrainingObjective(loss, validation_loss, is_running_statistic),
-        data,
-        validation,
+        TrainingObjective(training_loss, validation_loss, is_running_statistic),
+        training_arrays,
+        validation_arrays,
         plan,
         key=training_key,
         checkpoint=checkpoint,
@@ -247,5 +277,5 @@ def train_network(
     )
 
 
-def _cross_entropy(log_odds: Float[Array, "b C"], label: Int[Array, " b"]) -> Float[Array, " b"]:
-    return -jnp.take_along_axis(jax.nn.log_softmax(log_odds), label[:, None], axis=1)[:, 0]
+def _cross_entropy(class_log_odds: Float[Array, "b C"], class_labels: Int[Array, " b"]) -> Float[Array, " b"]:
+    return -jnp.take_along_axis(jax.nn.log_softmax(class_log_odds), class_labels[:, None], axis=1)[:, 0]

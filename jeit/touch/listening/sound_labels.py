@@ -86,39 +86,39 @@ class SoundLabels:
         The probability is the normalised geometric mean over the windows, so that overlapping windows do not count as
         independent; the class is "" if all windows are quiet.
         """
-        is_used = self.loud & self.known & ~self.quiet
-        if not is_used.any():
+        is_used_window = self.loud & self.known & ~self.quiet
+        if not is_used_window.any():
             return "", 0.0
-        mean = np.exp(np.log(np.maximum(self.probabilities[is_used], 1e-9)).mean(axis=0))
-        class_probabilities = mean / mean.sum()
+        mean_probabilities = np.exp(np.log(np.maximum(self.probabilities[is_used_window], 1e-9)).mean(axis=0))
+        class_probabilities = mean_probabilities / mean_probabilities.sum()
         return self.names[int(class_probabilities.argmax())], float(class_probabilities.max())
 
     @property
     def events(self) -> tuple[Event, ...]:
         """Sounds of the recording: intervals of consecutive windows of the same class."""
-        names, events = self.named, []
+        window_names, sound_events = self.named, []
         # An event extends half way to the previous and to the next window.
         boundary_segments = [
             self.times[:1] - WINDOW_INTERVAL / 2,
             (self.times[1:] + self.times[:-1]) / 2,
             self.times[-1:] + WINDOW_INTERVAL / 2,
         ]
-        edges = np.maximum(np.concatenate(boundary_segments), 0).tolist()
-        boundaries = np.flatnonzero(names[1:] != names[:-1]) + 1
-        for indices in np.split(np.arange(len(names)), boundaries):
-            if not indices.size:
+        window_edges = np.maximum(np.concatenate(boundary_segments), 0).tolist()
+        class_changes = np.flatnonzero(window_names[1:] != window_names[:-1]) + 1
+        for event_windows in np.split(np.arange(len(window_names)), class_changes):
+            if not event_windows.size:
                 continue
-            place = None
+            event_place = None
             if self.position is not None:
-                positions = self.position[indices][np.isfinite(self.position[indices]).all(axis=1)]
-                place = positions.mean(axis=0) if len(positions) else None
-            events.append(
+                event_positions = self.position[event_windows][np.isfinite(self.position[event_windows]).all(axis=1)]
+                event_place = event_positions.mean(axis=0) if len(event_positions) else None
+            sound_events.append(
                 Event(
-                    edges[indices[0]],
-                    edges[indices[-1] + 1],
-                    str(names[indices[0]]),
-                    float(self.probability[indices].mean()),
-                    place,
+                    window_edges[event_windows[0]],
+                    window_edges[event_windows[-1] + 1],
+                    str(window_names[event_windows[0]]),
+                    float(self.probability[event_windows].mean()),
+                    event_place,
                 )
             )
-        return tuple(events)
+        return tuple(sound_events)

@@ -28,33 +28,33 @@ def held_out_folds(
     set, since no other group has clips of their class. The groups of each class, the largest groups first, are assigned
     in turn to at most `max_folds` folds, so that every training set contains all classes.
     """
-    fold = np.full(len(clip_classes), -1)
+    clip_folds = np.full(len(clip_classes), -1)
     fold_of_group: dict[int, int] = {}
-    counts = np.zeros(max_folds, int)
-    groups_by_class = [np.unique(groups[clip_classes == label]) for label in np.unique(clip_classes)]
+    fold_clip_counts = np.zeros(max_folds, int)
+    groups_by_class = [np.unique(groups[clip_classes == class_label]) for class_label in np.unique(clip_classes)]
     for class_groups in sorted(groups_by_class, key=len):
         if len(class_groups) < 2:
             continue
-        for group in sorted(class_groups.tolist(), key=lambda group: -int((groups == group).sum())):
-            if group not in fold_of_group:
+        for clip_group in sorted(class_groups.tolist(), key=lambda clip_group: -int((groups == clip_group).sum())):
+            if clip_group not in fold_of_group:
                 num_groups_per_fold = [
                     sum(fold_of_group.get(other_group) == fold_index for other_group in class_groups.tolist())
                     for fold_index in range(max_folds)
                 ]
-                fold_of_group[group] = min(
+                fold_of_group[clip_group] = min(
                     range(max_folds),
-                    key=lambda fold_index: (num_groups_per_fold[fold_index], counts[fold_index], fold_index),
+                    key=lambda fold_index: (num_groups_per_fold[fold_index], fold_clip_counts[fold_index], fold_index),
                 )
-                counts[fold_of_group[group]] += int((groups == group).sum())
-    for group, fold_index in fold_of_group.items():
-        fold[groups == group] = fold_index
+                fold_clip_counts[fold_of_group[clip_group]] += int((groups == clip_group).sum())
+    for clip_group, fold_index in fold_of_group.items():
+        clip_folds[groups == clip_group] = fold_index
     # If all groups of a class were in one fold, the class would be tested while it is absent from the training set.
-    for label in np.unique(clip_classes):
-        is_in_class = clip_classes == label
-        if len(np.unique(fold[is_in_class])) < 2:
-            fold[is_in_class] = -1
-    used_folds = np.unique(fold[fold >= 0])
-    return np.where(fold >= 0, np.searchsorted(used_folds, fold), -1)
+    for class_label in np.unique(clip_classes):
+        is_in_class = clip_classes == class_label
+        if len(np.unique(clip_folds[is_in_class])) < 2:
+            clip_folds[is_in_class] = -1
+    used_folds = np.unique(clip_folds[clip_folds >= 0])
+    return np.where(clip_folds >= 0, np.searchsorted(used_folds, clip_folds), -1)
 
 
 MIN_RELATIVE_LOUDNESS = 0.01
@@ -92,31 +92,35 @@ class Windows:
 
         Raises `ValueError` for clips without finite samples.
         """
-        names, clip_labels = np.unique(clips.labels, return_inverse=True)
+        unique_labels, clip_labels = np.unique(clips.labels, return_inverse=True)
         clip_groups = np.unique(clips.groups, return_inverse=True)[1]
         single_group_labels = {
-            label for label in range(len(names)) if len(np.unique(clip_groups[clip_labels == label])) < 2
+            label_index
+            for label_index in range(len(unique_labels))
+            if len(np.unique(clip_groups[clip_labels == label_index])) < 2
         }
         image_blocks, clip_of_piece, group_of_piece, cut_classes = [], [], [], set()
         for clip_index in range(len(clips)):
-            images = sound_images(clips.clip(clip_index), clips.highest)
+            clip_images = sound_images(clips.clip(clip_index), clips.highest)
             loud_windows = np.flatnonzero(
-                images.known & (images.loudness >= MIN_RELATIVE_LOUDNESS * images.loudness.max())
+                clip_images.known & (clip_images.loudness >= MIN_RELATIVE_LOUDNESS * clip_images.loudness.max())
             )
             if not len(loud_windows):
                 raise ValueError(f"recordings[{clip_index}], {clips.recordings[clip_index].name}: it holds no numbers.")
             has_single_group = clip_labels[clip_index] in single_group_labels
-            is_long = images.times[-1] - images.times[0] > _MAX_CLIP_DURATION
+            is_long = clip_images.times[-1] - clip_images.times[0] > _MAX_CLIP_DURATION
             clip_pieces = (
-                _split_pieces(images.times[loud_windows])
+                _split_pieces(clip_images.times[loud_windows])
                 if is_long or has_single_group
                 else [np.arange(len(loud_windows))]
             )
-            for piece_index, piece in enumerate(clip_pieces):
-                selected_windows = piece[
-                    np.linspace(0, len(piece) - 1, min(len(piece), _MAX_PIECE_WINDOWS)).round().astype(int)
+            for piece_index, piece_windows in enumerate(clip_pieces):
+                selected_windows = piece_windows[
+                    np.linspace(0, len(piece_windows) - 1, min(len(piece_windows), _MAX_PIECE_WINDOWS))
+                    .round()
+                    .astype(int)
                 ]
-                image_blocks.append(images[loud_windows[selected_windows]])
+                image_blocks.append(clip_images[loud_windows[selected_windows]])
                 clip_of_piece.append(clip_index)
                 group_of_piece.append(
                     (
@@ -127,9 +131,9 @@ class Windows:
                     )
                 )
             if has_single_group and len(clip_pieces) > 1:
-                cut_classes.add(str(names[clip_labels[clip_index]]))
+                cut_classes.add(str(unique_labels[clip_labels[clip_index]]))
             report(f"{counted(clip_index + 1, 'clip')} of {len(clips)}")
-        clip = np.repeat(np.arange(len(image_blocks)), [len(block) for block in image_blocks])
+        clip_of_window = np.repeat(np.arange(len(image_blocks)), [len(image_block) for image_block in image_blocks])
         piece_labels = clip_labels[clip_of_piece]
         notes = ()
         if cut_classes:
@@ -138,12 +142,12 @@ class Windows:
                 "in turn; "
                 "accuracy on another recording is not known, and likely lower.",
             )
-        class_names = tuple(map(str, names))
+        class_names = tuple(map(str, unique_labels))
         piece_groups = np.unique(group_of_piece, axis=0, return_inverse=True)[1].ravel()
         return cls(
             SoundImages.concatenate(image_blocks),
-            clip,
-            piece_labels[clip],
+            clip_of_window,
+            piece_labels[clip_of_window],
             class_names,
             piece_labels,
             piece_groups,
@@ -170,10 +174,10 @@ class Windows:
         classes."""
         is_held_out = np.isfinite(odds).all(axis=1)
         log_probabilities = odds[is_held_out] - np.logaddexp.reduce(odds[is_held_out], axis=1, keepdims=True)
-        clips, clip_rows = np.unique(self.clip[is_held_out], return_inverse=True)
-        total = np.zeros((len(clips), self.classes))
-        np.add.at(total, clip_rows, log_probabilities)
-        return total.argmax(axis=1), self.clip_labels[clips]
+        held_out_clips, clip_row_of_window = np.unique(self.clip[is_held_out], return_inverse=True)
+        clip_log_probabilities = np.zeros((len(held_out_clips), self.classes))
+        np.add.at(clip_log_probabilities, clip_row_of_window, log_probabilities)
+        return clip_log_probabilities.argmax(axis=1), self.clip_labels[held_out_clips]
 
     def errors(self, odds: Float[np.ndarray, "W C"]) -> tuple[float, float]:
         """Compute the error rates of held-out clips and of held-out windows from the log-odds (W, C) of windows."""
@@ -193,18 +197,20 @@ def _split_pieces(times: Float[np.ndarray, " n"]) -> list[np.ndarray]:
     `times`: middles of the windows, seconds. Consecutive windows belong to one sound if the time between them does not
     exceed the duration of a window. A long sound is cut every 2 s; windows that extend over a cut are left out.
     """
-    intervals, period = [], _PIECE_DURATION + WINDOW_DURATION
-    for sound in np.split(np.arange(len(times)), np.flatnonzero(np.diff(times) > WINDOW_DURATION) + 1):
-        elapsed = times[sound] - times[sound[0]]
-        if elapsed[-1] <= period:
-            intervals.append(sound)
+    window_pieces, piece_period = [], _PIECE_DURATION + WINDOW_DURATION
+    for sound_windows in np.split(np.arange(len(times)), np.flatnonzero(np.diff(times) > WINDOW_DURATION) + 1):
+        elapsed_times = times[sound_windows] - times[sound_windows[0]]
+        if elapsed_times[-1] <= piece_period:
+            window_pieces.append(sound_windows)
             continue
-        piece_number, time_in_piece = np.divmod(elapsed, period)
-        kept_windows = sound[time_in_piece <= _PIECE_DURATION]
-        intervals += np.split(kept_windows, np.flatnonzero(np.diff(piece_number[time_in_piece <= _PIECE_DURATION])) + 1)
-    if len(intervals) > _MAX_PIECES:
-        intervals = [
-            intervals[interval_index]
-            for interval_index in np.linspace(0, len(intervals) - 1, _MAX_PIECES).round().astype(int)
+        piece_number, time_in_piece = np.divmod(elapsed_times, piece_period)
+        kept_windows = sound_windows[time_in_piece <= _PIECE_DURATION]
+        window_pieces += np.split(
+            kept_windows, np.flatnonzero(np.diff(piece_number[time_in_piece <= _PIECE_DURATION])) + 1
+        )
+    if len(window_pieces) > _MAX_PIECES:
+        window_pieces = [
+            window_pieces[interval_index]
+            for interval_index in np.linspace(0, len(window_pieces) - 1, _MAX_PIECES).round().astype(int)
         ]
-    return intervals
+    return window_pieces

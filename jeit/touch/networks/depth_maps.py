@@ -48,13 +48,13 @@ def resting_frame(frames: Float[np.ndarray, "r M"], name: str = "reference") -> 
     image = linear.image(frame - reference)
     ```
     """
-    is_known = np.isfinite(frames)
-    num_readings = is_known.sum(axis=0)
+    has_reading = np.isfinite(frames)
+    num_readings = has_reading.sum(axis=0)
     if np.mean(num_readings == 0) > MAX_MISSING_FRACTION:
         raise ValueError(
             f"'{name}' has no voltage of {int(np.sum(num_readings == 0))} of {len(num_readings)} channels."
         )
-    return np.where(num_readings, np.where(is_known, frames, 0).sum(axis=0) / np.maximum(num_readings, 1), np.nan)
+    return np.where(num_readings, np.where(has_reading, frames, 0).sum(axis=0) / np.maximum(num_readings, 1), np.nan)
 
 
 def check_measured(network: ImageNetwork, measurement: Measurement) -> None:
@@ -68,22 +68,22 @@ def check_measured(network: ImageNetwork, measurement: Measurement) -> None:
     if np.iscomplexobj(measurement.voltages):
         raise ValueError(f"'{measurement.name}' is complex, and the network was trained on real voltages.")
     _check_extent(network, measurement)
-    positions = getattr(measurement.electrodes, "position", None)
-    if positions is None or np.ndim(positions) != 2:
+    electrode_positions = getattr(measurement.electrodes, "position", None)
+    if electrode_positions is None or np.ndim(electrode_positions) != 2:
         return
     trained_positions = 1e-3 * np.asarray(network.made_for["electrodes_mm"])
-    distances = np.linalg.norm(np.asarray(positions)[:, :2] - trained_positions, axis=1)
-    if distances.max() > _POSITION_TOLERANCE:
+    electrode_distances = np.linalg.norm(np.asarray(electrode_positions)[:, :2] - trained_positions, axis=1)
+    if electrode_distances.max() > _POSITION_TOLERANCE:
         raise ValueError(
-            f"'{measurement.name}': electrode {distances.argmax() + 1} is {1e3 * distances.max():.3g} mm from where "
-            "the network's is; train one for this skin."
+            f"'{measurement.name}': electrode {electrode_distances.argmax() + 1} is "
+            f"{1e3 * electrode_distances.max():.3g} mm from where the network's is; train one for this skin."
         )
 
 
 def _check_extent(network: ImageNetwork, measurement: Measurement) -> None:
     """Raise `ValueError` if the sizes of a measurement's and a network's skin differ by more than a millimetre."""
-    domain = measurement.domain
-    measured_extent = getattr(domain, "extent", None)
+    measured_domain = measurement.domain
+    measured_extent = getattr(measured_domain, "extent", None)
     if measured_extent is None or np.shape(measured_extent) != (4,):
         return
     trained_size, measured_size = (
@@ -123,10 +123,10 @@ def stream_depths(network: ImageNetwork, frames: Iterable, rest: Float[np.ndarra
     for frame_index, frame in enumerate(frames):
         start_time = time.perf_counter()
         try:
-            change = network.changes(np.asarray(frame, float), rest)
-            depth_fraction = network.share(change)
-            (reason,) = network.doubts(change, depth_fraction)
-            depth = None if reason else network.thickness * depth_fraction[0]
+            voltage_change = network.changes(np.asarray(frame, float), rest)
+            depth_fraction = network.share(voltage_change)
+            (reason,) = network.doubts(voltage_change, depth_fraction)
+            depth_map = None if reason else network.thickness * depth_fraction[0]
         except (ValueError, TypeError) as error:
-            depth, reason = None, " ".join(str(error).split())
-        yield FrameDepth(frame_index, depth, reason, time.perf_counter() - start_time)
+            depth_map, reason = None, " ".join(str(error).split())
+        yield FrameDepth(frame_index, depth_map, reason, time.perf_counter() - start_time)

@@ -32,7 +32,7 @@ from jeit.touch.training import check_same, read_model, write_model
 NETWORK_DESIGNS = ("unrolled", "three-stages")
 _FILE_KIND, _FILE_VERSION = "a jeit image network", 1
 # Maximum number of refinement steps of an unrolled network.
-_MAX_STEPS = 100
+_MAX_NETWORK_STEPS = 100
 NETWORK_FILE = "network.jeit"
 # Maximum number of frames that are imaged at once; larger batches would exceed the processor's cache. JAX compiles a
 # program for each power of two up to this number.
@@ -76,11 +76,11 @@ class ImageNetwork:
     @classmethod
     def from_skin(cls, network: ThreeStages | Unrolled, skin: Skin, noise: float, shape: tuple[int, int]):
         """Create an `ImageNetwork` from a neural network that was trained for the given skin."""
-        design = "unrolled" if isinstance(network, Unrolled) else "three-stages"
+        design_name = "unrolled" if isinstance(network, Unrolled) else "three-stages"
         low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
         extent = low_x, high_x, low_y, high_y
-        made_for = describe_skin(skin.model.protocol, skin.layout.centres, extent)
-        return cls(network, design, float(skin.thickness), shape, extent, float(noise), made_for)
+        skin_description = describe_skin(skin.model.protocol, skin.layout.centres, extent)
+        return cls(network, design_name, float(skin.thickness), shape, extent, float(noise), skin_description)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the fields to pickle; compiled programs are left out and compiled again later."""
@@ -94,9 +94,9 @@ class ImageNetwork:
         input: `doubts` states which maps are unreliable. Raises `ValueError` if the number of channels differs from
         that in training, and as `changes` does.
         """
-        change = self.changes(voltages, reference)
-        maps = self.thickness * self.share(change)
-        return maps if np.ndim(voltages) == 2 else maps[0]
+        voltage_changes = self.changes(voltages, reference)
+        depth_maps = self.thickness * self.share(voltage_changes)
+        return depth_maps if np.ndim(voltages) == 2 else depth_maps[0]
 
     def changes(self, voltages: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "n M"]:
         """Compute relative voltage changes (frames, channels) from a reference frame, with missing channels filled in.
@@ -107,32 +107,45 @@ class ImageNetwork:
         num_channels = self.made_for["channels"]
         frames = real_array("voltages", voltages, f"frames ({num_channels},) or (n, {num_channels}), volts")
         reference_frame = real_array("reference", reference, f"a frame ({num_channels},), volts")
-        for name, array in (("voltages", frames), ("reference", reference_frame)):
-            if array.shape[-1:] != (num_channels,) or array.ndim > (2 if name == "voltages" else 1):
-                raise ValueError(f"{name} has shape {array.shape}; this network takes {num_channels} channels.")
-            if np.isinf(array).any():
-                raise ValueError(f"{name} is infinite in channel {np.flatnonzero(np.isinf(array))[0] % num_channels}.")
+        for argument_name, checked_frames in (("voltages", frames), ("reference", reference_frame)):
+            if checked_frames.shape[-1:] != (num_channels,) or checked_frames.ndim > (
+                2 if argument_name == "voltages" else 1
+            ):
+                raise ValueError(
+                    f"{argument_name} has shape {checked_frames.shape}; this network takes {num_channels} channels."
+                )
+            if np.isinf(checked_frames).any():
+                raise ValueError(
+                    f"{argument_name} is infinite in channel "
+                    f"{np.flatnonzero(np.isinf(checked_frames))[0] % num_channels}."
+                )
         frames = np.atleast_2d(frames)
         is_missing = np.isnan(frames) | np.isnan(reference_frame)
-        max_missing = MAX_MISSING_FRACTION * num_channels if isinstance(self.network, Unrolled) else 0
+        max_missing_channels = MAX_MISSING_FRACTION * num_channels if isinstance(self.network, Unrolled) else 0
         worst_frame = int(is_missing.sum(axis=1).argmax()) if len(is_missing) else 0
-        if is_missing.any() and is_missing[worst_frame].sum() > max_missing:
+        if is_missing.any() and is_missing[worst_frame].sum() > max_missing_channels:
             missing_channels = np.flatnonzero(is_missing[worst_frame])
             channels_text = ", ".join(map(str, missing_channels[:6])) + (", …" if len(missing_channels) > 6 else "")
             raise ValueError(
                 f"voltages: no reading of {len(missing_channels)} of {num_channels} channels ({channels_text}); "
                 + (
                     "half of them are needed."
-                    if max_missing
+                    if max_missing_channels
                     else "a network of three stages needs all, another does not."
                 )
             )
-        change = np.where(
+        relative_changes = np.where(
             is_missing, np.nan, relative_voltage_changes(np.nan_to_num(reference_frame), np.nan_to_num(frames))
         )
-        if (max_change := np.nanmax(np.abs(change), initial=0)) > _MAX_RELATIVE_CHANGE:
-            raise ValueError(f"voltages are {max_change:.3g} times those of the reference; are units the same?")
-        return fill_missing(change, self._covariance, self.noise) if is_missing.any() else change
+        if (max_relative_change := np.nanmax(np.abs(relative_changes), initial=0)) > _MAX_RELATIVE_CHANGE:
+            raise ValueError(
+                f"voltages are {max_relative_change:.3g} times those of the reference; are units the same?"
+            )
+        return (
+            fill_missing(relative_changes, self._channel_covariance, self.noise)
+            if is_missing.any()
+            else relative_changes
+        )
 
     def doubts(self, change: Float[np.ndarray, "n M"], share: Float[np.ndarray, "n rows columns"]) -> list[str]:
         """State why each depth map is unreliable; an empty string if there is no evidence against the map.
@@ -142,7 +155,7 @@ class ImageNetwork:
         model, a map is also unreliable if it bulges outwards more than it is indented, and the voltages that the model
         predicts for its indentation do not explain the change.
         """
-        reasons = ["" for _ in share]
+        doubt_reasons = ["" for _ in share]
         change_norms = np.linalg.norm(change, axis=1)
         is_testable = change_norms > _MIN_CHANGE_TO_NOISE * self.noise * np.sqrt(change.shape[1])
         unexplained_fractions, min_bulge = np.zeros(len(share)), _MIN_BULGE_TO_FLOOR * self.floor / self.thickness
@@ -155,29 +168,29 @@ class ImageNetwork:
             if unexplained_fractions[map_index] > _MAX_UNEXPLAINED_FRACTION and -depth_map.min() > max(
                 depth_map.max(), min_bulge
             ):
-                reasons[map_index] = (
+                doubt_reasons[map_index] = (
                     "the change is not that of a touch, but of a skin pushed outwards; do frame and reference "
                     "have the same "
                     "signs, and was the skin untouched in the reference?"
                 )
             elif depth_map.max() > _MAX_RELATIVE_DEPTH:
-                reasons[map_index] = (
+                doubt_reasons[map_index] = (
                     f"{1e3 * self.thickness * float(depth_map.max()):.3g} mm deep, and the skin is "
                     f"{1e3 * self.thickness:.3g} mm thick; are the units those of the reference?"
                 )
-        return reasons
+        return doubt_reasons
 
     @functools.cached_property
     def floor(self) -> float:
         """Noise floor of depth, metres: the maximum depth in 64 maps of an untouched skin, simulated with the channel
         noise of the training."""
-        random = np.random.default_rng(0)
+        generator = np.random.default_rng(0)
         return self.thickness * float(
-            self.share(self.noise * random.normal(size=(64, self.made_for["channels"]))).max()
+            self.share(self.noise * generator.normal(size=(64, self.made_for["channels"]))).max()
         )
 
     @functools.cached_property
-    def _covariance(self) -> Float[np.ndarray, "M M"]:
+    def _channel_covariance(self) -> Float[np.ndarray, "M M"]:
         """Covariance (channels, channels) of the relative voltage changes that touches cause."""
         assert isinstance(self.network, Unrolled)
         return self.network.covariance(pixel_places(self.extent, self.shape))
@@ -187,7 +200,7 @@ class ImageNetwork:
         """Compiled function that predicts relative voltage changes from relative depth maps by the forward model."""
         network = self.network
         assert isinstance(network, Unrolled)
-        return jax.jit(lambda maps: network.predicted_changes(jnp.asarray(maps, jnp.float32)))
+        return jax.jit(lambda depth_maps: network.predicted_changes(jnp.asarray(depth_maps, jnp.float32)))
 
     def share(self, change: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n rows columns"]:
         """Compute depth maps, divided by the skin's thickness, from relative voltage changes (frames, channels).
@@ -201,22 +214,29 @@ class ImageNetwork:
         padded_changes = np.zeros((-(-num_frames // batch_size) * batch_size, change.shape[1]), np.float32)
         padded_changes[:num_frames] = change
         if len(padded_changes) == batch_size:
-            return np.asarray(self._compiled(padded_changes))[:num_frames]
-        starts, compiled = range(0, len(padded_changes), batch_size), self._compiled
+            return np.asarray(self._compiled_network(padded_changes))[:num_frames]
+        batch_starts, compiled_network = range(0, len(padded_changes), batch_size), self._compiled_network
         # A compiled program leaves cores idle between its convolutions: running two programs at once takes three
         # quarters of the time.
-        with ThreadPoolExecutor(min(len(starts), os.cpu_count() or 1)) as pool:
-            parts = list(
-                pool.map(lambda start: np.asarray(compiled(padded_changes[start : start + batch_size])), starts)
+        with ThreadPoolExecutor(min(len(batch_starts), os.cpu_count() or 1)) as thread_pool:
+            map_batches = list(
+                thread_pool.map(
+                    lambda batch_start: np.asarray(
+                        compiled_network(padded_changes[batch_start : batch_start + batch_size])
+                    ),
+                    batch_starts,
+                )
             )
-        return np.concatenate(parts)[:num_frames]
+        return np.concatenate(map_batches)[:num_frames]
 
     @functools.cached_property
-    def _compiled(self) -> Callable[..., Any]:
+    def _compiled_network(self) -> Callable[..., Any]:
         """Compiled function that computes relative depth maps from relative voltage changes."""
-        arrays, static_part = eqx.partition(self.network, eqx.is_array)
-        run_network = jax.jit(lambda arrays, change: eqx.combine(arrays, static_part)(change))
-        return lambda change: run_network(arrays, jnp.asarray(change))
+        network_arrays, static_part = eqx.partition(self.network, eqx.is_array)
+        run_network = jax.jit(
+            lambda network_arrays, relative_changes: eqx.combine(network_arrays, static_part)(relative_changes)
+        )
+        return lambda relative_changes: run_network(network_arrays, jnp.asarray(relative_changes))
 
     def check_protocol(self, protocol: Protocol, name: str = "the data") -> None:
         """Raise `ValueError`, which states the difference, if the network was trained for a protocol other than
@@ -262,7 +282,7 @@ def write_network(network: ImageNetwork, path: str | Path) -> None:
         "extent_m": list(network.extent),
         "noise": network.noise,
         "made_for": network.made_for,
-        "versions": {name: version(name) for name in ("jeit", "jax", "equinox")},
+        "versions": {package_name: version(package_name) for package_name in ("jeit", "jax", "equinox")},
     }
     write_model(path, _FILE_KIND, _FILE_VERSION, header, network.network)
 
@@ -312,25 +332,25 @@ def _untrained_network(header: dict[str, Any]) -> ThreeStages | Unrolled:
     """Create an untrained network of the architecture that the `header` of a network's file describes."""
     check_name("design", header["design"], NETWORK_DESIGNS)
     rows, columns = header["shape"]
-    channels, key = header["made_for"]["channels"], jax.random.key(0)
-    for count in (rows, columns, channels):
-        if not (isinstance(count, int) and 1 <= count <= 10_000):
-            raise ValueError(f"its header gives {describe(count)} rows, columns or channels")
+    num_channels, key = header["made_for"]["channels"], jax.random.key(0)
+    for header_size in (rows, columns, num_channels):
+        if not (isinstance(header_size, int) and 1 <= header_size <= 10_000):
+            raise ValueError(f"its header gives {describe(header_size)} rows, columns or channels")
     lengths_and_noise = [header["thickness_m"], header["noise"], *header["extent_m"]]
-    if len(lengths_and_noise) != 6 or not all(is_number(number) for number in lengths_and_noise):
+    if len(lengths_and_noise) != 6 or not all(is_number(header_number) for header_number in lengths_and_noise):
         raise ValueError("its header gives no thickness, noise and extent")
-    if not (isinstance(header["steps"], int) and 0 <= header["steps"] <= _MAX_STEPS):
+    if not (isinstance(header["steps"], int) and 0 <= header["steps"] <= _MAX_NETWORK_STEPS):
         raise ValueError(f"its header gives {describe(header['steps'])} steps")
     if header["design"] == "three-stages":
-        return ThreeStages(channels, (rows, columns), key=key)
-    return Unrolled(channels, (rows, columns), header["steps"], key=key)
+        return ThreeStages(num_channels, (rows, columns), key=key)
+    return Unrolled(num_channels, (rows, columns), header["steps"], key=key)
 
 
 def _describe_protocol(protocol: Protocol) -> dict[str, Any]:
     """Return the numbers of channels and electrodes of a protocol, and a hash of its drive and measurement patterns
     that does not depend on the current."""
     drive_patterns, measurement_patterns = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
-    patterns = (
+    scaled_patterns = (
         np.round(
             np.concatenate(
                 [
@@ -345,7 +365,7 @@ def _describe_protocol(protocol: Protocol) -> dict[str, Any]:
     return {
         "channels": protocol.num_measurements,
         "electrodes": protocol.num_electrodes,
-        "patterns_sha256": hashlib.sha256(patterns.tobytes()).hexdigest()[:16],
+        "patterns_sha256": hashlib.sha256(scaled_patterns.tobytes()).hexdigest()[:16],
     }
 
 
@@ -359,10 +379,12 @@ def fill_missing(
     channel.
     """
     completed_changes = np.array(changes, float)
-    is_known = np.isfinite(completed_changes)
-    for mask in np.unique(is_known[~is_known.all(axis=1)], axis=0):
-        rows = (is_known == mask).all(axis=1)
-        known_covariance = covariance[np.ix_(mask, mask)] + noise**2 * np.eye(int(mask.sum()))
-        expected = np.linalg.solve(known_covariance, covariance[np.ix_(mask, ~mask)])
-        completed_changes[np.ix_(rows, ~mask)] = completed_changes[np.ix_(rows, mask)] @ expected
+    has_reading = np.isfinite(completed_changes)
+    for read_channels in np.unique(has_reading[~has_reading.all(axis=1)], axis=0):
+        has_same_channels = (has_reading == read_channels).all(axis=1)
+        read_covariance = covariance[np.ix_(read_channels, read_channels)] + noise**2 * np.eye(int(read_channels.sum()))
+        regression_matrix = np.linalg.solve(read_covariance, covariance[np.ix_(read_channels, ~read_channels)])
+        completed_changes[np.ix_(has_same_channels, ~read_channels)] = (
+            completed_changes[np.ix_(has_same_channels, read_channels)] @ regression_matrix
+        )
     return completed_changes

@@ -45,7 +45,7 @@ from jeit.touch.training import (
 # Training of the unrolled network. Weights of the maps of the other steps and of the voltage misfit in the loss,
 # relative to the weight of the last step's map. Model error, relative to the voltage changes; maximum standard
 # deviation of the drift of log contact impedances; maximum noise, as a multiple of the given noise.
-_EARLIER_MAP_LOSS_WEIGHT, _VOLTAGE_MISFIT_LOSS_WEIGHT, _MODEL_ERROR, _MAX_CONTACT_DRIFT, _MAX_NOISE_FACTOR = (
+_EARLIER_MAP_LOSS_WEIGHT, _VOLTAGE_MISFIT_LOSS_WEIGHT, _RELATIVE_MODEL_ERROR, _MAX_CONTACT_DRIFT, _MAX_NOISE_FACTOR = (
     0.3,
     0.05,
     0.1,
@@ -98,18 +98,20 @@ def train_three_stages(
     Both autoencoders are fixed while the projection is trained. `noise`: standard deviation of the noise of relative
     voltage changes.
     """
-    shape = validation.depth.shape[1:]
-    initial_network = ThreeStages(validation.change.shape[1], shape, key=runs.key)
-    mean, deviation = mean_and_deviation(training.rows("change"))
-    noisy_deviation = np.hypot(deviation, noise)
+    map_shape = validation.depth.shape[1:]
+    initial_network = ThreeStages(validation.change.shape[1], map_shape, key=runs.key)
+    mean_change, change_deviation = mean_and_deviation(training.rows("change"))
+    noisy_deviation = np.hypot(change_deviation, noise)
     initial_network = eqx.tree_at(
         lambda network: (network.mean, network.deviation),
         initial_network,
-        (jnp.asarray(mean, jnp.float32), jnp.asarray(noisy_deviation, jnp.float32)),
+        (jnp.asarray(mean_change, jnp.float32), jnp.asarray(noisy_deviation, jnp.float32)),
     )
     noise_scale = jnp.asarray(noise / noisy_deviation, jnp.float32)
-    changes = MappedRows(training.rows("change"), initial_network.standardise, f"standardised under noise of {noise}")
-    voltage_key, depth_key = (jax.random.fold_in(runs.key, number) for number in (1, 2))
+    scaled_changes = MappedRows(
+        training.rows("change"), initial_network.standardise, f"standardised under noise of {noise}"
+    )
+    voltage_key, depth_key = (jax.random.fold_in(runs.key, key_number) for key_number in (1, 2))
 
     def denoising_loss(network, batch, key):
         noise_key, dropout_key = jax.random.split(key)
@@ -119,17 +121,17 @@ def train_three_stages(
     def map_loss(network, batch, key):
         return jnp.mean((network(batch, key) - batch) ** 2) / _LOSS_SCALE, network
 
-    losses_by_training = {
+    training_results = {
         "voltages": runs.run(
             "voltages",
             VoltageAutoencoder(validation.change.shape[1], key=voltage_key),
             TrainingObjective(denoising_loss, lambda network, batch: jnp.mean((network(batch) - batch) ** 2, axis=1)),
-            changes,
+            scaled_changes,
             initial_network.standardise(jnp.asarray(validation.change, jnp.float32)),
         ),
         "maps": runs.run(
             "maps",
-            DepthAutoencoder(shape, key=depth_key),
+            DepthAutoencoder(map_shape, key=depth_key),
             TrainingObjective(
                 map_loss, lambda network, batch: jnp.mean((network(batch) - batch) ** 2, axis=(1, 2)) / _LOSS_SCALE
             ),
@@ -137,7 +139,7 @@ def train_three_stages(
             validation.depth,
         ),
     }
-    trained_parts = (losses_by_training["voltages"].network.encoder, losses_by_training["maps"].network.decoder)
+    trained_parts = (training_results["voltages"].network.encoder, training_results["maps"].network.decoder)
     initial_network = eqx.tree_at(lambda network: (network.encoder, network.decoder), initial_network, trained_parts)
     is_trained_weight = eqx.tree_at(
         lambda network: network.projection,
@@ -150,11 +152,11 @@ def train_three_stages(
         noisy_change = change + noise * jax.random.normal(key, change.shape, change.dtype)
         return jnp.mean((network(noisy_change) - true_maps) ** 2) / _LOSS_SCALE, network
 
-    rows = training.rows("change", "depth"), _add_noise(validation, noise)
-    losses_by_training["projection"] = runs.run(
-        "projection", initial_network, TrainingObjective(projection_loss, _map_errors, is_trained_weight), *rows
+    datasets = training.rows("change", "depth"), _add_noise(validation, noise)
+    training_results["projection"] = runs.run(
+        "projection", initial_network, TrainingObjective(projection_loss, _map_errors, is_trained_weight), *datasets
     )
-    return TrainedNetwork(losses_by_training["projection"].network, losses_by_training)
+    return TrainedNetwork(training_results["projection"].network, training_results)
 
 
 def train_unrolled(
@@ -170,30 +172,38 @@ def train_unrolled(
     The voltages of maps are computed by the skin's forward model. In training, relative noise of one to six times
     `noise` and the effect of drifting contact impedances are added to the voltage changes.
     """
-    contacts = jnp.asarray(channels.contacts, jnp.float32)
+    contact_changes = jnp.asarray(channels.contacts, jnp.float32)
 
     def loss(network, batch, key):
-        change, depth = batch
-        keys = jax.random.split(key, 4)
+        change, true_maps = batch
+        random_keys = jax.random.split(key, 4)
         # Drift and log noise are linear in the square of a uniform random number, so that most amounts are low.
         drift_size, noise_size = (
-            jax.random.uniform(size_key, (len(change), 1), change.dtype) ** 2 for size_key in keys[2:]
+            jax.random.uniform(size_key, (len(change), 1), change.dtype) ** 2 for size_key in random_keys[2:]
         )
-        drift = _MAX_CONTACT_DRIFT * drift_size * jax.random.normal(keys[1], (len(change), len(contacts)), change.dtype)
+        contact_drift = (
+            _MAX_CONTACT_DRIFT
+            * drift_size
+            * jax.random.normal(random_keys[1], (len(change), len(contact_changes)), change.dtype)
+        )
         noise_levels = noise * _MAX_NOISE_FACTOR**noise_size
-        noisy_change = change + noise_levels * jax.random.normal(keys[0], change.shape, change.dtype) + drift @ contacts
+        noisy_change = (
+            change
+            + noise_levels * jax.random.normal(random_keys[0], change.shape, change.dtype)
+            + contact_drift @ contact_changes
+        )
         *maps_of_earlier_steps, last_map = network.maps_after_steps(noisy_change)
-        loss_value = jnp.mean((last_map - depth) ** 2)
+        loss_value = jnp.mean((last_map - true_maps) ** 2)
         for map_of_earlier_step in maps_of_earlier_steps:
-            loss_value = loss_value + _EARLIER_MAP_LOSS_WEIGHT * jnp.mean((map_of_earlier_step - depth) ** 2)
-        expected_misfit = noise_levels[:, 0] ** 2 + _MODEL_ERROR**2 * jnp.mean(change**2, axis=1)
+            loss_value = loss_value + _EARLIER_MAP_LOSS_WEIGHT * jnp.mean((map_of_earlier_step - true_maps) ** 2)
+        expected_misfit = noise_levels[:, 0] ** 2 + _RELATIVE_MODEL_ERROR**2 * jnp.mean(change**2, axis=1)
         relative_misfit = jnp.mean((network.predicted_changes(last_map) - change) ** 2, axis=1) / expected_misfit
         # The logarithm of the misfit is used, since touches on electrodes, which the model explains least, would
         # otherwise dominate.
         return loss_value / _LOSS_SCALE + _VOLTAGE_MISFIT_LOSS_WEIGHT * jnp.mean(jnp.log1p(relative_misfit)), network
 
-    rows = training.rows("change", "depth"), _add_noise(validation, noise)
-    result = runs.run("unrolled", untrained, TrainingObjective(loss, _map_errors, untrained.trained), *rows)
+    datasets = training.rows("change", "depth"), _add_noise(validation, noise)
+    result = runs.run("unrolled", untrained, TrainingObjective(loss, _map_errors, untrained.trained), *datasets)
     return TrainedNetwork(result.network, {"unrolled": result})
 
 
@@ -204,29 +214,31 @@ def shuffle_pairs(examples: TouchExamples, seed: int = 0) -> TouchExamples:
 
 
 def _map_errors(network, batch):
-    change, depth = batch
-    return jnp.mean((network(change) - depth) ** 2, axis=(1, 2)) / _LOSS_SCALE
+    change, true_maps = batch
+    return jnp.mean((network(change) - true_maps) ** 2, axis=(1, 2)) / _LOSS_SCALE
 
 
 def mean_and_deviation(rows: Rows) -> tuple[Float[np.ndarray, " M"], Float[np.ndarray, " M"]]:
     """Compute the mean and the standard deviation of each column of the `rows` over all their chunks."""
-    num_rows, mean, squares = 0, np.zeros(()), np.zeros(())
-    for chunk_index, size in enumerate(rows.sizes):
-        values = np.asarray(rows.chunk(chunk_index), float)
-        chunk_mean = values.mean(axis=0)
+    num_rows, running_mean, squared_deviations = 0, np.zeros(()), np.zeros(())
+    for chunk_index, chunk_size in enumerate(rows.sizes):
+        chunk_values = np.asarray(rows.chunk(chunk_index), float)
+        chunk_mean = chunk_values.mean(axis=0)
         # Sum of squares about the mean of earlier chunks and this chunk together (Chan, Golub and LeVeque 1983).
-        difference, num_rows = chunk_mean - mean, num_rows + size
-        squares = (
-            squares + ((values - chunk_mean) ** 2).sum(axis=0) + difference**2 * (num_rows - size) * size / num_rows
+        mean_difference, num_rows = chunk_mean - running_mean, num_rows + chunk_size
+        squared_deviations = (
+            squared_deviations
+            + ((chunk_values - chunk_mean) ** 2).sum(axis=0)
+            + mean_difference**2 * (num_rows - chunk_size) * chunk_size / num_rows
         )
-        mean = mean + difference * size / num_rows
-    return mean, np.sqrt(squares / num_rows)
+        running_mean = running_mean + mean_difference * chunk_size / num_rows
+    return running_mean, np.sqrt(squared_deviations / num_rows)
 
 
 def _add_noise(examples: TouchExamples, noise: float) -> tuple[Float[np.ndarray, "n M"], Float[np.ndarray, "n r c"]]:
     """Return voltage changes with noise, and depth maps; the noise is fixed, so that held-out data never differ."""
-    random = np.random.default_rng(0).normal(size=examples.change.shape)
-    return np.asarray(examples.change + noise * random, np.float32), examples.depth
+    standard_noise = np.random.default_rng(0).normal(size=examples.change.shape)
+    return np.asarray(examples.change + noise * standard_noise, np.float32), examples.depth
 
 
 DEPTH_MAP_SHAPE = (48, 48)
@@ -238,7 +250,7 @@ _BALL_DIAMETER = 0.015
 # Depth to which the ball is pressed, divided by the skin's thickness.
 _BALL_DEPTH = 0.75
 # Number of places along a side at which the ball is pressed.
-_PLACES_PER_SIDE = 15
+_BALL_PLACES_PER_SIDE = 15
 
 
 @dataclass(frozen=True)
@@ -362,14 +374,14 @@ def learn_images(
         if not (isinstance(touches, int) and touches >= 1):
             raise ValueError(f"touches must be a whole number, 1 or more; it is {describe(touches)}.")
         preset = dataclasses.replace(preset, number=touches)
-    report = (lambda _: None) if progress is None else progress
+    report_progress = (lambda _: None) if progress is None else progress
     working_folder = Path(folder) / "work"
     working_folder.mkdir(parents=True, exist_ok=True)
-    seconds, start = {}, time.monotonic()
-    report("noise")
+    stage_seconds, start_time = {}, time.monotonic()
+    report_progress("noise")
     noise = detection_noise(skin)
     simulated_sets = {}
-    for name, num_touches, seed_offset in zip(
+    for set_name, num_touches, seed_offset in zip(
         ("learnt", "held-out", "standing"),
         (preset.number, preset.held_out, preset.held_out),
         _SEED_OFFSETS,
@@ -378,56 +390,60 @@ def learn_images(
         indents = IndentSet(
             skin, touch_draws(skin), num_touches, seed=3 * seed + seed_offset, shape=DEPTH_MAP_SHAPE, chunk=_CHUNK_SIZE
         )
-        path = working_folder / f"{name}.zarr"
+        store_path = working_folder / f"{set_name}.zarr"
         try:
             simulate_presses(
                 indents,
-                path,
+                store_path,
                 client=client,
-                progress=lambda state, name=name: report(f"touches {name}: {state.points} of {state.all_points}"),
+                progress=lambda state, set_name=set_name: report_progress(
+                    f"touches {set_name}: {state.points} of {state.all_points}"
+                ),
             )
         except DifferentContentsError:
             raise ValueError(
                 f"folder '{folder}' was begun for another skin, seed or number of touches; give another folder, or "
                 f"delete '{working_folder}' to learn anew."
             ) from None
-        simulated_sets[name] = StoredTouches(indents, path)
-    held_out_examples, test_examples = (simulated_sets[name].in_memory() for name in ("held-out", "standing"))
-    seconds["touches"] = time.monotonic() - start
+        simulated_sets[set_name] = StoredTouches(indents, store_path)
+    held_out_examples, test_examples = (simulated_sets[set_name].in_memory() for set_name in ("held-out", "standing"))
+    stage_seconds["touches"] = time.monotonic() - start_time
     key = jax.random.key(seed)
-    runs = TrainingRuns(preset.plan_of(design), key, working_folder, progress)
+    training_runs = TrainingRuns(preset.plan_of(design), key, working_folder, progress)
     if design == "unrolled":
-        channels = LinearChannels.from_skin(skin, DEPTH_MAP_SHAPE)
+        linear_channels = LinearChannels.from_skin(skin, DEPTH_MAP_SHAPE)
         initial_network = Unrolled(held_out_examples.change.shape[1], DEPTH_MAP_SHAPE, key=jax.random.fold_in(key, 3))
         pixel_positions = image_places(skin, DEPTH_MAP_SHAPE[1], DEPTH_MAP_SHAPE[0])
-        initial_network = initial_network.adapted_to_skin(channels, pixel_positions, skin.layout.centres, noise)
+        initial_network = initial_network.adapted_to_skin(linear_channels, pixel_positions, skin.layout.centres, noise)
         trained_network = train_unrolled(
-            initial_network, channels, simulated_sets["learnt"], held_out_examples, noise, runs
+            initial_network, linear_channels, simulated_sets["learnt"], held_out_examples, noise, training_runs
         )
     else:
-        trained_network = train_three_stages(simulated_sets["learnt"], held_out_examples, noise, runs)
-    seconds["training"] = time.monotonic() - start - seconds["touches"]
+        trained_network = train_three_stages(simulated_sets["learnt"], held_out_examples, noise, training_runs)
+    stage_seconds["training"] = time.monotonic() - start_time - stage_seconds["touches"]
     network = ImageNetwork.from_skin(trained_network.network, skin, noise, DEPTH_MAP_SHAPE)
-    report("standing")
+    report_progress("standing")
     standing = evaluate_network(network, skin, test_examples)
-    seconds["all"] = time.monotonic() - start
+    stage_seconds["all"] = time.monotonic() - start_time
     write_network(network, Path(folder) / NETWORK_FILE)
-    return LearntImages(network, trained_network.courses, standing, seconds)
+    return LearntImages(network, trained_network.courses, standing, stage_seconds)
 
 
 def evaluate_network(network: ImageNetwork, skin: Skin, examples: TouchExamples, seed: int = 0) -> ImageStanding:
     """Evaluate an image network on simulated touches, with the noise of its training."""
-    random = np.random.default_rng(seed)
+    generator = np.random.default_rng(seed)
 
     def estimate_maps(change):
-        return network.share(change + network.noise * random.normal(size=change.shape))
+        return network.share(change + network.noise * generator.normal(size=change.shape))
 
-    maps = estimate_maps(examples.change)
-    explained = 1 - float(np.mean((maps - examples.depth) ** 2) / np.mean(examples.depth**2))
-    grid = touches_away_from_the_edge(skin.outline, _BALL_DIAMETER / 2, _PLACES_PER_SIDE, _PLACES_PER_SIDE)
-    tip, depth = ball_indenter(_BALL_DIAMETER), min(_BALL_DEPTH * float(skin.thickness), _BALL_DIAMETER / 2)
-    ball_maps = estimate_maps(relative_changes(skin, [[Indent(tip, depth, place)] for place in grid.places]))
+    estimated_maps = estimate_maps(examples.change)
+    explained_fraction = 1 - float(np.mean((estimated_maps - examples.depth) ** 2) / np.mean(examples.depth**2))
+    ball_grid = touches_away_from_the_edge(
+        skin.outline, _BALL_DIAMETER / 2, _BALL_PLACES_PER_SIDE, _BALL_PLACES_PER_SIDE
+    )
+    ball, ball_depth = ball_indenter(_BALL_DIAMETER), min(_BALL_DEPTH * float(skin.thickness), _BALL_DIAMETER / 2)
+    ball_maps = estimate_maps(relative_changes(skin, [[Indent(ball, ball_depth, place)] for place in ball_grid.places]))
     rows, columns = network.shape
-    place_errors = error_statistics(depth_centroids(ball_maps, image_places(skin, columns, rows)), grid.places)
-    max_relative_depth = float(np.median(ball_maps.max(axis=(1, 2)))) * float(skin.thickness) / depth
-    return ImageStanding(explained, place_errors, max_relative_depth, examples.depth[:6], maps[:6])
+    place_errors = error_statistics(depth_centroids(ball_maps, image_places(skin, columns, rows)), ball_grid.places)
+    max_relative_depth = float(np.median(ball_maps.max(axis=(1, 2)))) * float(skin.thickness) / ball_depth
+    return ImageStanding(explained_fraction, place_errors, max_relative_depth, examples.depth[:6], estimated_maps[:6])

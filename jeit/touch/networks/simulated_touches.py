@@ -42,8 +42,8 @@ class TouchExamples(NamedTuple):
 
     def rows(self, *names: str) -> ArrayRows:
         """Return the arrays of these names, as `SimulatedTouches.rows` does."""
-        arrays = tuple(np.asarray(getattr(self, name), np.float32) for name in names)
-        return ArrayRows(arrays[0] if len(arrays) == 1 else arrays)
+        touch_arrays = tuple(np.asarray(getattr(self, array_name), np.float32) for array_name in names)
+        return ArrayRows(touch_arrays[0] if len(touch_arrays) == 1 else touch_arrays)
 
 
 class StoredTouches:
@@ -55,13 +55,14 @@ class StoredTouches:
     def __init__(self, indents: IndentSet, path: str | Path, max_chunk_size: int = _MAX_TOUCHES_IN_MEMORY):
         """Open the store of touches. Raises `ValueError` if the set is not finished, and as `Store` does."""
         store, chunks = Store(indents.contents(), path, create=False), indents.chunks
-        checksums = store.finished_checksums()
-        if len(checksums) < len(chunks):
+        chunk_checksums = store.finished_checksums()
+        if len(chunk_checksums) < len(chunks):
             raise ValueError(
-                f"path: {len(checksums)} of {len(chunks)} chunks of {path} are simulated; run simulate_presses again."
+                f"path: {len(chunk_checksums)} of {len(chunks)} chunks of {path} are simulated; run "
+                "simulate_presses again."
             )
-        self.fingerprint = hashlib.sha256(repr(sorted(checksums.items())).encode()).hexdigest()
-        self._arrays = store.open_dataset()
+        self.fingerprint = hashlib.sha256(repr(sorted(chunk_checksums.items())).encode()).hexdigest()
+        self._dataset = store.open_dataset()
         # The chunks are of similar size, so that no chunk is smaller than a batch.
         num_chunks = min(-(-indents.number // max_chunk_size), len(chunks))
         grouped_chunks = np.array_split(np.arange(len(chunks)), num_chunks)
@@ -75,19 +76,19 @@ class StoredTouches:
 
     def in_memory(self) -> TouchExamples:
         """Read all touches of the set into memory."""
-        return TouchExamples(self._arrays["change"].to_numpy(), self._arrays["depth"].to_numpy())
+        return TouchExamples(self._dataset["change"].to_numpy(), self._dataset["depth"].to_numpy())
 
     def read(self, name: str, chunk: int) -> Float[np.ndarray, "n *shape"]:
         """Read the array `name` of one chunk of touches, float32."""
         row_range = self.row_ranges[chunk]
-        return self._arrays[name][row_range.start : row_range.stop].to_numpy().astype(np.float32, copy=False)
+        return self._dataset[name][row_range.start : row_range.stop].to_numpy().astype(np.float32, copy=False)
 
 
 class StoredRows:
     """The named arrays of `StoredTouches`, with the interface of `Rows`."""
 
     def __init__(self, touches: StoredTouches, names: tuple[str, ...]):
-        self._touches, self._names = touches, names
+        self._touches, self._array_names = touches, names
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -97,9 +98,9 @@ class StoredRows:
     @property
     def fingerprint(self) -> str:
         """Fingerprint of the touches, the names of the arrays, and the sizes of the chunks."""
-        return f"{self._touches.fingerprint} {' '.join(self._names)} {self.sizes}"
+        return f"{self._touches.fingerprint} {' '.join(self._array_names)} {self.sizes}"
 
     def chunk(self, index: int):
         """Read the arrays of one chunk of touches; for a single name, returns the array itself."""
-        arrays = tuple(self._touches.read(name, index) for name in self._names)
-        return arrays[0] if len(arrays) == 1 else arrays
+        touch_arrays = tuple(self._touches.read(array_name, index) for array_name in self._array_names)
+        return touch_arrays[0] if len(touch_arrays) == 1 else touch_arrays

@@ -51,10 +51,10 @@ class Convolution(Module):
 
     def __call__(self, image: Float[Array, "b r c i"]) -> Float[Array, "b p q o"]:
         """Apply the layer to a batch of images (images, rows, columns, channels)."""
-        layout = ("NHWC", "HWIO", "NHWC")
+        axis_layout = ("NHWC", "HWIO", "NHWC")
         convolution_strides = (self.stride, self.stride)
         return (
-            jax.lax.conv_general_dilated(image, self.weight, convolution_strides, "SAME", dimension_numbers=layout)
+            jax.lax.conv_general_dilated(image, self.weight, convolution_strides, "SAME", dimension_numbers=axis_layout)
             + self.bias
         )
 
@@ -76,10 +76,12 @@ class Convolution(Module):
         # The image is padded before the convolution: for a padded convolution of even size, XLA takes twenty times as
         # long to compute derivatives.
         padded_image = jnp.pad(image, ((0, 0), (1, 1), (1, 1), (0, 0)))
-        layout = ("NHWC", "HWIO", "NHWC")
-        outputs = jax.lax.conv_general_dilated(padded_image, pixel_weights, (1, 1), "VALID", dimension_numbers=layout)
-        outputs = outputs.reshape(num_images, rows + 1, columns + 1, 2, 2, -1)
-        output_rows = [[outputs[:, a : a + rows, b : b + columns, a, b] for b in (0, 1)] for a in (0, 1)]
+        axis_layout = ("NHWC", "HWIO", "NHWC")
+        convolved_blocks = jax.lax.conv_general_dilated(
+            padded_image, pixel_weights, (1, 1), "VALID", dimension_numbers=axis_layout
+        )
+        convolved_blocks = convolved_blocks.reshape(num_images, rows + 1, columns + 1, 2, 2, -1)
+        output_rows = [[convolved_blocks[:, a : a + rows, b : b + columns, a, b] for b in (0, 1)] for a in (0, 1)]
         output_image = jnp.stack([jnp.stack(output_row, axis=3) for output_row in output_rows], axis=2)
         return output_image.reshape(num_images, 2 * rows, 2 * columns, -1) + self.bias
 
@@ -96,9 +98,10 @@ class Chain(Module):
     @classmethod
     def dense(cls, widths: Sequence[int], *, key: Array, dropout: float = 0.0) -> "Chain":
         """Create dense layers in sequence, whose numbers of inputs and outputs are successive elements of `widths`."""
-        keys = jax.random.split(key, len(widths) - 1)
+        layer_keys = jax.random.split(key, len(widths) - 1)
         return cls(
-            tuple(Dense(i, o, key=layer_key) for (i, o), layer_key in zip(pairwise(widths), keys, strict=True)), dropout
+            tuple(Dense(i, o, key=layer_key) for (i, o), layer_key in zip(pairwise(widths), layer_keys, strict=True)),
+            dropout,
         )
 
     def __call__(self, values: Array, key: Array | None = None) -> Array:
@@ -130,20 +133,20 @@ def channels_to_pixels(image: Float[Array, "b r c 4"]) -> Float[Array, "b s d"]:
 
 
 # Minimum number of random numbers drawn for the weights of a layer.
-_MIN_DRAWS = 8192
+_MIN_NUM_DRAWS = 8192
 
 
-def _draw_weights(key: Array, shape: tuple[int, ...], inputs: int) -> Array:
-    """Draw random initial weights of a layer; each output depends on a number `inputs` of values (He et al. 2015).
+def _draw_weights(key: Array, weight_shape: tuple[int, ...], num_inputs: int) -> Array:
+    """Draw random initial weights of a layer; each output depends on a number `num_inputs` of values (He et al. 2015).
 
     The number of draws is rounded up to a power of two, and to one number for all convolutions, so that JAX compiles
     fewer programs for layers of different sizes; the first draws are the same for any number.
     """
-    num_weights = math.prod(shape)
-    num_draws = max(1 << max(num_weights - 1, 0).bit_length(), _MIN_DRAWS)
-    draws = jax.random.normal(key, (num_draws,), jnp.float32)
-    draws = np.asarray(draws) if has_values(draws) else draws
-    return jnp.asarray(draws[:num_weights].reshape(shape) * np.float32(np.sqrt(2 / inputs)))
+    num_weights = math.prod(weight_shape)
+    num_draws = max(1 << max(num_weights - 1, 0).bit_length(), _MIN_NUM_DRAWS)
+    normal_draws = jax.random.normal(key, (num_draws,), jnp.float32)
+    normal_draws = np.asarray(normal_draws) if has_values(normal_draws) else normal_draws
+    return jnp.asarray(normal_draws[:num_weights].reshape(weight_shape) * np.float32(np.sqrt(2 / num_inputs)))
 
 
 # Autoencoder of voltages: size of the hidden layers, size of the latent vector, and dropout rate; autoencoder of depth
@@ -182,9 +185,10 @@ class DepthEncoder(Module):
     def __init__(self, shape: tuple[int, int], *, key: Array):
         """Create an untrained network for depth maps of this shape; rows and columns are multiples of 8."""
         *layer_keys, last_key = jax.random.split(key, len(_NUM_FILTERS) + 1)
-        widths = (1, *_NUM_FILTERS)
+        layer_widths = (1, *_NUM_FILTERS)
         self.layers = tuple(
-            Convolution(i, o, 2, key=layer_key) for (i, o), layer_key in zip(pairwise(widths), layer_keys, strict=True)
+            Convolution(i, o, 2, key=layer_key)
+            for (i, o), layer_key in zip(pairwise(layer_widths), layer_keys, strict=True)
         )
         self.last = Dense(shape[0] * shape[1] // 64 * _NUM_FILTERS[-1], _CODE_SIZE, key=last_key)
 
@@ -206,11 +210,12 @@ class DepthDecoder(Module):
     def __init__(self, shape: tuple[int, int], *, key: Array):
         """Create an untrained network for depth maps of this shape; rows and columns are multiples of 8."""
         first_key, *layer_keys = jax.random.split(key, len(_NUM_FILTERS) + 1)
-        widths = (*_NUM_FILTERS[::-1], 1)
+        layer_widths = (*_NUM_FILTERS[::-1], 1)
         self.shape = (shape[0] // 8, shape[1] // 8)
-        self.first = Dense(_CODE_SIZE, self.shape[0] * self.shape[1] * widths[0], key=first_key)
+        self.first = Dense(_CODE_SIZE, self.shape[0] * self.shape[1] * layer_widths[0], key=first_key)
         self.layers = tuple(
-            Convolution(i, o, key=layer_key) for (i, o), layer_key in zip(pairwise(widths), layer_keys, strict=True)
+            Convolution(i, o, key=layer_key)
+            for (i, o), layer_key in zip(pairwise(layer_widths), layer_keys, strict=True)
         )
 
     def __call__(self, code: Float[Array, "b 128"]) -> Float[Array, "b r c"]:

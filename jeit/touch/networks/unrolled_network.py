@@ -35,20 +35,20 @@ class Refinement(Module):
 
     def __init__(self, num_channels: int, *, key: Array):
         """Create an untrained U-net for images with `num_channels` channels."""
-        keys = jax.random.split(key, 9)
+        convolution_keys = jax.random.split(key, 9)
         self.inwards = (
-            Convolution(num_channels, _OUTER_CHANNELS, key=keys[0]),
-            Convolution(_OUTER_CHANNELS, _INNER_CHANNELS, 2, key=keys[1]),
-            Convolution(_INNER_CHANNELS, _INNER_CHANNELS, key=keys[2]),
-            Convolution(_INNER_CHANNELS, _INNER_CHANNELS, 2, key=keys[3]),
-            Convolution(_INNER_CHANNELS, _INNER_CHANNELS, key=keys[4]),
+            Convolution(num_channels, _OUTER_CHANNELS, key=convolution_keys[0]),
+            Convolution(_OUTER_CHANNELS, _INNER_CHANNELS, 2, key=convolution_keys[1]),
+            Convolution(_INNER_CHANNELS, _INNER_CHANNELS, key=convolution_keys[2]),
+            Convolution(_INNER_CHANNELS, _INNER_CHANNELS, 2, key=convolution_keys[3]),
+            Convolution(_INNER_CHANNELS, _INNER_CHANNELS, key=convolution_keys[4]),
         )
         self.outwards = (
-            Convolution(_INNER_CHANNELS, _INNER_CHANNELS, key=keys[5]),
-            Convolution(_INNER_CHANNELS, _OUTER_CHANNELS, key=keys[6]),
-            Convolution(_OUTER_CHANNELS, _OUTER_CHANNELS, key=keys[7]),
+            Convolution(_INNER_CHANNELS, _INNER_CHANNELS, key=convolution_keys[5]),
+            Convolution(_INNER_CHANNELS, _OUTER_CHANNELS, key=convolution_keys[6]),
+            Convolution(_OUTER_CHANNELS, _OUTER_CHANNELS, key=convolution_keys[7]),
         )
-        last_layer = Convolution(_OUTER_CHANNELS, 4, key=keys[8])
+        last_layer = Convolution(_OUTER_CHANNELS, 4, key=convolution_keys[8])
         # The initial weights of the last layer are small, so that an untrained network hardly changes the linear
         # images.
         self.last = eqx.tree_at(lambda layer: layer.weight, last_layer, 0.01 * last_layer.weight)
@@ -92,10 +92,10 @@ class Unrolled(Module):
         self.operator = jnp.asarray(np.zeros((num_channels, shape[0] * shape[1]), np.float32))
         self.imagers = jnp.asarray(np.zeros((num_channels, rows * columns, num_images), np.float32))
         self.constant_images = jnp.asarray(np.zeros((rows, columns, 2), np.float32))
-        keys = jax.random.split(key, num_steps)
+        step_keys = jax.random.split(key, num_steps)
         self.steps = tuple(
             Refinement(num_images + 2 + (4 if step_index else 0), key=step_key)
-            for step_index, step_key in enumerate(keys)
+            for step_index, step_key in enumerate(step_keys)
         )
         self.shape = shape
 
@@ -108,15 +108,15 @@ class Unrolled(Module):
         pixels, metres; `electrode_positions` (electrodes, 2): positions of the electrodes, metres; `noise`: relative
         noise of the channels.
         """
-        operator = channels.coarser_operator()
-        covariance = _covariance(pixel_positions[::2, ::2].reshape(-1, 2))
-        cross_covariance = operator @ covariance
-        change_covariance = cross_covariance @ operator.T
-        drift = _CONTACT_DRIFT**2 * channels.contacts.T @ channels.contacts
+        coarse_operator = channels.coarser_operator()
+        strength_covariance = _strength_covariance(pixel_positions[::2, ::2].reshape(-1, 2))
+        cross_covariance = coarse_operator @ strength_covariance
+        change_covariance = cross_covariance @ coarse_operator.T
+        drift_covariance = _CONTACT_DRIFT**2 * channels.contacts.T @ channels.contacts
         noise_covariance = noise**2 * np.eye(len(change_covariance))
         error_covariances = [
-            *(multiple**2 * noise_covariance for multiple in _NOISE_MULTIPLES),
-            noise_covariance + drift,
+            *(noise_multiple**2 * noise_covariance for noise_multiple in _NOISE_MULTIPLES),
+            noise_covariance + drift_covariance,
         ]
         imagers = np.stack(
             [
@@ -126,16 +126,24 @@ class Unrolled(Module):
             axis=-1,
         )
         block_centres = pixel_positions.reshape(self.shape[0] // 2, 2, self.shape[1] // 2, 2, 2).mean(axis=(1, 3))
-        distances = np.linalg.norm(block_centres[..., None, :] - np.asarray(electrode_positions), axis=-1).min(axis=-1)
-        response = np.log(np.linalg.norm(operator, axis=0).reshape(distances.shape) + 1e-9)
+        electrode_distances = np.linalg.norm(
+            block_centres[..., None, :] - np.asarray(electrode_positions), axis=-1
+        ).min(axis=-1)
+        log_sensitivity = np.log(np.linalg.norm(coarse_operator, axis=0).reshape(electrode_distances.shape) + 1e-9)
         constant_images = np.stack(
-            [distances / distances.max(), (response - response.mean()) / response.std()], axis=-1
+            [
+                electrode_distances / electrode_distances.max(),
+                (log_sensitivity - log_sensitivity.mean()) / log_sensitivity.std(),
+            ],
+            axis=-1,
         )
-        arrays = [
+        skin_arrays = [
             jnp.asarray(round_relative_to_maximum(array), jnp.float32)
             for array in (channels.operator, imagers, constant_images)
         ]
-        return eqx.tree_at(lambda network: (network.operator, network.imagers, network.constant_images), self, arrays)
+        return eqx.tree_at(
+            lambda network: (network.operator, network.imagers, network.constant_images), self, skin_arrays
+        )
 
     @property
     def trained(self) -> "Unrolled":
@@ -147,9 +155,9 @@ class Unrolled(Module):
         """Compute the covariance (channels, channels) of the relative voltage changes due to touches that are
         distributed according to the prior; `pixel_positions` (rows, columns, 2): positions of the pixels, metres."""
         rows, columns = self.shape[0] // 2, self.shape[1] // 2
-        operator = np.asarray(self.operator, float).reshape(-1, rows, 2, columns, 2).sum(axis=(2, 4))
-        operator = operator.reshape(len(operator), -1)
-        return operator @ _covariance(pixel_positions[::2, ::2].reshape(-1, 2)) @ operator.T
+        coarse_operator = np.asarray(self.operator, float).reshape(-1, rows, 2, columns, 2).sum(axis=(2, 4))
+        coarse_operator = coarse_operator.reshape(len(coarse_operator), -1)
+        return coarse_operator @ _strength_covariance(pixel_positions[::2, ::2].reshape(-1, 2)) @ coarse_operator.T
 
     def predicted_changes(self, maps: Float[Array, "b r c"]) -> Float[Array, "b M"]:
         """Compute the relative voltage changes (maps, channels) that the linear forward model predicts for relative
@@ -162,17 +170,19 @@ class Unrolled(Module):
         num_frames, (rows, columns) = len(changes), (self.shape[0] // 2, self.shape[1] // 2)
         constant_images = jnp.broadcast_to(self.constant_images, (num_frames, *self.constant_images.shape))
         maps_of_steps = []
-        for step in self.steps:
-            residual = changes - self.predicted_changes(maps_of_steps[-1]) if maps_of_steps else changes
-            images = (residual @ self.imagers.reshape(len(self.imagers), -1)).reshape(num_frames, rows, columns, -1)
-            inputs = [images / _STRENGTH_DEVIATION, constant_images]
+        for refinement in self.steps:
+            voltage_residual = changes - self.predicted_changes(maps_of_steps[-1]) if maps_of_steps else changes
+            residual_images = (voltage_residual @ self.imagers.reshape(len(self.imagers), -1)).reshape(
+                num_frames, rows, columns, -1
+            )
+            refinement_inputs = [residual_images / _STRENGTH_DEVIATION, constant_images]
             if maps_of_steps:
-                maps = maps_of_steps[-1]
-                pixel_blocks = maps.reshape(num_frames, rows, 2, columns, 2)
-                inputs.append(jnp.moveaxis(pixel_blocks, 2, 3).reshape(num_frames, rows, columns, 4))
+                previous_maps = maps_of_steps[-1]
+                pixel_blocks = previous_maps.reshape(num_frames, rows, 2, columns, 2)
+                refinement_inputs.append(jnp.moveaxis(pixel_blocks, 2, 3).reshape(num_frames, rows, columns, 4))
             else:
-                maps = repeat_pixels(depth_from_strength(images[..., :1]))[..., 0]
-            maps_of_steps.append(maps + step(jnp.concatenate(inputs, axis=-1)))
+                previous_maps = repeat_pixels(depth_from_strength(residual_images[..., :1]))[..., 0]
+            maps_of_steps.append(previous_maps + refinement(jnp.concatenate(refinement_inputs, axis=-1)))
         return maps_of_steps
 
     def __call__(self, changes: Float[Array, "b M"]) -> Float[Array, "b r c"]:
@@ -181,9 +191,9 @@ class Unrolled(Module):
         return self.maps_after_steps(changes)[-1]
 
 
-def _covariance(pixel_positions: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p p"]:
+def _strength_covariance(pixel_positions: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p p"]:
     """Compute the prior covariance of the indentation strengths of pixels, a Gaussian function of the pixels'
     distance."""
-    length = _CORRELATION_LENGTH * np.ptp(pixel_positions, axis=0).max()
+    correlation_length = _CORRELATION_LENGTH * np.ptp(pixel_positions, axis=0).max()
     squared_distances = ((pixel_positions[:, None] - pixel_positions) ** 2).sum(axis=-1)
-    return _STRENGTH_DEVIATION**2 * np.exp(-squared_distances / (2 * length**2))
+    return _STRENGTH_DEVIATION**2 * np.exp(-squared_distances / (2 * correlation_length**2))

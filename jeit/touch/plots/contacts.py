@@ -18,7 +18,7 @@ from jeit.plot.colours import CHANGE_SCALE, DARK_GREY, ColourScale, choose_si_pr
 from jeit.plot.imaging.image import plot_image
 from jeit.touch.contacts import Contact, RasterStages
 
-_HALO = [withStroke(linewidth=3, foreground="white")]
+_WHITE_HALO = [withStroke(linewidth=3, foreground="white")]
 
 
 def plot_contacts(
@@ -66,11 +66,13 @@ def draw_contacts(contacts: Sequence[Contact], *, ax: Axes | None = None) -> Axe
     for contact in contacts:
         x, y = contact.centroid
         ax.add_patch(Polygon(contact.contour, fill=False, edgecolor=DARK_GREY, linewidth=1.2, zorder=3))
-        ax.plot(x, y, marker="+", color=DARK_GREY, markersize=9, markeredgewidth=1.4, zorder=4, path_effects=_HALO)
-        text = f"({1e3 * x:+.1f}, {1e3 * y:+.1f}) mm".replace("-", "−")
+        ax.plot(
+            x, y, marker="+", color=DARK_GREY, markersize=9, markeredgewidth=1.4, zorder=4, path_effects=_WHITE_HALO
+        )
+        coordinates_text = f"({1e3 * x:+.1f}, {1e3 * y:+.1f}) mm".replace("-", "−")
         contour_top = contact.contour[:, 1].max()
         ax.annotate(
-            text,
+            coordinates_text,
             (x, contour_top),
             (0, 4),
             textcoords="offset points",
@@ -78,7 +80,7 @@ def draw_contacts(contacts: Sequence[Contact], *, ax: Axes | None = None) -> Axe
             color=DARK_GREY,
             fontsize=8,
             zorder=5,
-            path_effects=_HALO,
+            path_effects=_WHITE_HALO,
         )
     return ax
 
@@ -95,7 +97,7 @@ def largest_magnitude(values: np.ndarray) -> float:
     return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
 
 
-_TITLES = ("region of interest", "grey", "adaptive threshold", "opened", "contours", "centroids")
+_STAGE_TITLES = ("region of interest", "grey", "adaptive threshold", "opened", "contours", "centroids")
 
 
 def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarray | None = None) -> np.ndarray:
@@ -120,34 +122,34 @@ def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarr
     """
     check_kind("stages", stages, RasterStages, "what finder.stages(image, noise) of a RasterFinder gives")
     axes = _new_axes() if axes is None else np.asarray(axes, object).ravel()
-    if axes.size != len(_TITLES):
+    if axes.size != len(_STAGE_TITLES):
         raise ValueError(f"axes: give six, one for each stage; there are {axes.size}.")
-    is_inside = np.isfinite(stages.region)
-    factor, with_prefix = choose_si_prefix(largest_magnitude(stages.region), unit)
-    colour_limit = factor * largest_magnitude(stages.region) or 1.0
+    is_on_skin = np.isfinite(stages.region)
+    unit_factor, prefixed_unit = choose_si_prefix(largest_magnitude(stages.region), unit)
+    colour_limit = unit_factor * largest_magnitude(stages.region) or 1.0
     colour_options = {"cmap": "RdBu_r", "vmin": -colour_limit, "vmax": colour_limit}
-    region_image = _draw_pixels(axes[0], factor * stages.region, stages, colour_options)
+    region_image = _draw_pixels(axes[0], unit_factor * stages.region, stages, colour_options)
     # The colour bar is as tall as its image, whatever the height of the axes.
     colour_bar_axes = axes[0].inset_axes((1.02, 0.1, 0.035, 0.8))
-    draw_colour_bar(axes[0], region_image, f"Change ({with_prefix})", show_sign=True, position=colour_bar_axes)
+    draw_colour_bar(axes[0], region_image, f"Change ({prefixed_unit})", show_sign=True, position=colour_bar_axes)
     grey_options = {"cmap": "gray", "vmin": 0, "vmax": 255}
     grey_images = (stages.grey, 255.0 * stages.threshold, 255.0 * stages.opened, stages.grey)
-    for ax, pixels in zip(axes[1:5], grey_images, strict=True):
-        _draw_pixels(ax, np.where(is_inside, pixels, np.nan), stages, grey_options)
+    for ax, grey_pixels in zip(axes[1:5], grey_images, strict=True):
+        _draw_pixels(ax, np.where(is_on_skin, grey_pixels, np.nan), stages, grey_options)
     for contact in stages.contacts:
         closed_contour = np.vstack([contact.contour, contact.contour[:1]])
         axes[4].plot(*closed_contour.T, color="#d1495b", linewidth=1.4)
-    _draw_pixels(axes[5], factor * stages.region, stages, colour_options)
+    _draw_pixels(axes[5], unit_factor * stages.region, stages, colour_options)
     draw_contacts(stages.contacts, ax=axes[5])
-    for ax, title in zip(axes, _TITLES, strict=True):
+    for ax, stage_title in zip(axes, _STAGE_TITLES, strict=True):
         hide_axes(ax, stages.extent, numbered=False)
-        ax.set_title(title, fontsize=10)
+        ax.set_title(stage_title, fontsize=10)
         draw_scale_bar(ax, stages.extent)
     return axes
 
 
-def _draw_pixels(ax: Axes, pixels: np.ndarray, stages: RasterStages, keywords: dict):
-    return ax.imshow(pixels, extent=stages.extent, interpolation="nearest", **keywords)
+def _draw_pixels(ax: Axes, pixels: np.ndarray, stages: RasterStages, image_options: dict):
+    return ax.imshow(pixels, extent=stages.extent, interpolation="nearest", **image_options)
 
 
 def _new_axes() -> np.ndarray:

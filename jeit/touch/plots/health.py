@@ -15,7 +15,7 @@ from jeit.plot.imaging.image import draw_outline, plot_image
 from jeit.touch.health import EventKind, EventStatus, HealthEvent, SkinHealth
 from jeit.touch.health.event import change_size
 
-_HALO = [withStroke(linewidth=4, foreground="white")]
+_WHITE_HALO = [withStroke(linewidth=4, foreground="white")]
 _CUT_COLOUR, _MENDED_COLOUR = SERIES_COLOURS[1], SERIES_COLOURS[2]
 
 
@@ -71,35 +71,45 @@ def plot_health(
             _draw_cut(ax, event)
     failed_electrodes = [event.electrode for event in health.open_events if event.electrode is not None]
     if failed_electrodes:
-        places = np.asarray(electrodes.position)[failed_electrodes, :2]  # pyright: ignore[reportAttributeAccessIssue]
-        ax.plot(*places.T, "x", color=_CUT_COLOUR, markersize=11, markeredgewidth=2.4, zorder=6, path_effects=_HALO)
+        electrode_places = np.asarray(electrodes.position)[failed_electrodes, :2]  # pyright: ignore[reportAttributeAccessIssue]
+        ax.plot(
+            *electrode_places.T,
+            "x",
+            color=_CUT_COLOUR,
+            markersize=11,
+            markeredgewidth=2.4,
+            zorder=6,
+            path_effects=_WHITE_HALO,
+        )
     return ax
 
 
 def _draw_cut(ax: Axes, event: HealthEvent) -> None:
     """Draw the path of a cut, labelled with its length and time; a mended cut is dashed."""
-    is_mended, path = event.status == EventStatus.MENDED, np.asarray(event.path)
-    colour = _MENDED_COLOUR if is_mended else _CUT_COLOUR
-    style = (0, (2.5, 1.5)) if is_mended else "-"
-    ax.plot(*path.T, color=colour, linestyle=style, linewidth=2.4, zorder=5, path_effects=_HALO)
+    is_mended, cut_path = event.status == EventStatus.MENDED, np.asarray(event.path)
+    cut_colour = _MENDED_COLOUR if is_mended else _CUT_COLOUR
+    line_style = (0, (2.5, 1.5)) if is_mended else "-"
+    ax.plot(*cut_path.T, color=cut_colour, linestyle=line_style, linewidth=2.4, zorder=5, path_effects=_WHITE_HALO)
     # The standard deviation of the length is omitted where it rounds to 0 mm.
     deviation_text = f" ± {1e3 * event.deviation:.0f}" if 1e3 * event.deviation >= 0.5 else ""
-    label = f"{'mended' if is_mended else 'cut'}, {1e3 * event.length:.0f}{deviation_text} mm, at {event.time:.4g} s"
+    cut_label = (
+        f"{'mended' if is_mended else 'cut'}, {1e3 * event.length:.0f}{deviation_text} mm, at {event.time:.4g} s"
+    )
     left_limit, right_limit = ax.get_xlim()
-    highest_point = path[path[:, 1].argmax()]
+    highest_point = cut_path[cut_path[:, 1].argmax()]
     # A label near the edge of the skin extends away from the edge.
     relative_x = (highest_point[0] - left_limit) / (right_limit - left_limit)
-    alignment = "left" if relative_x < 0.25 else "right" if relative_x > 0.75 else "center"
+    text_alignment = "left" if relative_x < 0.25 else "right" if relative_x > 0.75 else "center"
     ax.annotate(
-        label,
+        cut_label,
         highest_point,
         (0, 7),
         textcoords="offset points",
-        ha=alignment,
-        color=colour,
+        ha=text_alignment,
+        color=cut_colour,
         fontsize=9,
         zorder=7,
-        path_effects=_HALO,
+        path_effects=_WHITE_HALO,
     )
 
 
@@ -138,19 +148,21 @@ def plot_health_course(
     time_values, frame_values = np.asarray(times, float), np.asarray(frames, float)
     if frame_values.shape != (len(time_values), health.reference.size):
         raise ValueError(f"frames have shape {frame_values.shape}; give ({len(time_values)}, {health.reference.size}).")
-    healthy = health.healthy
-    has_reading = healthy.used & np.isfinite(frame_values)
+    healthy_state = health.healthy
+    has_reading = healthy_state.used & np.isfinite(frame_values)
     scaled_changes = np.where(
-        has_reading, (frame_values - healthy.reference) / np.where(healthy.used, healthy.scale, np.inf), np.nan
+        has_reading,
+        (frame_values - healthy_state.reference) / np.where(healthy_state.used, healthy_state.scale, np.inf),
+        np.nan,
     )
-    relative_sizes = np.where(has_reading.any(axis=1), change_size(scaled_changes) / healthy.limit, np.nan)
+    relative_changes = np.where(has_reading.any(axis=1), change_size(scaled_changes) / healthy_state.limit, np.nan)
     ax = get_or_create_axes(ax, (9.0, 3.2))
-    ax.plot(time_values, relative_sizes, color=DARK_GREY, linewidth=0.8)
+    ax.plot(time_values, relative_changes, color=DARK_GREY, linewidth=0.8)
     ax.axhline(1.0, color=LIGHT_GREY, linewidth=1, linestyle=(0, (4, 3)))
     ax.text(1, 1.0, " limit", color=LIGHT_GREY, fontsize=8, va="center", transform=ax.get_yaxis_transform())
     for event in health.events:
-        colour = SERIES_COLOURS[2] if event.kind == EventKind.REPAIRED else SERIES_COLOURS[1]
-        ax.axvline(event.time, color=colour, linewidth=1.4)
+        event_colour = SERIES_COLOURS[2] if event.kind == EventKind.REPAIRED else SERIES_COLOURS[1]
+        ax.axvline(event.time, color=event_colour, linewidth=1.4)
         if len(health.events) <= _MAX_LABELS:
             electrode_text = "" if event.electrode is None else f" {event.electrode + 1}"
             ax.annotate(
@@ -160,12 +172,12 @@ def plot_health_course(
                 xycoords=("data", "axes fraction"),
                 textcoords="offset points",
                 va="top",
-                color=colour,
+                color=event_colour,
                 fontsize=8,
             )
     ax.set_yscale("symlog", linthresh=1.0)
-    ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    ax.set_ylim(0, max(_MIN_AXIS_LIMIT, 1.6 * float(np.nanmax(relative_sizes, initial=1.0))))
+    ax.yaxis.set_major_formatter(lambda tick_value, _: f"{tick_value:g}")
+    ax.set_ylim(0, max(_MIN_AXIS_LIMIT, 1.6 * float(np.nanmax(relative_changes, initial=1.0))))
     ax.set_ylabel("Change, times the limit", color=DARK_GREY)
     style_graph_axes(ax)
     if title is not None:

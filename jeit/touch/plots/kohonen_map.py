@@ -66,18 +66,18 @@ def plot_map(
     ax = get_or_create_axes(ax)
     extent = extent_of(places[has_place])
     hide_axes(ax, extent, numbered=False)
-    edges = [
-        edge
+    lattice_edges = [
+        lattice_edge
         for line_starts, line_ends in ((places[:-1], places[1:]), (places[:, :-1], places[:, 1:]))
-        for edge in np.stack([line_starts, line_ends], axis=-2).reshape(-1, 2, 2)
-        if np.isfinite(edge).all()
+        for lattice_edge in np.stack([line_starts, line_ends], axis=-2).reshape(-1, 2, 2)
+        if np.isfinite(lattice_edge).all()
     ]
     ax.add_collection(
-        LineCollection(edges, colors=DARK_GREY if values is None else LIGHT_GREY, linewidths=0.5, zorder=1)
+        LineCollection(lattice_edges, colors=DARK_GREY if values is None else LIGHT_GREY, linewidths=0.5, zorder=1)
     )
     if values is not None:
         marker_area = _MARKER_AREA * min(4.0, _REFERENCE_NEURONS / has_place.size)
-        points = ax.scatter(
+        neuron_markers = ax.scatter(
             *places[has_place].T,
             c=np.asarray(values)[has_place],
             s=marker_area,
@@ -85,7 +85,7 @@ def plot_map(
             linewidths=0,
             zorder=2,
         )
-        draw_colour_bar(ax, points, label)
+        draw_colour_bar(ax, neuron_markers, label)
     for touch in touches:
         ax.plot(*touch.place, marker="+", color="#d1495b", markersize=13, markeredgewidth=2.2, zorder=4)
     if on_skin:

@@ -36,19 +36,19 @@ def plot_places(touches: Touches, *, title: str | None = None, ax: Axes | None =
         default_title = "All frames unlike any learnt from" if touches.unlike.all() else "No touch"
         ax.set_title(default_title if title is None else title)
         return ax
-    places = touches.position[touched_frames, :2]
-    std = touches.position_std[touched_frames, :2]  # pyright: ignore[reportOptionalSubscript]
-    extent = extent_of(np.vstack([places - std, places + std]))
+    touched_places = touches.position[touched_frames, :2]
+    place_deviations = touches.position_std[touched_frames, :2]  # pyright: ignore[reportOptionalSubscript]
+    extent = extent_of(np.vstack([touched_places - place_deviations, touched_places + place_deviations]))
     hide_axes(ax, extent, numbered=False)
     drawn_indices = np.linspace(0, len(touched_frames) - 1, min(len(touched_frames), _MAX_ELLIPSES)).astype(int)
-    diameters = 2 * std[drawn_indices]
+    ellipse_diameters = 2 * place_deviations[drawn_indices]
     ax.add_collection(
         EllipseCollection(
-            diameters[:, 0],
-            diameters[:, 1],
+            ellipse_diameters[:, 0],
+            ellipse_diameters[:, 1],
             np.zeros(len(drawn_indices)),
             units="xy",
-            offsets=places[drawn_indices],
+            offsets=touched_places[drawn_indices],
             transOffset=ax.transData,
             facecolors="none",
             edgecolors=SERIES_COLOURS[0],
@@ -56,9 +56,11 @@ def plot_places(touches: Touches, *, title: str | None = None, ax: Axes | None =
             alpha=0.35,
         )
     )
-    points = ax.scatter(*places.T, c=touched_frames, s=12, cmap=SEQUENTIAL_COLOUR_MAP, linewidths=0, zorder=3)
+    place_markers = ax.scatter(
+        *touched_places.T, c=touched_frames, s=12, cmap=SEQUENTIAL_COLOUR_MAP, linewidths=0, zorder=3
+    )
     draw_scale_bar(ax, extent)
-    draw_colour_bar(ax, points, "Frame")
+    draw_colour_bar(ax, place_markers, "Frame")
     ax.set_title(f"{len(touched_frames)} touches, ellipses of one standard deviation" if title is None else title)
     return ax
 
@@ -66,7 +68,7 @@ def plot_places(touches: Touches, *, title: str | None = None, ax: Axes | None =
 def plot_answers(touches: Touches, *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Draw what a learnt skin predicts for consecutive frames: pressed keys, labels, or forces in newtons."""
     ax = get_or_create_axes(ax)
-    frame = np.arange(len(touches))
+    frame_numbers = np.arange(len(touches))
     if touches.touched is not None:
         ax.imshow(
             touches.touched.T, aspect="auto", cmap="Blues", vmin=0, vmax=1.2, interpolation="nearest", origin="lower"
@@ -74,11 +76,11 @@ def plot_answers(touches: Touches, *, title: str | None = None, ax: Axes | None 
         ax.set_yticks(range(touches.touched.shape[1]))
         ax.set_ylabel("Key", color=DARK_GREY)
     elif touches.label is not None:
-        labels = [str(text) for text in np.unique(touches.label) if text]
+        label_names = [str(label_text) for label_text in np.unique(touches.label) if label_text]
         has_label = touches.label != ""
-        label_indices = np.searchsorted(labels, touches.label[has_label])
+        label_indices = np.searchsorted(label_names, touches.label[has_label])
         ax.plot(
-            frame[has_label],
+            frame_numbers[has_label],
             label_indices,
             linestyle="none",
             marker="o",
@@ -86,13 +88,13 @@ def plot_answers(touches: Touches, *, title: str | None = None, ax: Axes | None 
             color=SERIES_COLOURS[0],
             markeredgewidth=0,
         )
-        ax.set_yticks(range(len(labels)), labels)
+        ax.set_yticks(range(len(label_names)), label_names)
     elif touches.force is not None and touches.force_std is not None:
         lower_limits, upper_limits = touches.force - touches.force_std, touches.force + touches.force_std
-        ax.fill_between(frame, lower_limits, upper_limits, color=SERIES_COLOURS[0], alpha=0.2, linewidth=0)
-        ax.plot(frame, touches.force, color=SERIES_COLOURS[0], linewidth=1.2)
+        ax.fill_between(frame_numbers, lower_limits, upper_limits, color=SERIES_COLOURS[0], alpha=0.2, linewidth=0)
+        ax.plot(frame_numbers, touches.force, color=SERIES_COLOURS[0], linewidth=1.2)
         ax.set_ylabel("Force (N)", color=DARK_GREY)
-    for unlike_frame in frame[touches.unlike]:
+    for unlike_frame in frame_numbers[touches.unlike]:
         ax.axvline(unlike_frame, color=SERIES_COLOURS[1], linewidth=0.6, alpha=0.5, zorder=0)
     ax.set_xlabel("Frame", color=DARK_GREY)
     num_unlike_touches = int(touches.unlike.sum())
@@ -163,12 +165,20 @@ def plot_losses(courses: Mapping[str, TrainingResult], *, title: str | None = No
     """
     check_kind("courses", courses, Mapping, "trainings by name, such as learnt.courses")
     ax = get_or_create_axes(ax)
-    for (name, result), colour in zip(courses.items(), SERIES_COLOURS * len(courses), strict=False):
-        check_kind(f"courses[{name!r}]", result, TrainingResult, "a TrainingResult, as of fit")
-        course = result.course
-        relative_losses = np.array(course.validation) / course.validation[0]
-        ax.plot(course.steps, relative_losses, color=colour, linewidth=1.6, label=name)
-        ax.plot(course.steps[course.best], relative_losses[course.best], marker="o", color=colour, markersize=5)
+    for (training_name, training_result), line_colour in zip(
+        courses.items(), SERIES_COLOURS * len(courses), strict=False
+    ):
+        check_kind(f"courses[{training_name!r}]", training_result, TrainingResult, "a TrainingResult, as of fit")
+        training_course = training_result.course
+        relative_losses = np.array(training_course.validation) / training_course.validation[0]
+        ax.plot(training_course.steps, relative_losses, color=line_colour, linewidth=1.6, label=training_name)
+        ax.plot(
+            training_course.steps[training_course.best],
+            relative_losses[training_course.best],
+            marker="o",
+            color=line_colour,
+            markersize=5,
+        )
     ax.set_xlabel("Batches", color=DARK_GREY)
     ax.set_ylabel("Loss of touches held out, of that at first", color=DARK_GREY)
     style_graph_axes(ax)
@@ -189,7 +199,7 @@ def plot_place_errors(place: Standing, *, title: str | None = None, ax: Axes | N
     hide_axes(ax, extent, numbered=False)
     colour_limit = float(np.quantile(errors_mm, 0.98)) or 1.0
     sort_order = np.argsort(errors_mm)
-    points = ax.scatter(
+    place_markers = ax.scatter(
         *place.right[sort_order, :2].T,
         c=errors_mm[sort_order],
         s=22,
@@ -199,7 +209,7 @@ def plot_place_errors(place: Standing, *, title: str | None = None, ax: Axes | N
         linewidths=0,
     )
     draw_scale_bar(ax, extent)
-    draw_colour_bar(ax, points, "Error of presses held out (mm)")
+    draw_colour_bar(ax, place_markers, "Error of presses held out (mm)")
     ax.set_title(
         f"Places: {errors_mm.mean():.3g} mm on average, median {np.median(errors_mm):.3g} mm"
         if title is None
@@ -212,8 +222,8 @@ def plot_force_errors(force: Standing, *, title: str | None = None, ax: Axes | N
     """Draw the forces that a learnt skin estimates for held-out presses against the true forces, in newtons."""
     ax = get_or_create_axes(ax)
     true_forces, estimated_forces = force.right[:, 0], force.held_out[:, 0]
-    limits = [min(true_forces.min(), estimated_forces.min()), max(true_forces.max(), estimated_forces.max())]
-    ax.plot(limits, limits, color=LIGHT_GREY, linewidth=1, zorder=1)
+    force_limits = [min(true_forces.min(), estimated_forces.min()), max(true_forces.max(), estimated_forces.max())]
+    ax.plot(force_limits, force_limits, color=LIGHT_GREY, linewidth=1, zorder=1)
     ax.plot(
         true_forces,
         estimated_forces,
@@ -250,28 +260,39 @@ def plot_confusion(label: Standing, *, title: str | None = None, ax: Axes | None
     ```
     """
     ax = get_or_create_axes(ax)
-    labels = np.unique(label.right)
-    counts = np.array(
+    label_names = np.unique(label.right)
+    press_counts = np.array(
         [
-            [np.sum((label.right == true_label) & (label.held_out == predicted_label)) for predicted_label in labels]
-            for true_label in labels
+            [
+                np.sum((label.right == true_label) & (label.held_out == predicted_label))
+                for predicted_label in label_names
+            ]
+            for true_label in label_names
         ]
     )
-    percentages = 100 * counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+    percentages = 100 * press_counts / np.maximum(press_counts.sum(axis=1, keepdims=True), 1)
     matrix_image = ax.imshow(percentages, cmap="Blues", vmin=0, vmax=100)
     draw_colour_bar(ax, matrix_image, "Share of the kind (%)")
-    if len(labels) <= _MAX_TICK_LABELS:
-        rotation = 90 if max(len(text) for text in labels) > 3 else 0
-        ax.set_xticks(range(len(labels)), labels, rotation=rotation)
-        ax.set_yticks(range(len(labels)), labels)
-    if len(labels) <= 10:
-        for row, column in np.argwhere(percentages >= 0.5):
-            colour = "white" if percentages[row, column] > 50 else DARK_GREY
-            ax.text(column, row, f"{percentages[row, column]:.0f}", ha="center", va="center", color=colour, fontsize=8)
+    if len(label_names) <= _MAX_TICK_LABELS:
+        label_rotation = 90 if max(len(label_name) for label_name in label_names) > 3 else 0
+        ax.set_xticks(range(len(label_names)), label_names, rotation=label_rotation)
+        ax.set_yticks(range(len(label_names)), label_names)
+    if len(label_names) <= 10:
+        for true_index, predicted_index in np.argwhere(percentages >= 0.5):
+            text_colour = "white" if percentages[true_index, predicted_index] > 50 else DARK_GREY
+            ax.text(
+                predicted_index,
+                true_index,
+                f"{percentages[true_index, predicted_index]:.0f}",
+                ha="center",
+                va="center",
+                color=text_colour,
+                fontsize=8,
+            )
     ax.set_xlabel("Predicted label", color=DARK_GREY)
     ax.set_ylabel("True label", color=DARK_GREY)
-    percentage = 100 * np.mean(label.right == label.held_out)
-    ax.set_title(f"Labels: {percentage:.1f} % right of presses held out" if title is None else title)
+    percentage_right = 100 * np.mean(label.right == label.held_out)
+    ax.set_title(f"Labels: {percentage_right:.1f} % right of presses held out" if title is None else title)
     return ax
 
 
@@ -284,8 +305,8 @@ def plot_key_errors(keys: Standing, *, title: str | None = None, ax: Axes | None
     ax.set_xlabel("Key", color=DARK_GREY)
     ax.set_ylabel("Classified wrongly (%)", color=DARK_GREY)
     ax.set_ylim(0, max(1.0, 1.1 * error_rates.max()))
-    pattern_share = 100 * np.mean((keys.held_out == keys.right).all(axis=1))
-    default_title = f"Keys: {100 - error_rates.mean():.1f} % right, whole patterns {pattern_share:.1f} %"
+    percentage_of_patterns = 100 * np.mean((keys.held_out == keys.right).all(axis=1))
+    default_title = f"Keys: {100 - error_rates.mean():.1f} % right, whole patterns {percentage_of_patterns:.1f} %"
     ax.set_title(default_title if title is None else title)
     style_graph_axes(ax)
     return ax
@@ -294,12 +315,15 @@ def plot_key_errors(keys: Standing, *, title: str | None = None, ax: Axes | None
 def plot_tried(label: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Draw the accuracy, in per cent, of each tried classifier on held-out presses, the best at the top."""
     ax = get_or_create_axes(ax)
-    names, percentages = [name for name, _ in label.tried], [100 * (1 - error) for _, error in label.tried]
-    colours = [SERIES_COLOURS[0] if name == label.method else "#c9d3de" for name in names]
-    ax.barh(range(len(names)), percentages, color=colours, height=0.7)
-    for row, value in enumerate(percentages):
-        ax.text(value, row, f" {value:.0f}", va="center", color=DARK_GREY, fontsize=8)
-    ax.set_yticks(range(len(names)), names, fontsize=8)
+    method_names, percentages = (
+        [method_name for method_name, _ in label.tried],
+        [100 * (1 - error_rate) for _, error_rate in label.tried],
+    )
+    bar_colours = [SERIES_COLOURS[0] if method_name == label.method else "#c9d3de" for method_name in method_names]
+    ax.barh(range(len(method_names)), percentages, color=bar_colours, height=0.7)
+    for method_index, percentage in enumerate(percentages):
+        ax.text(percentage, method_index, f" {percentage:.0f}", va="center", color=DARK_GREY, fontsize=8)
+    ax.set_yticks(range(len(method_names)), method_names, fontsize=8)
     ax.invert_yaxis()
     ax.set_xlim(0, 105)
     ax.set_xlabel("Right of what was held out (%)", color=DARK_GREY)

@@ -23,11 +23,11 @@ from jeit.touch.listening.feature_images import WINDOW_INTERVAL
 # Minimum gap between frames at which a curve is interrupted, as a multiple of the median interval.
 _MIN_GAP_RATIO = 10.0
 # Maximum number of points of a curve.
-_MAX_POINTS = 3000
+_MAX_CURVE_POINTS = 3000
 # Minimum length of a touch's bar, as a share of the whole time.
 _MIN_BAR_SHARE = 0.003
 # Maximum number of touches with numbers.
-_MAX_NUMBERED = 60
+_MAX_NUMBERED_TOUCHES = 60
 _UNKNOWN_TOUCH_COLOUR = "#b9bdc4"
 
 
@@ -45,18 +45,22 @@ def plot_changes(
     `seconds` (F,): times of the frames; `peaks` (F,): maximum change in each frame, in `unit`; `level`: the level, in
     `unit`. Refused frames, which are NaN, leave gaps. Raises `ValueError` if `seconds` and `peaks` differ in shape.
     """
-    times, values = np.asarray(seconds, float), np.asarray(peaks, float)
-    if times.shape != values.shape or times.ndim != 1:
+    frame_times, peak_changes = np.asarray(seconds, float), np.asarray(peaks, float)
+    if frame_times.shape != peak_changes.shape or frame_times.ndim != 1:
         raise ValueError(
-            f"peaks have shape {values.shape} and seconds {times.shape}; give one of each for every frame."
+            f"peaks have shape {peak_changes.shape} and seconds {frame_times.shape}; give one of each for every frame."
         )
     ax = get_or_create_axes(ax, (9.0, 2.6))
-    factor, prefixed_unit = choose_si_prefix(float(np.nanmax(values, initial=level)), unit)
-    ax.plot(*_reduce_points(*_interrupt_at_gaps(times, factor * values)), color=DARK_GREY, linewidth=0.8)
-    ax.axhline(factor * level, color=LIGHT_GREY, linewidth=1, linestyle=(0, (4, 3)))
-    ax.text(1, factor * level, " level", color=LIGHT_GREY, fontsize=8, va="center", transform=ax.get_yaxis_transform())
+    unit_factor, prefixed_unit = choose_si_prefix(float(np.nanmax(peak_changes, initial=level)), unit)
+    ax.plot(
+        *_reduce_points(*_interrupt_at_gaps(frame_times, unit_factor * peak_changes)), color=DARK_GREY, linewidth=0.8
+    )
+    ax.axhline(unit_factor * level, color=LIGHT_GREY, linewidth=1, linestyle=(0, (4, 3)))
+    ax.text(
+        1, unit_factor * level, " level", color=LIGHT_GREY, fontsize=8, va="center", transform=ax.get_yaxis_transform()
+    )
     ax.set_ylabel(f"Greatest change ({prefixed_unit})", color=DARK_GREY)
-    ax.set_ylim(bottom=min(0.0, factor * float(np.nanmin(values, initial=0.0))))
+    ax.set_ylim(bottom=min(0.0, unit_factor * float(np.nanmin(peak_changes, initial=0.0))))
     style_graph_axes(ax)
     if title is not None:
         ax.set_title(title)
@@ -89,20 +93,20 @@ def plot_timeline(
     check_named_touches(touches)
     ax = get_or_create_axes(ax, (9.0, 2.6))
     row_names = [*names, *(["unlike any"] if any(touch.unlike for touch in touches) else [])]
-    offsets = [touch.touch.offset for touch in touches]
-    duration = max(offsets, default=1.0) - min((touch.touch.onset for touch in touches), default=0.0)
+    touch_end_times = [touch.touch.offset for touch in touches]
+    timeline_duration = max(touch_end_times, default=1.0) - min((touch.touch.onset for touch in touches), default=0.0)
     for touch in touches:
         row_index = len(names) if touch.unlike else row_names.index(touch.gesture)
-        length = max(touch.touch.offset - touch.touch.onset, _MIN_BAR_SHARE * duration)
-        bar = Rectangle(
+        bar_length = max(touch.touch.offset - touch.touch.onset, _MIN_BAR_SHARE * timeline_duration)
+        touch_bar = Rectangle(
             (touch.touch.onset, row_index - 0.36),
-            length,
+            bar_length,
             0.72,
             color=gesture_colour(touch, names),
-            alpha=_opacity(touch),
+            alpha=_touch_opacity(touch),
             linewidth=0,
         )
-        ax.add_patch(bar)
+        ax.add_patch(touch_bar)
         if not touch.touch.whole:
             ax.plot(
                 touch.touch.offset if touch.touch.cut_off else touch.touch.onset,
@@ -111,8 +115,8 @@ def plot_timeline(
                 color=DARK_GREY,
                 markersize=14,
             )
-        if len(touches) <= _MAX_NUMBERED:
-            label_position = (touch.touch.onset + length / 2, row_index - 0.42)
+        if len(touches) <= _MAX_NUMBERED_TOUCHES:
+            label_position = (touch.touch.onset + bar_length / 2, row_index - 0.42)
             ax.annotate(
                 f"{touch.number}",
                 label_position,
@@ -170,24 +174,24 @@ def plot_touch_paths(
     if electrodes is not None:
         draw_electrodes(mesh, electrodes, numbers=False, ax=ax)
     for touch in touches:
-        centroids = touch.touch.course.centroid
-        centroids = centroids[np.isfinite(centroids).all(axis=1)]
-        if len(centroids):
-            colour = gesture_colour(touch, names)
-            ax.plot(*centroids.T, color=colour, linewidth=1.4, alpha=_opacity(touch), zorder=3)
+        touch_centroids = touch.touch.course.centroid
+        touch_centroids = touch_centroids[np.isfinite(touch_centroids).all(axis=1)]
+        if len(touch_centroids):
+            path_colour = gesture_colour(touch, names)
+            ax.plot(*touch_centroids.T, color=path_colour, linewidth=1.4, alpha=_touch_opacity(touch), zorder=3)
             ax.plot(
-                *centroids[0],
+                *touch_centroids[0],
                 marker="o",
                 markersize=4.5,
-                color=colour,
-                alpha=_opacity(touch),
+                color=path_colour,
+                alpha=_touch_opacity(touch),
                 markeredgewidth=0,
                 zorder=4,
             )
-            if len(touches) <= _MAX_NUMBERED:
+            if len(touches) <= _MAX_NUMBERED_TOUCHES:
                 ax.annotate(
                     f"{touch.number}",
-                    centroids[0],
+                    touch_centroids[0],
                     (4, 2),
                     textcoords="offset points",
                     color=DARK_GREY,
@@ -217,31 +221,35 @@ def check_named_touches(touches) -> None:
         check_kind(f"touches[{touch_index}]", touch, NamedTouch, "a NamedTouch")
 
 
-def _opacity(touch: NamedTouch) -> float:
+def _touch_opacity(touch: NamedTouch) -> float:
     return 1.0 if touch.unlike else 0.35 + 0.65 * touch.probability
 
 
-def _interrupt_at_gaps(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _interrupt_at_gaps(times: np.ndarray, curve_values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Insert NaN into a curve of values over times at long gaps between frames, so that the curve is interrupted."""
-    intervals = np.diff(times)
-    gaps = 1 + np.flatnonzero(intervals > _MIN_GAP_RATIO * np.median(intervals)) if intervals.size else np.zeros(0, int)
-    return np.insert(times, gaps, times[gaps]), np.insert(values, gaps, np.nan)
+    time_intervals = np.diff(times)
+    gap_indices = (
+        1 + np.flatnonzero(time_intervals > _MIN_GAP_RATIO * np.median(time_intervals))
+        if time_intervals.size
+        else np.zeros(0, int)
+    )
+    return np.insert(times, gap_indices, times[gap_indices]), np.insert(curve_values, gap_indices, np.nan)
 
 
-def _reduce_points(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Reduce a curve of values over times to about `_MAX_POINTS` points, keeping its extremes."""
-    if len(times) <= _MAX_POINTS:
-        return times, values
-    segments = np.array_split(np.arange(len(times)), _MAX_POINTS // 2)
-    filled_values = np.where(np.isfinite(values), values, 0.0)
-    rows = np.unique(
+def _reduce_points(times: np.ndarray, curve_values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Reduce a curve of values over times to about `_MAX_CURVE_POINTS` points, keeping its extremes."""
+    if len(times) <= _MAX_CURVE_POINTS:
+        return times, curve_values
+    index_segments = np.array_split(np.arange(len(times)), _MAX_CURVE_POINTS // 2)
+    filled_values = np.where(np.isfinite(curve_values), curve_values, 0.0)
+    kept_indices = np.unique(
         [
-            segment[extreme_index]
-            for segment in segments
-            for extreme_index in (filled_values[segment].argmin(), filled_values[segment].argmax())
+            index_segment[extreme_index]
+            for index_segment in index_segments
+            for extreme_index in (filled_values[index_segment].argmin(), filled_values[index_segment].argmax())
         ]
     )
-    return times[rows], values[rows]
+    return times[kept_indices], curve_values[kept_indices]
 
 
 def plot_sound_labels(labels: SoundLabels, *, title: str | None = None, ax: Axes | None = None) -> Axes:
@@ -263,9 +271,14 @@ def plot_sound_labels(labels: SoundLabels, *, title: str | None = None, ax: Axes
     ```
     """
     ax = get_or_create_axes(ax, (8.0, 3.2))
-    names, times = labels.names, labels.times
+    class_names, window_times = labels.names, labels.times
     shown_probabilities = np.where((labels.named != "")[:, None], labels.probabilities, np.nan).T
-    extent = (float(times[0]) - WINDOW_INTERVAL / 2, float(times[-1]) + WINDOW_INTERVAL / 2, -0.5, len(names) - 0.5)
+    extent = (
+        float(window_times[0]) - WINDOW_INTERVAL / 2,
+        float(window_times[-1]) + WINDOW_INTERVAL / 2,
+        -0.5,
+        len(class_names) - 0.5,
+    )
     probability_image = ax.imshow(
         100 * shown_probabilities,
         aspect="auto",
@@ -279,9 +292,9 @@ def plot_sound_labels(labels: SoundLabels, *, title: str | None = None, ax: Axes
     draw_colour_bar(ax, probability_image, "Probability (%)")
     for event in labels.events:
         if event.name:
-            bar_height, bar_limits = names.index(event.name) - 0.42, [event.start, event.end]
+            bar_height, bar_limits = class_names.index(event.name) - 0.42, [event.start, event.end]
             ax.plot(bar_limits, [bar_height, bar_height], color=SERIES_COLOURS[1], linewidth=2.5, solid_capstyle="butt")
-    ax.set_yticks(range(len(names)), names)
+    ax.set_yticks(range(len(class_names)), class_names)
     ax.set_xlim(0, extent[1])
     ax.set_xlabel("Time (s)", color=DARK_GREY)
     num_quiet = int((labels.named == "").sum())

@@ -21,7 +21,7 @@ from jeit.touch.simulate.contact.indent_sets import pixel_places
 
 LEARNT_FILES = ("network.jeit", "report.json", "learning.png")
 DEPTH_FILES = ("frames.csv", "depth.npz", "depth.png", "report.json")
-_PACKAGES = ("jeit", "jax", "equinox", "optax", "numpy")
+_REPORTED_PACKAGES = ("jeit", "jax", "equinox", "optax", "numpy")
 # Maximum number of depth maps that are drawn.
 _MAX_DRAWN_MAPS = 6
 # Maximum number of refused frames that a report lists.
@@ -43,15 +43,15 @@ def report_learnt_images(learnt: LearntImages) -> dict[str, Any]:
     """Report the accuracy and the trainings of an image network as plain numbers, strings, lists and dictionaries."""
     network = learnt.network
     training_reports = {
-        name: {
-            "ended": training.reason,
-            "batches": training.course.steps[-1],
-            "best_batches": training.course.steps[training.course.best],
-            "best_loss_held_out": training.course.validation[training.course.best],
-            "loss_held_out": training.course.validation,
-            "loss": training.course.training,
+        training_name: {
+            "ended": training_result.reason,
+            "batches": training_result.course.steps[-1],
+            "best_batches": training_result.course.steps[training_result.course.best],
+            "best_loss_held_out": training_result.course.validation[training_result.course.best],
+            "loss_held_out": training_result.course.validation,
+            "loss": training_result.course.training,
         }
-        for name, training in learnt.courses.items()
+        for training_name, training_result in learnt.courses.items()
     }
     return to_plain_values(
         {
@@ -64,7 +64,7 @@ def report_learnt_images(learnt: LearntImages) -> dict[str, Any]:
             "estimated_depth_of_a_ball": learnt.standing.deepest,
             "trainings": training_reports,
             "seconds": learnt.seconds,
-            "versions": {package: package_version(package) for package in _PACKAGES},
+            "versions": {package_name: package_version(package_name) for package_name in _REPORTED_PACKAGES},
         }
     )
 
@@ -83,15 +83,17 @@ def draw_learnt_images(learnt: LearntImages):
     subfigures = figure.subfigures(1, 2, width_ratios=(4.4, 2.6 * max(len(true_maps), 1)), squeeze=False)
     loss_figure, map_figure = subfigures[0]
     plot_losses(learnt.courses, ax=loss_figure.subplots())
-    axes = map_figure.subplots(2, len(true_maps), squeeze=False)
+    map_axes = map_figure.subplots(2, len(true_maps), squeeze=False)
     thickness = learnt.network.thickness
     max_depth = thickness * float(true_maps.max())
-    for row_axes, (name, maps_of_kind) in zip(axes, (("right", true_maps), ("estimated", estimated_maps)), strict=True):
+    for row_axes, (row_title, maps_of_kind) in zip(
+        map_axes, (("right", true_maps), ("estimated", estimated_maps)), strict=True
+    ):
         for ax, depth_map in zip(row_axes, maps_of_kind, strict=True):
             plot_depth_map(
                 thickness * depth_map, learnt.network.extent, most=max_depth, colour_bar=ax is row_axes[-1], ax=ax
             )
-        row_axes[0].set_title(name)
+        row_axes[0].set_title(row_title)
     return figure
 
 
@@ -147,45 +149,50 @@ def write_depths(
     for file_name in DEPTH_FILES[1:]:
         (result_folder / file_name).unlink(missing_ok=True)  # files of earlier frames
     remove_unfinished_files(result_folder)
-    report = drawing or (lambda message: None)
-    with GrowingRows(result_folder, network.shape) as rows:
-        statistics = _FrameStatistics(network)
-        with GrowingTable(result_folder / "frames.csv", ("frame", "x_m", "y_m", "depth_m")) as table:
+    report_message = drawing or (lambda message: None)
+    with GrowingRows(result_folder, network.shape) as map_rows:
+        frame_statistics = _FrameStatistics(network)
+        with GrowingTable(result_folder / "frames.csv", ("frame", "x_m", "y_m", "depth_m")) as frame_table:
             for frame in frame_depths:
-                table_row, depth = statistics.add_frame(frame)
-                with reporting_partial_results(rows):
-                    table.write(table_row)
-                    rows.append(depth)
+                table_row, depth_map = frame_statistics.add_frame(frame)
+                with reporting_partial_results(map_rows):
+                    frame_table.write(table_row)
+                    map_rows.append(depth_map)
                 if progress is not None:
                     progress(frame)
-        if not statistics.imaged:
+        if not frame_statistics.imaged:
             (result_folder / "frames.csv").unlink()
-            reason = statistics.first_reason or "there is none"
+            first_reason = frame_statistics.first_reason or "there is none"
             raise ValueError(
-                f"'{name}': {counted(rows.number, 'frame')}, and none could be imaged; the first: {reason}"
+                f"'{name}': {counted(map_rows.number, 'frame')}, and none could be imaged; the first: {first_reason}"
             )
-        report("images")
-        with reporting_partial_results(rows):
+        report_message("images")
+        with reporting_partial_results(map_rows):
             extent = np.array(network.extent)
-            rows.write_npz(
+            map_rows.write_npz(
                 result_folder / "depth.npz",
                 "depth",
                 {"extent": extent},
-                lambda progress_text: report(f"images: {progress_text}"),
+                lambda progress_text: report_message(f"images: {progress_text}"),
             )
         with results(result_folder, ("report.json",)) as report_folder:
-            write_json(statistics.report(name, rows.number), report_folder / "report.json")
-        report(PICTURES[0])
-        row_indices, frame_numbers = statistics.row.values().astype(int), statistics.number.values().astype(int)
+            write_json(frame_statistics.report(name, map_rows.number), report_folder / "report.json")
+        report_message(PICTURES[0])
+        row_indices, frame_numbers = (
+            frame_statistics.row.values().astype(int),
+            frame_statistics.number.values().astype(int),
+        )
         drawn_indices = np.unique(np.linspace(0, len(row_indices) - 1, _MAX_DRAWN_MAPS).round().astype(int))
         with atomically_written_file(result_folder / "depth.png") as file:
             _draw_depths(
-                rows.read(row_indices[drawn_indices]),
+                map_rows.read(row_indices[drawn_indices]),
                 frame_numbers[drawn_indices],
-                statistics.deepest_frame.depth,
+                frame_statistics.deepest_frame.depth,
                 network,
             ).savefig(file, dpi=130)
-        return WrittenDepths(rows.number, statistics.imaged, statistics.deepest_frame, statistics.latency.values())
+        return WrittenDepths(
+            map_rows.number, frame_statistics.imaged, frame_statistics.deepest_frame, frame_statistics.latency.values()
+        )
 
 
 class _FrameStatistics:
@@ -206,25 +213,31 @@ class _FrameStatistics:
             self.first_reason = self.first_reason or frame.reason
             self.refused_frames += [frame.number] if len(self.refused_frames) < _MAX_LISTED_FRAMES else []
             return [frame.number, "", "", ""], self._empty_map
-        for sample, value in ((self.row, self.imaged + self.number_refused), (self.number, frame.number)):
-            sample.append(value)
+        for series_sample, sampled_value in (
+            (self.row, self.imaged + self.number_refused),
+            (self.number, frame.number),
+        ):
+            series_sample.append(sampled_value)
         self.latency.append(frame.latency)
         self.imaged += 1
-        depth = float(frame.depth.max())
-        centroid = depth_centroids(frame.depth[None], self._places)[0]
-        if not depth > self.network.floor:
-            centroid = np.full(2, np.nan)
-        if depth > self.deepest_frame.depth:
-            self.deepest_frame = DeepestFrame(frame.number, depth, centroid)
-        texts = [f"{value:.6g}" if np.isfinite(value) else "" for value in (*centroid, depth)]
-        return [frame.number, *texts], frame.depth
+        max_depth = float(frame.depth.max())
+        depth_centroid = depth_centroids(frame.depth[None], self._places)[0]
+        if not max_depth > self.network.floor:
+            depth_centroid = np.full(2, np.nan)
+        if max_depth > self.deepest_frame.depth:
+            self.deepest_frame = DeepestFrame(frame.number, max_depth, depth_centroid)
+        number_texts = [
+            f"{sampled_value:.6g}" if np.isfinite(sampled_value) else ""
+            for sampled_value in (*depth_centroid, max_depth)
+        ]
+        return [frame.number, *number_texts], frame.depth
 
-    def report(self, name: str, num_frames: int) -> dict[str, Any]:
+    def report(self, recording_name: str, num_frames: int) -> dict[str, Any]:
         """Report the statistics of the imaged frames as plain numbers, strings, lists and dictionaries."""
         network = self.network
         return to_plain_values(
             {
-                "frames": name,
+                "frames": recording_name,
                 "number": num_frames,
                 "refused": self.refused_frames,
                 "number_refused": self.number_refused,
@@ -233,23 +246,30 @@ class _FrameStatistics:
                 "deepest_m": self.deepest_frame.depth,
                 "depth_by_noise_alone_m": network.floor,
                 "units": {"length": "m"},
-                "versions": {package: package_version(package) for package in _PACKAGES},
+                "versions": {package_name: package_version(package_name) for package_name in _REPORTED_PACKAGES},
             }
         )
 
 
 def _draw_depths(
-    maps: Float[np.ndarray, "k rows columns"], numbers: Int[np.ndarray, " k"], depth_limit: float, network: ImageNetwork
+    depth_maps: Float[np.ndarray, "k rows columns"],
+    frame_numbers: Int[np.ndarray, " k"],
+    depth_limit: float,
+    network: ImageNetwork,
 ):
-    """Draw the depth maps of k frames with the given `numbers`; `depth_limit`: maximum depth of all frames, metres."""
+    """Draw depth maps of k frames with these `frame_numbers`; `depth_limit`: maximum depth of all frames, metres."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_depth_map
 
-    figure = Figure(figsize=(4.2 * len(maps), 4.2), layout="constrained")
+    figure = Figure(figsize=(4.2 * len(depth_maps), 4.2), layout="constrained")
     # The colour scale reaches at least 4 times the noise floor, so that noise on an untouched skin does not fill it.
     max_depth = max(depth_limit, 4 * network.floor)
-    for ax, depth_map, number in zip(figure.subplots(1, len(maps), squeeze=False)[0], maps, numbers, strict=True):
-        is_last = number == numbers[-1]
-        plot_depth_map(depth_map, network.extent, most=max_depth, colour_bar=is_last, title=f"frame {number}", ax=ax)
+    for ax, depth_map, frame_number in zip(
+        figure.subplots(1, len(depth_maps), squeeze=False)[0], depth_maps, frame_numbers, strict=True
+    ):
+        is_last = frame_number == frame_numbers[-1]
+        plot_depth_map(
+            depth_map, network.extent, most=max_depth, colour_bar=is_last, title=f"frame {frame_number}", ax=ax
+        )
     return figure

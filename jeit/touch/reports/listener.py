@@ -13,7 +13,7 @@ from jeit.touch.listening.feature_images import WINDOW_DURATION, WINDOW_INTERVAL
 
 LISTENER_FILES = ("listener.jeit", "report.json", "learning.png")
 SOUND_LABEL_FILES = ("events.csv", "report.json", "timeline.png")
-_PACKAGES = ("jeit", "jax", "numpy", "scipy", "scikit-learn")
+_REPORTED_PACKAGES = ("jeit", "jax", "numpy", "scipy", "scikit-learn")
 
 
 def write_listener(listener: Listener, folder: str | Path) -> None:
@@ -64,9 +64,9 @@ def write_sound_labels(labels: SoundLabels, folder: str | Path, *, model: str) -
     write_sound_labels(sounds, "out", model="listener")
     ```
     """
-    columns = _table_columns(labels)
+    table_columns = _table_columns(labels)
     with results(folder, SOUND_LABEL_FILES) as result_folder:
-        write_rows(result_folder / "events.csv", list(columns), zip(*columns.values(), strict=True))
+        write_rows(result_folder / "events.csv", list(table_columns), zip(*table_columns.values(), strict=True))
         write_json(report_sound_labels(labels, model=model), result_folder / "report.json")
         draw_sound_labels(labels).savefig(result_folder / "timeline.png", dpi=150)
 
@@ -81,7 +81,7 @@ def report_listener(listener: Listener) -> dict[str, Any]:
             "right": is_right.mean(),
             "right_by_chance": 1 / len(listener.names),
             "right_of_each": {name: is_right[standing.right == name].mean() for name in np.unique(standing.right)},
-            "tried": [{"method": name, "right": 1 - error} for name, error in standing.tried],
+            "tried": [{"method": name, "right": 1 - error_rate} for name, error_rate in standing.tried],
         }
     return to_plain_values(
         {
@@ -93,16 +93,16 @@ def report_listener(listener: Listener) -> dict[str, Any]:
             "loudness_counts": listener.loudness,
             "held_out": held_out,
             "notes": list(listener.notes),
-            "versions": {package: package_version(package) for package in _PACKAGES},
+            "versions": {package_name: package_version(package_name) for package_name in _REPORTED_PACKAGES},
         }
     )
 
 
 def report_sound_labels(labels: SoundLabels, *, model: str) -> dict[str, Any]:
     """Report the classified sounds as plain numbers, strings, lists and dictionaries; unknown values are None."""
-    recording_class, probability = labels.whole
-    names, counts = np.unique(labels.named, return_counts=True)
-    events = [
+    recording_class, class_probability = labels.whole
+    class_names, window_counts = np.unique(labels.named, return_counts=True)
+    event_reports = [
         {
             "sound": event.name or None,
             "from_s": event.start,
@@ -119,12 +119,15 @@ def report_sound_labels(labels: SoundLabels, *, model: str) -> dict[str, Any]:
             "windows": len(labels),
             "window_s": WINDOW_DURATION,
             "every_s": WINDOW_INTERVAL,
-            "whole": {"sound": recording_class or None, "probability": probability if recording_class else None},
-            "windows_of_each": {name or "quiet": count for name, count in zip(names, counts, strict=True)},
-            "events": events,
+            "whole": {"sound": recording_class or None, "probability": class_probability if recording_class else None},
+            "windows_of_each": {
+                class_name or "quiet": window_count
+                for class_name, window_count in zip(class_names, window_counts, strict=True)
+            },
+            "events": event_reports,
             "notes": list(labels.notes),
             "units": {"length": "m", "time": "s"},
-            "versions": {package: package_version(package) for package in _PACKAGES},
+            "versions": {package_name: package_version(package_name) for package_name in _REPORTED_PACKAGES},
         }
     )
 
@@ -134,9 +137,11 @@ def summary(listener: Listener) -> str:
     standing = listener.standing
     if standing is None:
         return "not known: nothing could be held out"
-    percentage = 100 * np.mean(standing.held_out == standing.right)
-    method_texts = ", ".join(f"{name} {100 * (1 - error):.1f} %" for name, error in standing.tried)
-    return f"{percentage:.1f} % of {len(standing.right)} clips right; tried: {method_texts}"
+    percentage_right = 100 * np.mean(standing.held_out == standing.right)
+    method_texts = ", ".join(
+        f"{method_name} {100 * (1 - error_rate):.1f} %" for method_name, error_rate in standing.tried
+    )
+    return f"{percentage_right:.1f} % of {len(standing.right)} clips right; tried: {method_texts}"
 
 
 def draw_listener(listener: Listener):
@@ -151,11 +156,11 @@ def draw_listener(listener: Listener):
         ax.set_axis_off()
         ax.set_title("No clips could be held out")
         return figure
-    percentage = 100 * np.mean(listener.standing.held_out == listener.standing.right)
+    percentage_right = 100 * np.mean(listener.standing.held_out == listener.standing.right)
     num_clips = len(listener.standing.right)
     plot_confusion(
         listener.standing,
-        title=f"{listener.method}: {percentage:.1f} % of {num_clips} clips held out classified correctly",
+        title=f"{listener.method}: {percentage_right:.1f} % of {num_clips} clips held out classified correctly",
         ax=ax,
     )
     return figure
@@ -174,23 +179,27 @@ def draw_sound_labels(labels: SoundLabels):
 
 def _table_columns(labels: SoundLabels) -> dict[str, list]:
     """Return the columns of the table `events.csv`, by name."""
-    columns: dict[str, list] = {
-        "time_s": [f"{time:.4f}" for time in labels.times],
+    table_columns: dict[str, list] = {
+        "time_s": [f"{window_time:.4f}" for window_time in labels.times],
         "sound": labels.named.tolist(),
         "probability": _format_numbers(labels.probability),
         **{
-            f"p_{name}": _format_numbers(values)
-            for name, values in zip(labels.names, labels.probabilities.T, strict=True)
+            f"p_{class_name}": _format_numbers(numbers_of_windows)
+            for class_name, numbers_of_windows in zip(labels.names, labels.probabilities.T, strict=True)
         },
         "microphone": labels.strongest.tolist(),
     }
     if labels.position is not None and labels.position_std is not None:
-        axes = "xyz"[: labels.position.shape[1]]
-        columns |= {f"{axis}_m": _format_numbers(values) for axis, values in zip(axes, labels.position.T, strict=True)}
-        columns |= {
-            f"std_{axis}_m": _format_numbers(values) for axis, values in zip(axes, labels.position_std.T, strict=True)
+        coordinate_names = "xyz"[: labels.position.shape[1]]
+        table_columns |= {
+            f"{coordinate_name}_m": _format_numbers(numbers_of_windows)
+            for coordinate_name, numbers_of_windows in zip(coordinate_names, labels.position.T, strict=True)
         }
-    return columns
+        table_columns |= {
+            f"std_{coordinate_name}_m": _format_numbers(numbers_of_windows)
+            for coordinate_name, numbers_of_windows in zip(coordinate_names, labels.position_std.T, strict=True)
+        }
+    return table_columns
 
 
 def _format_numbers(values: np.ndarray) -> list[str]:

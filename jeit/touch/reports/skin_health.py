@@ -13,7 +13,7 @@ from jeit.report.folder import package_version, results, to_plain_values, write_
 from jeit.touch.health import HealthEvent, SkinHealth
 
 HEALTH_FILES = ("events.csv", "report.json", "health.png")
-_PACKAGES = ("jeit", "jax", "numpy", "scipy")
+_REPORTED_PACKAGES = ("jeit", "jax", "numpy", "scipy")
 _EVENT_COLUMNS = (
     "event", "kind", "status", "time", "noticed", "frame", "electrode", "channels", "strength", "length_m",
     "length_deviation_m", "path_m", "reason",
@@ -77,7 +77,7 @@ def report_health(health: SkinHealth, name: str, timed: bool) -> dict[str, Any]:
             "patience": health.patience,
             "with_a_model": health.skin is not None,
             "units": {"length": "m", "time": "s" if timed else "frames"},
-            "versions": {package: package_version(package) for package in _PACKAGES},
+            "versions": {package_name: package_version(package_name) for package_name in _REPORTED_PACKAGES},
         }
     )
 
@@ -103,7 +103,7 @@ def draw_health(health: SkinHealth, times: Float[np.ndarray, " F"], frames: Floa
 
 def _event_row(event: HealthEvent) -> list[object]:
     """Create the row of the table `events.csv` for an event: damage or repair."""
-    path = "" if event.path is None else "; ".join(f"{x:.5f} {y:.5f}" for x, y in event.path)
+    path_text = "" if event.path is None else "; ".join(f"{x:.5f} {y:.5f}" for x, y in event.path)
     return [
         event.number,
         event.kind,
@@ -116,6 +116,6 @@ def _event_row(event: HealthEvent) -> list[object]:
         f"{event.strength:.4g}",
         "" if event.path is None else f"{event.length:.5f}",
         "" if event.path is None else f"{event.deviation:.5f}",
-        path,
+        path_text,
         event.reason,
     ]

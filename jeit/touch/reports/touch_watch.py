@@ -35,7 +35,7 @@ def write_gestures(learnt: LearntGestures, folder: str | Path, *, name: str = "r
 def report_gestures(learnt: LearntGestures, name: str) -> dict[str, Any]:
     """Report how accurate a gesture classifier is, as plain numbers, strings, lists and dictionaries."""
     model, standing = learnt.model, learnt.model.standing
-    report: dict[str, Any] = {
+    gesture_report: dict[str, Any] = {
         "recordings": name,
         "gestures": list(model.names),
         "classifier": f"{model.method} on {model.form}",
@@ -43,17 +43,17 @@ def report_gestures(learnt: LearntGestures, name: str) -> dict[str, Any]:
         "recordings_without_a_touch": list(learnt.without_touch),
         "notes": list(model.notes),
         "units": {"level": "S", "rate": "1/s"},
-        "versions": {package: package_version(package) for package in _LEARNING_PACKAGES},
+        "versions": {package_name: package_version(package_name) for package_name in _LEARNING_PACKAGES},
     }
     if standing is not None:
         is_right = standing.held_out == standing.right
-        report["held_out"] = {
+        gesture_report["held_out"] = {
             "touches": len(standing.right),
             "right": is_right.mean(),
             "right_by_gesture": {name: is_right[standing.right == name].mean() for name in model.names},
-            "tried": [{"classifier": name, "right": 1 - error} for name, error in standing.tried],
+            "tried": [{"classifier": name, "right": 1 - error_rate} for name, error_rate in standing.tried],
         }
-    return to_plain_values(report)
+    return to_plain_values(gesture_report)
 
 
 def draw_gestures(learnt: LearntGestures):
@@ -66,8 +66,8 @@ def draw_gestures(learnt: LearntGestures):
     figure = Figure(figsize=(12.0, 5.4), layout="constrained")
     if standing is not None:
         left_axes, right_axes = figure.subplots(1, 2)
-        percentage = 100 * np.mean(standing.held_out == standing.right)
-        plot_confusion(standing, title=f"Gestures: {percentage:.1f} % right of touches held out", ax=left_axes)
+        percentage_right = 100 * np.mean(standing.held_out == standing.right)
+        plot_confusion(standing, title=f"Gestures: {percentage_right:.1f} % right of touches held out", ax=left_axes)
         plot_tried(standing, ax=right_axes)
     return figure
 
@@ -124,36 +124,43 @@ def write_watch(
     for file_name in WATCH_FILES[2:]:
         (folder / file_name).unlink(missing_ok=True)  # files of earlier touches
     touches: list[NamedTouch] = []
-    seconds, peaks, latency, counts, reason, notes = [], [], [], {}, "", []
+    frame_times, frame_peaks, gesture_latencies, status_counts, first_refusal_reason, frame_notes = (
+        [],
+        [],
+        [],
+        {},
+        "",
+        [],
+    )
     with (
-        GrowingTable(folder / "events.csv", _EVENT_COLUMNS) as events,
-        GrowingTable(folder / "paths.csv", _PATH_COLUMNS) as paths,
+        GrowingTable(folder / "events.csv", _EVENT_COLUMNS) as event_table,
+        GrowingTable(folder / "paths.csv", _PATH_COLUMNS) as path_table,
     ):
         for frame in watched:
             for touch in frame.ended:
                 touches.append(touch)
-                events.write(_event_row(touch))
-                for row in _path_rows(touch):
-                    paths.write(row)
+                event_table.write(_event_row(touch))
+                for path_row in _path_rows(touch):
+                    path_table.write(path_row)
             if frame.image is not None:
-                seconds.append(frame.second)
-                peaks.append(frame.peak)
-                counts[str(frame.image.status)] = counts.get(str(frame.image.status), 0) + 1
-                reason = reason or ("" if frame.image.imaged else frame.image.reason)
-            latency += [frame.latency] if frame.named is not None else []
-            notes += [frame.note] if frame.note else []
+                frame_times.append(frame.second)
+                frame_peaks.append(frame.peak)
+                status_counts[str(frame.image.status)] = status_counts.get(str(frame.image.status), 0) + 1
+                first_refusal_reason = first_refusal_reason or ("" if frame.image.imaged else frame.image.reason)
+            gesture_latencies += [frame.latency] if frame.named is not None else []
+            frame_notes += [frame.note] if frame.note else []
             if progress is not None:
                 progress(frame)
-    if not seconds:
+    if not frame_times:
         raise ValueError(f"'{name}': there was no frame in it.")
     written_watch = WrittenWatch(
         touches=tuple(touches),
-        seconds=np.array(seconds),
-        peaks=np.array(peaks),
-        latency=np.array(latency),
-        counts=counts,
-        first_reason=reason,
-        notes=tuple(notes),
+        seconds=np.array(frame_times),
+        peaks=np.array(frame_peaks),
+        latency=np.array(gesture_latencies),
+        counts=status_counts,
+        first_reason=first_refusal_reason,
+        notes=tuple(frame_notes),
     )
     with results(folder, WATCH_FILES[2:]) as result_folder:
         write_json(report_watch(written_watch, watch, name), result_folder / "report.json")
@@ -163,10 +170,10 @@ def write_watch(
 
 def report_watch(written_watch: WrittenWatch, watch: TouchWatch, name: str) -> dict[str, Any]:
     """Report classified touches as plain numbers, strings, lists and dictionaries; unknown values are None."""
-    names, counts = np.unique(
+    gesture_names, gesture_counts = np.unique(
         [touch.gesture for touch in written_watch.touches if not touch.unlike], return_counts=True
     )
-    latencies = written_watch.latency
+    gesture_latencies = written_watch.latency
     return to_plain_values(
         {
             "stream": name,
@@ -175,7 +182,7 @@ def report_watch(written_watch: WrittenWatch, watch: TouchWatch, name: str) -> d
             "status": written_watch.counts,
             "first_refusal": written_watch.first_reason or None,
             "touches": len(written_watch.touches),
-            "gestures": dict(zip(names.tolist(), counts.tolist(), strict=True)),
+            "gestures": dict(zip(gesture_names.tolist(), gesture_counts.tolist(), strict=True)),
             "unlike_any_learnt": sum(touch.unlike for touch in written_watch.touches),
             "cut_off": sum(not touch.touch.whole for touch in written_watch.touches),
             "held": sum(touch.held for touch in written_watch.touches),
@@ -184,13 +191,16 @@ def report_watch(written_watch: WrittenWatch, watch: TouchWatch, name: str) -> d
             "level_S": watch.level.level,
             "gap_s": watch.gap,
             "patience_s": watch.patience,
-            "named_within_s": {"median": np.median(latencies), "99_percent": np.quantile(latencies, 0.99)}
-            if latencies.size
+            "named_within_s": {
+                "median": np.median(gesture_latencies),
+                "99_percent": np.quantile(gesture_latencies, 0.99),
+            }
+            if gesture_latencies.size
             else None,
             "background_S": watch.images.background,
             "notes": [*watch.notes, *written_watch.notes, *watch.model.notes, *watch.images.reference.notes],
             "units": {"length": "m", "time": "s", "change": "S"},
-            "versions": {package: package_version(package) for package in _WATCH_PACKAGES},
+            "versions": {package_name: package_version(package_name) for package_name in _WATCH_PACKAGES},
         }
     )
 
@@ -201,42 +211,42 @@ def draw_watch(written_watch: WrittenWatch, watch: TouchWatch):
 
     from jeit.touch.plots import plot_changes, plot_timeline, plot_touch_paths
 
-    names = watch.model.names
-    figure = Figure(figsize=(13.0, 2.6 + 0.42 * max(len(names), 5)), layout="constrained")
-    grid = figure.add_gridspec(2, 2, width_ratios=(1.9, 1), height_ratios=(1, 1.25))
-    upper_axes = figure.add_subplot(grid[0, 0])
-    lower_axes = figure.add_subplot(grid[1, 0], sharex=upper_axes)
+    gesture_names = watch.model.names
+    figure = Figure(figsize=(13.0, 2.6 + 0.42 * max(len(gesture_names), 5)), layout="constrained")
+    axes_grid = figure.add_gridspec(2, 2, width_ratios=(1.9, 1), height_ratios=(1, 1.25))
+    upper_axes = figure.add_subplot(axes_grid[0, 0])
+    lower_axes = figure.add_subplot(axes_grid[1, 0], sharex=upper_axes)
     num_refused = int(np.isnan(written_watch.peaks).sum())
-    duration = written_watch.seconds[-1] - written_watch.seconds[0]
-    title = f"{counted(len(written_watch.touches), 'touch')} in {duration:.4g} s"
-    title += f"; {counted(num_refused, 'frame')} refused" if num_refused else ""
-    plot_changes(written_watch.seconds, written_watch.peaks, watch.level.level, title=title, ax=upper_axes)
-    plot_timeline(list(written_watch.touches), names, ax=lower_axes)
+    stream_duration = written_watch.seconds[-1] - written_watch.seconds[0]
+    stream_title = f"{counted(len(written_watch.touches), 'touch')} in {stream_duration:.4g} s"
+    stream_title += f"; {counted(num_refused, 'frame')} refused" if num_refused else ""
+    plot_changes(written_watch.seconds, written_watch.peaks, watch.level.level, title=stream_title, ax=upper_axes)
+    plot_timeline(list(written_watch.touches), gesture_names, ax=lower_axes)
     upper_axes.set_xlim(*_time_range(written_watch.seconds))
     upper_axes.tick_params(labelbottom=False)
-    model = watch.images.calibration.model
+    forward_model = watch.images.calibration.model
     plot_touch_paths(
-        model.mesh,
+        forward_model.mesh,
         list(written_watch.touches),
-        names,
-        model.electrodes,
+        gesture_names,
+        forward_model.electrodes,
         title="Where they went, from the dots on",
-        ax=figure.add_subplot(grid[:, 1]),
+        ax=figure.add_subplot(axes_grid[:, 1]),
     )
     return figure
 
 
-def _time_range(seconds: np.ndarray) -> tuple[float, float]:
+def _time_range(frame_times: np.ndarray) -> tuple[float, float]:
     """Return the times of the first and the last frame, seconds, at least 1 ms apart."""
-    return float(seconds[0]), max(float(seconds[-1]), float(seconds[0]) + 1e-3)
+    return float(frame_times[0]), max(float(frame_times[-1]), float(frame_times[0]) + 1e-3)
 
 
 def _event_row(touch: NamedTouch) -> list[object]:
     """Create the row of the table `events.csv` for a touch."""
     time_course = touch.touch.course
     peak_frame = int(time_course.peak.argmax())
-    centroids = time_course.centroid[np.isfinite(time_course.centroid).all(axis=1)]
-    path_length = float(np.linalg.norm(np.diff(centroids, axis=0), axis=1).sum())
+    touch_centroids = time_course.centroid[np.isfinite(time_course.centroid).all(axis=1)]
+    path_length = float(np.linalg.norm(np.diff(touch_centroids, axis=0), axis=1).sum())
     return [
         touch.number,
         f"{touch.touch.onset:.4f}",
@@ -244,9 +254,9 @@ def _event_row(touch: NamedTouch) -> list[object]:
         "" if touch.unlike else touch.gesture,
         f"{touch.probability:.4f}",
         int(touch.unlike),
-        *(f"{value:.5f}" for value in time_course.centroid[peak_frame]),
+        *(f"{coordinate:.5f}" for coordinate in time_course.centroid[peak_frame]),
         f"{path_length:.5f}",
-        f"{np.linalg.norm(centroids[-1] - centroids[0]):.5f}",
+        f"{np.linalg.norm(touch_centroids[-1] - touch_centroids[0]):.5f}",
         f"{time_course.peak[peak_frame]:.6g}",
         f"{time_course.area[peak_frame]:.6g}",
         int(touch.touch.begun_before),
@@ -265,18 +275,20 @@ def _path_rows(touch: NamedTouch) -> list[list[object]]:
     return [
         [
             touch.number,
-            f"{time:.4f}",
-            *(f"{value:.5f}" if np.isfinite(value) else "" for value in centroid),
-            f"{peak:.6g}",
+            f"{frame_time:.4f}",
+            *(f"{coordinate:.5f}" if np.isfinite(coordinate) else "" for coordinate in frame_centroid),
+            f"{frame_peak:.6g}",
         ]
-        for time, centroid, peak in zip(time_course.seconds, time_course.centroid, time_course.peak, strict=True)
+        for frame_time, frame_centroid, frame_peak in zip(
+            time_course.seconds, time_course.centroid, time_course.peak, strict=True
+        )
     ]
 
 
 CONTACT_FILES = ("contacts.csv", "report.json", "contacts.png")
 _CONTACT_COLUMNS = ("frame", "time_s", "touch", "x_m", "y_m", "deviation_m", "area_m2", "peak_S")
 # Maximum number of paths that have a number in the picture.
-_MAX_NUMBERED = 20
+_MAX_NUMBERED_TOUCHES = 20
 
 
 def write_contacts(recorded_contacts: RecordedContacts, images: TouchImages, folder: str | Path, *, name: str) -> None:
@@ -285,42 +297,46 @@ def write_contacts(recorded_contacts: RecordedContacts, images: TouchImages, fol
     The files are `contacts.csv`, `report.json` and `contacts.png`. `name`: name of the recording. Raises `ValueError`
     if `folder` cannot be a folder.
     """
-    rows = (
-        [frame, f"{recorded_contacts.seconds[frame]:.6g}", recorded_contacts.number_of(frame, contact)]
+    table_rows = (
+        [
+            frame_number,
+            f"{recorded_contacts.seconds[frame_number]:.6g}",
+            recorded_contacts.number_of(frame_number, contact),
+        ]
         + [f"{metres:.6f}" for metres in (*contact.centroid, contact.deviation)]
         + [f"{contact.area:.4g}", f"{contact.peak:.4g}"]
-        for frame, contacts in enumerate(recorded_contacts.contacts)
+        for frame_number, contacts in enumerate(recorded_contacts.contacts)
         for contact in contacts
     )
     with results(folder, CONTACT_FILES) as temporary_folder:
-        write_rows(temporary_folder / "contacts.csv", _CONTACT_COLUMNS, rows)
+        write_rows(temporary_folder / "contacts.csv", _CONTACT_COLUMNS, table_rows)
         write_json(_report_contacts(recorded_contacts, images, name), temporary_folder / "report.json")
         _draw_contacts(recorded_contacts, images).savefig(temporary_folder / "contacts.png", dpi=130)
 
 
-def _report_contacts(recorded_contacts: RecordedContacts, images: TouchImages, name: str) -> dict[str, Any]:
+def _report_contacts(recorded_contacts: RecordedContacts, images: TouchImages, recording_name: str) -> dict[str, Any]:
     return to_plain_values(
         {
-            "recording": name,
+            "recording": recording_name,
             "frames": len(recorded_contacts.seconds),
             "background": images.background,
             "touches": [
                 {
-                    "touch": path.number,
-                    "onset": path.onset,
-                    "offset": path.offset,
-                    "frames": len(path.times),
-                    "first_position": path.position[0],
-                    "last_position": path.position[-1],
-                    "mean_position": path.position.mean(axis=0),
-                    "path_length": path.length,
-                    "peak": path.peak[np.abs(path.peak).argmax()],
+                    "touch": touch_path.number,
+                    "onset": touch_path.onset,
+                    "offset": touch_path.offset,
+                    "frames": len(touch_path.times),
+                    "first_position": touch_path.position[0],
+                    "last_position": touch_path.position[-1],
+                    "mean_position": touch_path.position.mean(axis=0),
+                    "path_length": touch_path.length,
+                    "peak": touch_path.peak[np.abs(touch_path.peak).argmax()],
                 }
-                for path in recorded_contacts.touches
+                for touch_path in recorded_contacts.touches
             ],
             "notes": list(recorded_contacts.notes),
             "units": {"onset": "s", "position": "m", "path_length": "m", "peak": "S", "background": "S"},
-            "versions": {package: package_version(package) for package in _WATCH_PACKAGES[:3]},
+            "versions": {package_name: package_version(package_name) for package_name in _WATCH_PACKAGES[:3]},
         }
     )
 
@@ -336,26 +352,28 @@ def _draw_contacts(recorded_contacts: RecordedContacts, images: TouchImages):
 
     electrodes, extent = images.calibration.model.electrodes, extent_of(np.asarray(images.mesh.points))
     figure = Figure(figsize=(12.0, 5.4), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    strengths = [sum(abs(contact.integral) for contact in contacts) for contacts in recorded_contacts.contacts]
-    frame = int(np.argmax(strengths))
-    title = f"Frame {frame}, {recorded_contacts.seconds[frame]:.2f} s"
+    image_axes, path_axes = figure.subplots(1, 2)
+    frame_strengths = [sum(abs(contact.integral) for contact in contacts) for contacts in recorded_contacts.contacts]
+    strongest_frame = int(np.argmax(frame_strengths))
+    frame_title = f"Frame {strongest_frame}, {recorded_contacts.seconds[strongest_frame]:.2f} s"
     plot_contacts(
         images.mesh,
-        np.nan_to_num(recorded_contacts.changes[frame]),
-        recorded_contacts.contacts[frame],
+        np.nan_to_num(recorded_contacts.changes[strongest_frame]),
+        recorded_contacts.contacts[strongest_frame],
         electrodes,
-        title=title,
-        ax=left,
+        title=frame_title,
+        ax=image_axes,
     )
-    draw_outline(images.mesh, right)
-    draw_electrodes(images.mesh, electrodes, numbers=False, ax=right)
-    for path in recorded_contacts.touches:
-        (line,) = right.plot(*path.position.T, linewidth=1.6)
-        right.plot(*path.position[0], marker="o", markersize=5, color=line.get_color())
-        if len(recorded_contacts.touches) <= _MAX_NUMBERED:
-            right.annotate(str(path.number), path.position[0], (5, 3), textcoords="offset points", fontsize=9)
-    hide_axes(right, extent)
-    draw_scale_bar(right, extent)
-    right.set_title(f"Paths of {counted(len(recorded_contacts.touches), 'touch')}, from their dots")
+    draw_outline(images.mesh, path_axes)
+    draw_electrodes(images.mesh, electrodes, numbers=False, ax=path_axes)
+    for touch_path in recorded_contacts.touches:
+        (path_line,) = path_axes.plot(*touch_path.position.T, linewidth=1.6)
+        path_axes.plot(*touch_path.position[0], marker="o", markersize=5, color=path_line.get_color())
+        if len(recorded_contacts.touches) <= _MAX_NUMBERED_TOUCHES:
+            path_axes.annotate(
+                str(touch_path.number), touch_path.position[0], (5, 3), textcoords="offset points", fontsize=9
+            )
+    hide_axes(path_axes, extent)
+    draw_scale_bar(path_axes, extent)
+    path_axes.set_title(f"Paths of {counted(len(recorded_contacts.touches), 'touch')}, from their dots")
     return figure

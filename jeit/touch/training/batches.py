@@ -47,24 +47,24 @@ class ArrayRows:
     def __init__(self, arrays: Any, name: str = "training"):
         """Raises `ValueError`, with the `name` of the data, if there are no arrays, or the arrays differ in number of
         rows."""
-        lengths = {len(leaf) if np.ndim(leaf) else -1 for leaf in jax.tree.leaves(arrays)}
-        if len(lengths) != 1 or min(lengths) < 1:
+        row_counts = {len(array) if np.ndim(array) else -1 for array in jax.tree.leaves(arrays)}
+        if len(row_counts) != 1 or min(row_counts) < 1:
             raise ValueError(
                 f"{name} must be arrays of one and the same number of rows, 1 or more, such as (inputs, targets); it "
-                f"is {describe(arrays)} of {sorted(lengths) or 'none'}."
+                f"is {describe(arrays)} of {sorted(row_counts) or 'none'}."
             )
         self.arrays = arrays
-        self.sizes = (lengths.pop(),)
+        self.sizes = (row_counts.pop(),)
 
     @property
     def fingerprint(self) -> str:
         """Fingerprint of the rows: SHA-256 of the arrays."""
-        digest = hashlib.sha256()
-        for leaf in jax.tree.leaves(self.arrays):
-            values = np.ascontiguousarray(leaf)
-            digest.update(f"{values.dtype} {values.shape}".encode())
-            digest.update(values.data)
-        return digest.hexdigest()
+        content_hash = hashlib.sha256()
+        for array in jax.tree.leaves(self.arrays):
+            contiguous_array = np.ascontiguousarray(array)
+            content_hash.update(f"{contiguous_array.dtype} {contiguous_array.shape}".encode())
+            content_hash.update(contiguous_array.data)
+        return content_hash.hexdigest()
 
     def chunk(self, index: int) -> Any:
         """Return all rows of the arrays, which are a single chunk."""
@@ -118,7 +118,7 @@ class BatchOrder:
 
     def __init__(self, sizes: tuple[int, ...], batch: int, seed: list[int]):
         self.batch, self.seed = min(batch, *sizes), seed
-        self.num_batches = [size // self.batch for size in sizes]
+        self.num_batches = [num_rows // self.batch for num_rows in sizes]
         self.sizes = sizes
 
     @property
@@ -133,19 +133,23 @@ class BatchOrder:
         """
         while first_batch < last_batch:
             epoch, batch_in_epoch = divmod(first_batch, self.batches_per_epoch)
-            chunks = self._permutation(len(self.sizes), epoch)
-            last_batches = np.cumsum([self.num_batches[chunk_index] for chunk_index in chunks])
-            position = int(np.searchsorted(last_batches, batch_in_epoch, side="right"))
-            chunk = int(chunks[position])
-            batch_in_chunk = batch_in_epoch - (int(last_batches[position]) - self.num_batches[chunk])
-            group_size = min(max_batches, last_batch - first_batch, int(last_batches[position]) - batch_in_epoch)
-            rows = self._permutation(self.sizes[chunk], epoch, 1 + chunk)[batch_in_chunk * self.batch :][
-                : group_size * self.batch
-            ]
-            yield ChunkBatches(chunk, rows.reshape(group_size, self.batch), first_batch)
+            chunk_order = self._draw_permutation(len(self.sizes), epoch)
+            last_batch_of_chunks = np.cumsum([self.num_batches[chunk_index] for chunk_index in chunk_order])
+            chunk_position = int(np.searchsorted(last_batch_of_chunks, batch_in_epoch, side="right"))
+            chunk_number = int(chunk_order[chunk_position])
+            batch_in_chunk = batch_in_epoch - (
+                int(last_batch_of_chunks[chunk_position]) - self.num_batches[chunk_number]
+            )
+            group_size = min(
+                max_batches, last_batch - first_batch, int(last_batch_of_chunks[chunk_position]) - batch_in_epoch
+            )
+            batch_rows = self._draw_permutation(self.sizes[chunk_number], epoch, 1 + chunk_number)[
+                batch_in_chunk * self.batch :
+            ][: group_size * self.batch]
+            yield ChunkBatches(chunk_number, batch_rows.reshape(group_size, self.batch), first_batch)
             first_batch += group_size
 
-    def _permutation(self, count: int, *location: int) -> np.ndarray:
-        """Draw a random permutation of 0 … `count` - 1, determined by the seed and by `location`: the epoch, or the
-        epoch and the chunk."""
-        return np.random.default_rng([*self.seed, *location]).permutation(count)
+    def _draw_permutation(self, num_elements: int, *seed_extension: int) -> np.ndarray:
+        """Draw a random permutation of 0 … `num_elements` - 1, determined by the seed and by `seed_extension`: the
+        epoch, or the epoch and the chunk."""
+        return np.random.default_rng([*self.seed, *seed_extension]).permutation(num_elements)

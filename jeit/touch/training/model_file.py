@@ -34,17 +34,17 @@ def write_model(path: str | Path, kind: str, version: int, header: dict[str, Any
     path = Path(path)
     if path.is_dir():
         raise ValueError(f"'{path}' is a folder; give a file, such as {path / 'network.jeit'}.")
-    text = json.dumps({"kind": kind, "version": version, **header}, allow_nan=True).encode()
-    if len(text) > _MAX_HEADER_SIZE:
+    header_text = json.dumps({"kind": kind, "version": version, **header}, allow_nan=True).encode()
+    if len(header_text) > _MAX_HEADER_SIZE:
         raise ValueError(
-            f"header has {len(text)} bytes as JSON, more than {_MAX_HEADER_SIZE}; put arrays into the model."
+            f"header has {len(header_text)} bytes as JSON, more than {_MAX_HEADER_SIZE}; put arrays into the model."
         )
-    arrays = [leaf for leaf in jax.tree.leaves(model) if eqx.is_array(leaf)]
-    if _num_bytes(arrays) > _MAX_ARRAY_SIZE:
-        raise ValueError(f"model has {_num_bytes(arrays)} bytes of arrays, and a file {_MAX_ARRAY_SIZE} at most.")
+    model_arrays = [model_leaf for model_leaf in jax.tree.leaves(model) if eqx.is_array(model_leaf)]
+    if _num_bytes(model_arrays) > _MAX_ARRAY_SIZE:
+        raise ValueError(f"model has {_num_bytes(model_arrays)} bytes of arrays, and a file {_MAX_ARRAY_SIZE} at most.")
     with atomically_written_file(path) as file:
-        file.write(_FILE_SIGNATURE + text + b"\n")
-        for array in arrays:
+        file.write(_FILE_SIGNATURE + header_text + b"\n")
+        for array in model_arrays:
             np.lib.format.write_array(file, np.asarray(array), allow_pickle=False)
 
 
@@ -72,19 +72,23 @@ def read_model(
     with _open_file(Path(path), kind) as file:
         header = _read_header(file, kind, version)
         try:
-            architecture = eqx.filter_eval_shape(make, header)
+            model_structure = eqx.filter_eval_shape(make, header)
         except (KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
             raise ValueError(
                 f"its header does not describe such a model ({type(error).__name__}: {error_text(error)})"
             ) from None
-        arrays = [leaf for leaf in jax.tree.leaves(architecture) if isinstance(leaf, jax.ShapeDtypeStruct)]
+        described_arrays = [
+            model_leaf
+            for model_leaf in jax.tree.leaves(model_structure)
+            if isinstance(model_leaf, jax.ShapeDtypeStruct)
+        ]
         remaining_bytes = os.fstat(file.fileno()).st_size - file.tell()
-        if not _num_bytes(arrays) <= min(remaining_bytes, _MAX_ARRAY_SIZE):
+        if not _num_bytes(described_arrays) <= min(remaining_bytes, _MAX_ARRAY_SIZE):
             raise ValueError(
-                f"it has {remaining_bytes} bytes of arrays, fewer than the {_num_bytes(arrays)} that its header "
-                "describes"
+                f"it has {remaining_bytes} bytes of arrays, fewer than the {_num_bytes(described_arrays)} that its "
+                "header describes"
             )
-        model = jax.tree.map(lambda leaf: _read_array(file, leaf), architecture)
+        model = jax.tree.map(lambda model_leaf: _read_array(file, model_leaf), model_structure)
         if file.read(1):
             raise ValueError("it has more bytes after its last array")
     return header, model
@@ -97,12 +101,15 @@ def check_same(path: str | Path, actual_description: dict[str, Any], expected_de
     dictionaries of JSON values, in which numbers may differ by a millionth. Raises `ValueError`, which states the first
     difference.
     """
-    for name in expected_description:
-        if not _are_equal(actual_description.get(name), expected_description[name]):
-            actual_text, expected_text = _shorten(actual_description.get(name)), _shorten(expected_description[name])
+    for property_name in expected_description:
+        if not _are_equal(actual_description.get(property_name), expected_description[property_name]):
+            actual_text, expected_text = (
+                _short_text(actual_description.get(property_name)),
+                _short_text(expected_description[property_name]),
+            )
             raise ValueError(
-                f"'{path}' was trained for another skin or protocol: its {name} is {actual_text}, and here it is "
-                f"{expected_text}; train one for this."
+                f"'{path}' was trained for another skin or protocol: its {property_name} is {actual_text}, and here "
+                f"it is {expected_text}; train one for this."
             )
 
 
@@ -124,11 +131,11 @@ def _read_header(file: BinaryIO, kind: str, version: int) -> dict[str, Any]:
     """Read the header of a model file. Raises `ValueError` if the file is of another kind or version."""
     if file.read(len(_FILE_SIGNATURE)) != _FILE_SIGNATURE:
         raise ValueError("it is a file of another kind")
-    line = file.readline(_MAX_HEADER_SIZE + 1)
-    if not line.endswith(b"\n"):
+    header_line = file.readline(_MAX_HEADER_SIZE + 1)
+    if not header_line.endswith(b"\n"):
         raise ValueError("its header is truncated, or too long")
     try:
-        header = json.loads(line)
+        header = json.loads(header_line)
     except (ValueError, RecursionError):
         raise ValueError("its header is not JSON") from None
     if not isinstance(header, dict) or header.get("kind") != kind:
@@ -139,29 +146,36 @@ def _read_header(file: BinaryIO, kind: str, version: int) -> dict[str, Any]:
     return header
 
 
-def _num_bytes(arrays) -> int:
-    return sum(math.prod(array.shape) * np.dtype(array.dtype).itemsize for array in arrays)
+def _num_bytes(sized_arrays) -> int:
+    return sum(math.prod(sized_array.shape) * np.dtype(sized_array.dtype).itemsize for sized_array in sized_arrays)
 
 
-def _read_array(file: BinaryIO, leaf: Any) -> Any:
-    """Read an array with the shape and dtype of a model's `leaf`; a leaf that is no array is returned unchanged."""
-    if not isinstance(leaf, jax.ShapeDtypeStruct):
-        return leaf
-    version = np.lib.format.read_magic(file)
-    if version != (1, 0):
-        raise ValueError(f"one of its arrays is in format {version}")
-    shape, is_fortran_order, dtype = np.lib.format.read_array_header_1_0(file)
-    if (shape, dtype, is_fortran_order) != (leaf.shape, leaf.dtype, is_fortran_order and len(leaf.shape) > 1):
+def _read_array(file: BinaryIO, described_array: Any) -> Any:
+    """Read an array with the shape and dtype of `described_array`; a leaf that is no array is returned unchanged."""
+    if not isinstance(described_array, jax.ShapeDtypeStruct):
+        return described_array
+    array_version = np.lib.format.read_magic(file)
+    if array_version != (1, 0):
+        raise ValueError(f"one of its arrays is in format {array_version}")
+    stored_shape, is_fortran_order, stored_dtype = np.lib.format.read_array_header_1_0(file)
+    if (stored_shape, stored_dtype, is_fortran_order) != (
+        described_array.shape,
+        described_array.dtype,
+        is_fortran_order and len(described_array.shape) > 1,
+    ):
         raise ValueError(
-            f"one of its arrays is {dtype} of shape {shape}, and its header says {leaf.dtype} of {leaf.shape}"
+            f"one of its arrays is {stored_dtype} of shape {stored_shape}, and its header says "
+            f"{described_array.dtype} of {described_array.shape}"
         )
-    data = file.read(_num_bytes([leaf]))
-    if len(data) != _num_bytes([leaf]):
+    array_bytes = file.read(_num_bytes([described_array]))
+    if len(array_bytes) != _num_bytes([described_array]):
         raise ValueError("it is truncated")
-    values = np.frombuffer(data, dtype).reshape(shape, order="F" if is_fortran_order else "C")
-    if np.isnan(values).any():
+    array_values = np.frombuffer(array_bytes, stored_dtype).reshape(
+        stored_shape, order="F" if is_fortran_order else "C"
+    )
+    if np.isnan(array_values).any():
         raise ValueError("some of its numbers are NaN")
-    return as_array(values)
+    return as_array(array_values)
 
 
 def _are_equal(first_value: Any, second_value: Any) -> bool:
@@ -172,9 +186,9 @@ def _are_equal(first_value: Any, second_value: Any) -> bool:
     return first_value == second_value
 
 
-def _shorten(value: Any) -> str:
-    text = "not given" if value is None else str(value)
-    return text if len(text) <= 60 else f"{text[:59]}…"
+def _short_text(described_value: Any) -> str:
+    value_text = "not given" if described_value is None else str(described_value)
+    return value_text if len(value_text) <= 60 else f"{value_text[:59]}…"
 
 
 _CHECKPOINT_KIND, _CHECKPOINT_VERSION = "a jeit training under way", 1
@@ -232,14 +246,14 @@ class Checkpoint:
         if not self.path.exists():
             return initial_state
 
-        def make(header: dict[str, Any]) -> Any:
-            for name, value in json.loads(json.dumps(self.fingerprint)).items():
-                if header["training"].get(name) != value:
+        def make_state(header: dict[str, Any]) -> Any:
+            for field_name, field_value in json.loads(json.dumps(self.fingerprint)).items():
+                if header["training"].get(field_name) != field_value:
                     raise ValueError(
-                        f"it is of another training ({name} was {header['training'].get(name)}, and is {value} now); "
-                        "delete it, or give another file"
+                        f"it is of another training ({field_name} was {header['training'].get(field_name)}, and is "
+                        f"{field_value} now); delete it, or give another file"
                     )
-            return jax.tree.map(lambda leaf: leaf, initial_state[2:])
+            return jax.tree.map(lambda state_leaf: state_leaf, initial_state[2:])
 
-        header, arrays = read_model(self.path, _CHECKPOINT_KIND, _CHECKPOINT_VERSION, make)
-        return TrainingState(header["step"], Course(*header["course"]), *arrays)
+        header, state_arrays = read_model(self.path, _CHECKPOINT_KIND, _CHECKPOINT_VERSION, make_state)
+        return TrainingState(header["step"], Course(*header["course"]), *state_arrays)

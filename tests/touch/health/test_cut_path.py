@@ -58,7 +58,7 @@ def test_each_end_of_a_path_is_uncertain_by_half_an_edge():
     fit.energy, fit.edge_length, fit.change = 1.0, 1e-3, np.ones(50)
     fit._misfit = lambda unknowns: 1e6 * float(np.sum((unknowns - path) ** 2))  # pyright: ignore
     path = np.array([0.0, 0.0, 0.01, 0.0, 0.0, 0.0])
-    assert fit._deviation(_FittedUnknowns(path, 0.0)) == pytest.approx(np.sqrt(2) * 0.5e-3, rel=1e-6)
+    assert fit._cut_length_deviation(_FittedUnknowns(path, 0.0)) == pytest.approx(np.sqrt(2) * 0.5e-3, rel=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["complete", "point"])

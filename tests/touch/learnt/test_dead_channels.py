@@ -7,7 +7,7 @@ from jeit.touch.learnt.channels import (
     _CANDIDATE_DIAGONAL_TERMS,
     Channels,
     _leave_one_out_errors,
-    _variances,
+    _principal_variances,
     choose_channels,
 )
 
@@ -86,7 +86,7 @@ def test_healthy_channels_are_not_reported_as_dead_beside_four_dead_ones():
 
 def test_residuals_are_those_of_prediction_by_the_other_channels():
     learnt, other = changes(60, 0, noise=0.3)[:, :6], changes(40, 1, noise=0.3)[:, :6]
-    variance, directions = _variances(learnt)
+    variance, directions = _principal_variances(learnt)
     covariance = (directions * variance) @ directions.T + _CANDIDATE_DIAGONAL_TERMS[8] * np.eye(6)
     left = []
     for one in range(6):
