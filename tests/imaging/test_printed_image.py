@@ -39,7 +39,7 @@ def printed(imaged, capsys):
     return call
 
 
-USUAL = ["background", "difference", "noise in it", "method", "mesh"]
+USUAL = ["background", "difference", "noise in it", "smallest body", "method", "mesh"]
 
 
 def test_a_sound_image_has_no_rows_of_faults(printed):
