@@ -67,8 +67,8 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Draw the arcs of the boundary of `mesh` that the electrodes cover."""
-        for position, width in zip(np.asarray(self.position), np.asarray(self.width), strict=True):
-            pen.lines([_arc_points(mesh, position, width)], position)
+        for position, electrode_width in zip(np.asarray(self.position), np.asarray(self.width), strict=True):
+            pen.lines([_arc_points(mesh, position, electrode_width)], position)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
         """Refine cells to a quarter of their size at the ends of the electrodes, where the current density is largest
@@ -78,17 +78,20 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         nodes, the error of adjacent voltages is 3 %; with cells of half the size at the middles of the electrodes
         instead, the error is 57 %.
         """
-        edge = body.loops(720)[0]
-        centres, half_width = project_to_loop(np.asarray(self.position), np.asarray(edge)), np.asarray(self.width) / 2
-        end_points = points_on_loop(edge, np.concatenate([centres - half_width, centres + half_width]))
+        outer_loop = body.loops(720)[0]
+        centres, half_width = (
+            project_to_loop(np.asarray(self.position), np.asarray(outer_loop)),
+            np.asarray(self.width) / 2,
+        )
+        end_points = points_on_loop(outer_loop, np.concatenate([centres - half_width, centres + half_width]))
         return (Refine(np.asarray(end_points), factor=4.0),)
 
     def directions(self, mesh: Mesh) -> Float[np.ndarray, "L a 2"]:
         """Unit tangents of the boundary of `mesh` at the electrodes, counter-clockwise."""
-        start, end = np.asarray(mesh.points)[np.asarray(mesh.facets)].swapaxes(0, 1)
+        edge_starts, edge_ends = np.asarray(mesh.points)[np.asarray(mesh.facets)].swapaxes(0, 1)
         positions = np.asarray(self.position)
-        nearest_edges = np.argmin(np.linalg.norm(positions[:, None] - (start + end) / 2, axis=-1), axis=1)
-        tangents = (end - start)[nearest_edges]
+        nearest_edges = np.argmin(np.linalg.norm(positions[:, None] - (edge_starts + edge_ends) / 2, axis=-1), axis=1)
+        tangents = (edge_ends - edge_starts)[nearest_edges]
         return (tangents / np.linalg.norm(tangents, axis=1, keepdims=True))[:, None]
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
@@ -99,33 +102,39 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
     def contact(self, mesh: Mesh) -> Contact:
         """Contact integrals over the boundary edges of `mesh`, exact for P1 basis functions."""
         xp = namespace(self, mesh)
-        start, end = _covered_intervals(self.position, self.width, mesh)
-        length = facet_measures(mesh)[:, None]
-        # The basis functions on an edge are φ_1 = t / length and φ_0 = 1 - φ_1. Simpson's rule is exact for their
+        covered_starts, covered_ends = _covered_intervals(self.position, self.width, mesh)
+        edge_length = facet_measures(mesh)[:, None]
+        # The basis functions on an edge are φ_1 = t / edge length and φ_0 = 1 - φ_1. Simpson's rule is exact for their
         # products over [start, end]. It sums only positive terms, so it is also accurate for edges of which an
         # electrode covers only a small part.
-        end_hat_function = xp.stack([start, (start + end) / 2, end]) / length
+        end_hat_function = xp.stack([covered_starts, (covered_starts + covered_ends) / 2, covered_ends]) / edge_length
         start_hat_function = 1 - end_hat_function
-        weights = (end - start) * np.array([1.0, 4.0, 1.0], start.dtype)[:, None, None, None] / 6
+        simpson_weights = (
+            (covered_ends - covered_starts) * np.array([1.0, 4.0, 1.0], covered_starts.dtype)[:, None, None, None] / 6
+        )
 
         # The sum over the turns around the loop, (b, L), is explicit, because XLA converts a sum over such a short axis
         # into a slow matrix product.
-        def integral(values):
-            values = weights[0] * values[0] + weights[1] * values[1] + weights[2] * values[2]
-            return values[0] + values[1] + values[2]
+        def integral_over_covered(integrand_values):
+            integrand_values = (
+                simpson_weights[0] * integrand_values[0]
+                + simpson_weights[1] * integrand_values[1]
+                + simpson_weights[2] * integrand_values[2]
+            )
+            return integrand_values[0] + integrand_values[1] + integrand_values[2]
 
-        phi = xp.stack([integral(start_hat_function), integral(end_hat_function)])
-        hat_function_integrals = xp.stack(
+        hat_integrals = xp.stack([integral_over_covered(start_hat_function), integral_over_covered(end_hat_function)])
+        hat_product_integrals = xp.stack(
             [
-                integral(start_hat_function**2),
-                integral(start_hat_function * end_hat_function),
-                integral(end_hat_function**2),
+                integral_over_covered(start_hat_function**2),
+                integral_over_covered(start_hat_function * end_hat_function),
+                integral_over_covered(end_hat_function**2),
             ]
         )
-        admittance = 1 / self.contact_impedance
-        admittance_entries = hat_function_integrals @ admittance  # (3, b)
+        admittance_per_area = 1 / self.contact_impedance
+        admittance_entries = hat_product_integrals @ admittance_per_area  # (3, b)
         mass = xp.stack([admittance_entries[:2], admittance_entries[1:]]).transpose(2, 0, 1)
-        load = sum_into((mesh.num_points, self.num_electrodes), mesh.facets.T, phi * admittance)
+        load = sum_into((mesh.num_points, self.num_electrodes), mesh.facets.T, hat_integrals * admittance_per_area)
         return Contact((mesh.facets,), (mass,), load)
 
     def check(self, mesh: Mesh) -> None:
@@ -135,24 +144,30 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         if not has_values(self.position, self.width, mesh):
             return
         position, width, mesh = on_host((self.position, self.width, mesh))
-        distance, (start, end) = _project(position, mesh)[2], _covered_intervals(position, width, mesh)
-        off_boundary = np.flatnonzero(distance > np.maximum(0.5 * width, 2e-3 * np.ptp(mesh.points, axis=0).max()))
-        if off_boundary.size:
+        distance_from_boundary, (covered_starts, covered_ends) = (
+            _project(position, mesh)[2],
+            _covered_intervals(position, width, mesh),
+        )
+        electrodes_off_boundary = np.flatnonzero(
+            distance_from_boundary > np.maximum(0.5 * width, 2e-3 * np.ptp(mesh.points, axis=0).max())
+        )
+        if electrodes_off_boundary.size:
             raise ValueError(
-                f"position: electrode {off_boundary[0] + 1} lies {distance[off_boundary[0]]:.3g} m from the boundary "
-                "of the mesh; they must lie on it (are both in metres?). For electrodes inside a sheet use SheetDiscs."
+                f"position: electrode {electrodes_off_boundary[0] + 1} lies "
+                f"{distance_from_boundary[electrodes_off_boundary[0]]:.3g} m from the boundary of the mesh; they must "
+                "lie on it (are both in metres?). For electrodes inside a sheet use SheetDiscs."
             )
-        covered_lengths = np.clip(end - start, 0, None).sum(axis=0)  # (b, L)
+        covered_lengths = np.clip(covered_ends - covered_starts, 0, None).sum(axis=0)  # (b, L)
         rounding_error = max(1e-9, 1e3 * np.finfo(covered_lengths.dtype).eps)
-        too_wide = np.flatnonzero(covered_lengths.sum(axis=0) < (1 - rounding_error) * width)
-        if too_wide.size:
+        too_wide_electrodes = np.flatnonzero(covered_lengths.sum(axis=0) < (1 - rounding_error) * width)
+        if too_wide_electrodes.size:
             raise ValueError(
-                f"width: electrode {too_wide[0] + 1} is {float(self.width[too_wide[0]]):.3g} m wide, more than the "
-                "boundary it lies on; widths are in metres."
+                f"width: electrode {too_wide_electrodes[0] + 1} is {float(self.width[too_wide_electrodes[0]]):.3g} m "
+                "wide, more than the boundary it lies on; widths are in metres."
             )
-        pairs = overlapping_pairs(start, end)
-        if pairs:
-            first_electrode, second_electrode = pairs[0]
+        overlapping_electrodes = overlapping_pairs(covered_starts, covered_ends)
+        if overlapping_electrodes:
+            first_electrode, second_electrode = overlapping_electrodes[0]
             raise ValueError(
                 f"Electrodes {first_electrode + 1} and {second_electrode + 1} overlap; move them apart or make them "
                 "narrower (positions and widths are in metres along the boundary)."
@@ -163,34 +178,38 @@ def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int
     """Pairs of electrodes that cover a common part of an edge, given the `start` and `end` (3, b, L) of the intervals
     of the b edges that they cover, see `_covered_intervals`."""
     start, end = start.transpose(2, 1, 0), end.transpose(2, 1, 0)
-    is_covered = (end > start).any(axis=2).astype(float)
-    pairs = []
+    is_edge_covered = (end > start).any(axis=2).astype(float)
+    electrode_pairs = []
     for first_electrode, second_electrode in np.argwhere(
-        np.triu(is_covered @ is_covered.T, 1)
+        np.triu(is_edge_covered @ is_edge_covered.T, 1)
     ).tolist():  # both cover a part of one edge
         common_lengths = np.minimum(end[first_electrode][:, :, None], end[second_electrode][:, None, :]) - np.maximum(
             start[first_electrode][:, :, None], start[second_electrode][:, None, :]
         )
         if common_lengths.max() > max(1e-9, 1e3 * np.finfo(end.dtype).eps) * end.max():
-            pairs.append((first_electrode, second_electrode))
-    return pairs
+            electrode_pairs.append((first_electrode, second_electrode))
+    return electrode_pairs
 
 
 def _arc_points(mesh: Mesh, centre: np.ndarray, width: float) -> np.ndarray:
     """Points (k, 2) of the arc of the boundary with length `width` in metres around the point nearest to `centre`."""
-    points, facets = np.asarray(mesh.points), np.asarray(mesh.facets)
-    edge_points = points[facets]
+    mesh_points, facets = np.asarray(mesh.points), np.asarray(mesh.facets)
+    edge_points = mesh_points[facets]
     edge_vectors = edge_points[:, 1] - edge_points[:, 0]
     squared_lengths = np.sum(edge_vectors**2, axis=1)
-    fraction = np.clip(np.sum((centre - edge_points[:, 0]) * edge_vectors, axis=1) / squared_lengths, 0, 1)
-    nearest_edge = np.argmin(np.sum((edge_points[:, 0] + fraction[:, None] * edge_vectors - centre) ** 2, axis=1))
+    fractions_along_edges = np.clip(np.sum((centre - edge_points[:, 0]) * edge_vectors, axis=1) / squared_lengths, 0, 1)
+    nearest_edge = np.argmin(
+        np.sum((edge_points[:, 0] + fractions_along_edges[:, None] * edge_vectors - centre) ** 2, axis=1)
+    )
     # The loop that contains this edge, as vertices with their arc length from the start of the loop.
-    loop = np.cumsum(np.concatenate([[0], facets[1:, 0] != facets[:-1, 1]]))
-    edges = np.flatnonzero(loop == loop[nearest_edge])
-    lengths = np.sqrt(squared_lengths[edges])
-    arc = np.concatenate([[0], np.cumsum(lengths)])
-    middle_position = arc[nearest_edge - edges[0]] + fraction[nearest_edge] * np.sqrt(squared_lengths[nearest_edge])
-    vertices = np.concatenate([edge_points[edges, 0], edge_points[edges[-1:], 1]])
+    loop_of_edge = np.cumsum(np.concatenate([[0], facets[1:, 0] != facets[:-1, 1]]))
+    edges_of_loop = np.flatnonzero(loop_of_edge == loop_of_edge[nearest_edge])
+    lengths_of_edges = np.sqrt(squared_lengths[edges_of_loop])
+    arc = np.concatenate([[0], np.cumsum(lengths_of_edges)])
+    middle_position = arc[nearest_edge - edges_of_loop[0]] + fractions_along_edges[nearest_edge] * np.sqrt(
+        squared_lengths[nearest_edge]
+    )
+    vertices = np.concatenate([edge_points[edges_of_loop, 0], edge_points[edges_of_loop[-1:], 1]])
     vertex_positions = np.concatenate([arc - arc[-1], arc, arc + arc[-1]])
     covered_positions = vertex_positions[
         (vertex_positions > middle_position - width / 2) & (vertex_positions < middle_position + width / 2)
@@ -214,30 +233,36 @@ def _project(position, mesh: Mesh):
     xp = namespace(position, mesh)
     corners = mesh.points[mesh.facets]
     edge_vectors = corners[:, 1] - corners[:, 0]
-    offset = position[:, None, :] - corners[:, 0]  # (L, b, 2)
-    clipped_fraction = xp.clip(_dot_products(offset, edge_vectors) / _dot_products(edge_vectors, edge_vectors), 0, 1)
-    perpendicular = offset - clipped_fraction[..., None] * edge_vectors
-    squared_distances = undifferentiated(_dot_products(perpendicular, perpendicular))
+    offset_from_edges = position[:, None, :] - corners[:, 0]  # (L, b, 2)
+    fraction_along_edges = xp.clip(
+        _dot_products(offset_from_edges, edge_vectors) / _dot_products(edge_vectors, edge_vectors), 0, 1
+    )
+    perpendicular_offset = offset_from_edges - fraction_along_edges[..., None] * edge_vectors
+    squared_distances = undifferentiated(_dot_products(perpendicular_offset, perpendicular_offset))
     facet = xp.argmin(squared_distances, axis=1)
     start_node, end_node = mesh.facets[facet].T
     previous_edge = xp.argmax(mesh.facets[:, 1] == start_node[:, None], axis=1)
     next_edge = xp.argmax(mesh.facets[:, 0] == end_node[:, None], axis=1)
     edge_vectors = edge_vectors[facet]
-    length = xp.sqrt(_dot_products(edge_vectors, edge_vectors))
+    edge_length = xp.sqrt(_dot_products(edge_vectors, edge_vectors))
     previous_edge, tangent, next_edge = (
         _normalised(corners[:, 1] - corners[:, 0])[index] for index in (previous_edge, facet, next_edge)
     )
     start_tangent, end_tangent = _normalised(previous_edge + tangent), _normalised(tangent + next_edge)
-    offset = position - corners[facet, 0]
+    offset_from_edges = position - corners[facet, 0]
     # (offset - t along)·τ(t) = 0 reads constant + linear t + quadratic t² = 0; take the root that is regular as
     # quadratic → 0.
-    constant = _dot_products(offset, start_tangent)
-    linear_coefficient = _dot_products(offset, end_tangent - start_tangent) - _dot_products(edge_vectors, start_tangent)
-    quadratic = -_dot_products(edge_vectors, end_tangent - start_tangent)
-    fraction = (
-        2 * constant / (xp.sqrt(xp.maximum(linear_coefficient**2 - 4 * quadratic * constant, 0)) - linear_coefficient)
+    constant_coefficient = _dot_products(offset_from_edges, start_tangent)
+    linear_coefficient = _dot_products(offset_from_edges, end_tangent - start_tangent) - _dot_products(
+        edge_vectors, start_tangent
     )
-    return facet, fraction * length, xp.sqrt(squared_distances.min(axis=1))
+    quadratic = -_dot_products(edge_vectors, end_tangent - start_tangent)
+    fraction_along_facet = (
+        2
+        * constant_coefficient
+        / (xp.sqrt(xp.maximum(linear_coefficient**2 - 4 * quadratic * constant_coefficient, 0)) - linear_coefficient)
+    )
+    return facet, fraction_along_facet * edge_length, xp.sqrt(squared_distances.min(axis=1))
 
 
 def _dot_products(first_vectors, second_vectors):
@@ -259,17 +284,17 @@ def _covered_intervals(position, width, mesh: Mesh):
     length starts.
     """
     xp = namespace(position, width, mesh)
-    length = facet_measures(mesh)
-    loop, arc_start = boundary_loops(mesh)
+    edge_length = facet_measures(mesh)
+    loop_of_edge, arc_start = boundary_loops(mesh)
     facet, arc_offset, _ = _project(position, mesh)
-    is_same_loop = loop[:, None] == loop[facet]  # (b, L)
-    perimeter = xp.sum(xp.where(is_same_loop, length[:, None], 0), axis=0)
+    is_same_loop = loop_of_edge[:, None] == loop_of_edge[facet]  # (b, L)
+    perimeter = xp.sum(xp.where(is_same_loop, edge_length[:, None], 0), axis=0)
     centre = arc_start[facet] + arc_offset
-    perimeter_offsets = np.array([-1.0, 0.0, 1.0], length.dtype)[:, None] * perimeter
+    perimeter_offsets = np.array([-1.0, 0.0, 1.0], edge_length.dtype)[:, None] * perimeter
     electrode_centres = (centre + perimeter_offsets)[:, None, :] - arc_start[:, None]
-    half_width, edge_lengths = 0.5 * width, length[:, None]
-    start, end = (
+    half_width, edge_lengths = 0.5 * width, edge_length[:, None]
+    covered_starts, covered_ends = (
         xp.clip(electrode_centres - half_width, 0, edge_lengths),
         xp.clip(electrode_centres + half_width, 0, edge_lengths),
     )
-    return xp.where(is_same_loop, start, 0), xp.where(is_same_loop, end, 0)
+    return xp.where(is_same_loop, covered_starts, 0), xp.where(is_same_loop, covered_ends, 0)

@@ -34,13 +34,15 @@ def triangle_quadrature(order: int = 5) -> tuple[np.ndarray, np.ndarray]:
 
     Exact for polynomials of degree 2·order - 1 (the collapsed-square rule; Stroud 1971).
     """
-    u, weight_u = np.polynomial.legendre.leggauss(order)
-    v, weight_v = roots_jacobi(order, 1, 0)
+    u, legendre_weights = np.polynomial.legendre.leggauss(order)
+    v, jacobi_weights = roots_jacobi(order, 1, 0)
     u, v = (u + 1) / 2, (v + 1) / 2
-    second = np.outer(1 - v, u).ravel()
+    second_coordinates = np.outer(1 - v, u).ravel()
     third_coordinates = np.repeat(v, order)
-    weights = np.outer(weight_v, weight_u).ravel()
-    return np.stack([1 - second - third_coordinates, second, third_coordinates], axis=1), weights / weights.sum()
+    quadrature_weights = np.outer(jacobi_weights, legendre_weights).ravel()
+    return np.stack(
+        [1 - second_coordinates - third_coordinates, second_coordinates, third_coordinates], axis=1
+    ), quadrature_weights / quadrature_weights.sum()
 
 
 def smooth_step(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -57,12 +59,12 @@ def nearest_electrodes(centres, position, radius) -> Int[Array, "q k"]:
     triangle is so much larger than the electrodes that `check` rejects the mesh. The indices have no derivatives.
     """
     xp = namespace(centres, position, radius)
-    distance = xp.sum((centres[:, None] - position) ** 2, axis=-1) - radius**2
-    distance = undifferentiated(distance).astype(np.float32)  # the order of distant ones does not matter
-    number = min(_MAX_DISCS_PER_TRIANGLE, len(radius))
+    power_distance = xp.sum((centres[:, None] - position) ** 2, axis=-1) - radius**2
+    power_distance = undifferentiated(power_distance).astype(np.float32)  # the order of distant ones does not matter
+    num_nearest = min(_MAX_DISCS_PER_TRIANGLE, len(radius))
     if xp is np:
-        return host.argsort(distance, axis=1, kind="stable")[:, :number]
-    return jax.lax.top_k(-distance, number)[1]
+        return host.argsort(power_distance, axis=1, kind="stable")[:, :num_nearest]
+    return jax.lax.top_k(-power_distance, num_nearest)[1]
 
 
 def window_contact(
@@ -78,12 +80,14 @@ def window_contact(
     `measure`: areas of the triangles; `window`: value of the window (0 to 1) of each electrode at each quadrature
     point; `electrode`: indices of k electrodes for each triangle.
     """
-    barycentric, weights = triangle_quadrature()
-    current = measure[:, None, None] * weights * window / contact_impedance[electrode][..., None]
-    products = (barycentric[:, :, None] * barycentric[:, None]).reshape(len(weights), -1)
-    mass = (current.sum(axis=1) @ products).reshape(-1, *2 * barycentric.shape[1:])
-    shape = num_points, contact_impedance.shape[0]
-    load = sum_into(shape, (nodes[:, None], electrode[..., None]), current @ barycentric)
+    barycentric_coordinates, quadrature_weights = triangle_quadrature()
+    current = measure[:, None, None] * quadrature_weights * window / contact_impedance[electrode][..., None]
+    basis_products = (barycentric_coordinates[:, :, None] * barycentric_coordinates[:, None]).reshape(
+        len(quadrature_weights), -1
+    )
+    mass = (current.sum(axis=1) @ basis_products).reshape(-1, *2 * barycentric_coordinates.shape[1:])
+    load_shape = num_points, contact_impedance.shape[0]
+    load = sum_into(load_shape, (nodes[:, None], electrode[..., None]), current @ barycentric_coordinates)
     return Contact((nodes,), (mass,), load)
 
 
@@ -153,12 +157,16 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
         """Contact integrals over the cells, by quadrature of the discs' windows."""
         xp = namespace(self, mesh)
         area = measures(mesh)
-        barycentric, _ = triangle_quadrature()
-        points = xp.einsum("pi,mid->mpd", barycentric, mesh.points[mesh.cells])
+        barycentric_coordinates, _ = triangle_quadrature()
+        quadrature_points = xp.einsum("pi,mid->mpd", barycentric_coordinates, mesh.points[mesh.cells])
         edge_width = RELATIVE_EDGE_HALF_WIDTH * xp.sqrt(area)
-        nearest_electrode = nearest_electrodes(points.mean(axis=1), self.position, self.radius)
-        window = disc_window(points, self.position[nearest_electrode], self.radius[nearest_electrode], edge_width)
-        return window_contact(mesh.cells, area, window, nearest_electrode, self.contact_impedance, mesh.num_points)
+        nearest_electrode = nearest_electrodes(quadrature_points.mean(axis=1), self.position, self.radius)
+        soft_disc_indicator = disc_window(
+            quadrature_points, self.position[nearest_electrode], self.radius[nearest_electrode], edge_width
+        )
+        return window_contact(
+            mesh.cells, area, soft_disc_indicator, nearest_electrode, self.contact_impedance, mesh.num_points
+        )
 
     def check(self, mesh: Mesh) -> None:
         """Raise `ValueError` for discs that lie off the sheet, overlap, or are too small for the mesh."""
@@ -211,16 +219,18 @@ class FaceDiscs(AbstractDiscs, AbstractMovableElectrodes):
         """Contact integrals over the boundary triangles, by quadrature of the discs' windows."""
         xp = namespace(self, mesh)
         area = facet_measures(mesh)
-        barycentric, _ = triangle_quadrature()
-        points = xp.einsum("pi,bid->bpd", barycentric, mesh.points[mesh.facets])
+        barycentric_coordinates, _ = triangle_quadrature()
+        quadrature_points = xp.einsum("pi,bid->bpd", barycentric_coordinates, mesh.points[mesh.facets])
         edge_width = RELATIVE_EDGE_HALF_WIDTH * xp.sqrt(area)
-        nearest_electrode = nearest_electrodes(points.mean(axis=1), self.position, self.radius)
-        window = disc_window(points, self.position[nearest_electrode], self.radius[nearest_electrode], edge_width)
-        is_reached = xp.take_along_axis(same_face(mesh, self.position, self.radius), nearest_electrode, axis=1)
+        nearest_electrode = nearest_electrodes(quadrature_points.mean(axis=1), self.position, self.radius)
+        soft_disc_indicator = disc_window(
+            quadrature_points, self.position[nearest_electrode], self.radius[nearest_electrode], edge_width
+        )
+        is_on_same_face = xp.take_along_axis(same_face(mesh, self.position, self.radius), nearest_electrode, axis=1)
         return window_contact(
             mesh.facets,
             area,
-            window * is_reached[..., None],
+            soft_disc_indicator * is_on_same_face[..., None],
             nearest_electrode,
             self.contact_impedance,
             mesh.num_points,
@@ -264,28 +274,32 @@ def check_discs(electrodes: AbstractDiscs, mesh: Mesh, area) -> None:
         return
     electrodes, mesh = on_host((electrodes, mesh))
     position, radius = electrodes.position, electrodes.radius
-    gaps = np.linalg.norm(position[:, None] - position, axis=-1) - radius[:, None] - radius
-    np.fill_diagonal(gaps, np.inf)
-    if gaps.min() < 0:
-        i, j = np.unravel_index(gaps.argmin(), gaps.shape)
-        raise ValueError(f"Electrodes {i + 1} and {j + 1} overlap by {-gaps.min():.3g} m; move them apart.")
+    gaps_between_discs = np.linalg.norm(position[:, None] - position, axis=-1) - radius[:, None] - radius
+    np.fill_diagonal(gaps_between_discs, np.inf)
+    if gaps_between_discs.min() < 0:
+        i, j = np.unravel_index(gaps_between_discs.argmin(), gaps_between_discs.shape)
+        raise ValueError(
+            f"Electrodes {i + 1} and {j + 1} overlap by {-gaps_between_discs.min():.3g} m; move them apart."
+        )
     covered_areas = electrodes.contact(mesh).load.sum(axis=0) * electrodes.contact_impedance
     for electrode in range(len(radius)):
         covered_fraction = covered_areas[electrode] / (np.pi * radius[electrode] ** 2)
-        label = f"electrode {electrode + 1} at {position[electrode].tolist()} m with radius {radius[electrode]:.3g} m"
+        electrode_label = (
+            f"electrode {electrode + 1} at {position[electrode].tolist()} m with radius {radius[electrode]:.3g} m"
+        )
         if covered_fraction < 0.01:
             raise ValueError(
-                f"position: {label} touches nothing; it lies off the mesh, which spans "
+                f"position: {electrode_label} touches nothing; it lies off the mesh, which spans "
                 f"{np.asarray(mesh.points).min(axis=0).tolist()} to {np.asarray(mesh.points).max(axis=0).tolist()} m, "
                 "or is far smaller than a cell."
             )
         if covered_fraction < 0.8:
             raise ValueError(
-                f"position: only {100 * covered_fraction:.0f} % of {label} lies on the mesh; move it inside, or refine "
-                "the mesh there if the disc is smaller than a cell."
+                f"position: only {100 * covered_fraction:.0f} % of {electrode_label} lies on the mesh; move it inside, "
+                "or refine the mesh there if the disc is smaller than a cell."
             )
         if covered_fraction > 1.2:
-            raise ValueError(f"radius: {label} is too small for the mesh there; refine the mesh around it.")
+            raise ValueError(f"radius: {electrode_label} is too small for the mesh there; refine the mesh around it.")
 
 
 # Minimum cosine of the angle between normals within a disc: the normal turns by one radian along a radius equal to the
@@ -337,28 +351,34 @@ class SurfaceDiscs(AbstractDiscs):
         """Contact integrals over the triangles, by quadrature of the discs' windows."""
         xp = namespace(self, mesh)
         area = measures(mesh)
-        barycentric, _ = triangle_quadrature()
+        barycentric_coordinates, _ = triangle_quadrature()
         corners = mesh.points[mesh.cells]
-        points = xp.einsum("pi,mid->mpd", barycentric, corners)
+        quadrature_points = xp.einsum("pi,mid->mpd", barycentric_coordinates, corners)
         edge_width = RELATIVE_EDGE_HALF_WIDTH * xp.sqrt(area)
-        cell_centres = points.mean(axis=1)
+        cell_centres = quadrature_points.mean(axis=1)
         nearest_electrode = nearest_electrodes(cell_centres, self.position, self.radius)
         longest_side = xp.sqrt(((corners - xp.roll(corners, 1, axis=1)) ** 2).sum(axis=-1).max(axis=1))
-        chart = unfold(mesh, self.position, self.radius[:, None] + edge_width + longest_side)
+        unfolded_surface = unfold(mesh, self.position, self.radius[:, None] + edge_width + longest_side)
         normal = xp.asarray(undifferentiated(normals(mesh)))
         centre = xp.argmin(undifferentiated(((self.position[:, None] - cell_centres) ** 2).sum(axis=-1)), axis=1)
         is_exact, is_facing = (
-            chart.exact[nearest_electrode],
+            unfolded_surface.exact[nearest_electrode],
             xp.take_along_axis(normal @ normal[centre].T, nearest_electrode, axis=1) > 0,
         )
-        is_covered = xp.where(is_exact, xp.take_along_axis(chart.reached.T, nearest_electrode, axis=1), is_facing)
+        is_covered = xp.where(
+            is_exact, xp.take_along_axis(unfolded_surface.reached.T, nearest_electrode, axis=1), is_facing
+        )
         squared_distance = xp.where(
             is_exact[..., None],
-            chart.squared(barycentric, nearest_electrode),
-            squared_distances(points, self.position[nearest_electrode]),
+            unfolded_surface.squared(barycentric_coordinates, nearest_electrode),
+            squared_distances(quadrature_points, self.position[nearest_electrode]),
         )
-        window = window_within(squared_distance, self.radius[nearest_electrode], edge_width) * is_covered[..., None]
-        return window_contact(mesh.cells, area, window, nearest_electrode, self.contact_impedance, mesh.num_points)
+        soft_disc_indicator = (
+            window_within(squared_distance, self.radius[nearest_electrode], edge_width) * is_covered[..., None]
+        )
+        return window_contact(
+            mesh.cells, area, soft_disc_indicator, nearest_electrode, self.contact_impedance, mesh.num_points
+        )
 
     def check(self, mesh: Mesh) -> None:
         """Raise `ValueError` for discs that lie off the surface, extend over its border, are as large as the surface's
@@ -381,23 +401,25 @@ def check_on_surface(position, radius, surface: Triangles) -> None:
     nearest_points = surface.nearest(position)
     border_distances = surface.distance_to_border(nearest_points.points)
     triangle_centres, normal = surface.corners.mean(axis=1), surface.normals
-    for number, (centre, disc_radius) in enumerate(zip(position, radius, strict=True)):
+    for electrode_index, (centre, disc_radius) in enumerate(zip(position, radius, strict=True)):
         x, y, z = 1e3 * centre
-        label = f"electrode {number + 1}, {2e3 * disc_radius:.3g} mm across at ({x:.4g}, {y:.4g}, {z:.4g}) mm,"
-        if nearest_points.away[number] > disc_radius:
+        electrode_label = (
+            f"electrode {electrode_index + 1}, {2e3 * disc_radius:.3g} mm across at ({x:.4g}, {y:.4g}, {z:.4g}) mm,"
+        )
+        if nearest_points.away[electrode_index] > disc_radius:
             raise ValueError(
-                f"position: {label} is {1e3 * nearest_points.away[number]:.3g} mm off the surface, farther than its "
-                "radius; move it onto the surface. Are both in metres?"
+                f"position: {electrode_label} is {1e3 * nearest_points.away[electrode_index]:.3g} mm off the surface, "
+                "farther than its radius; move it onto the surface. Are both in metres?"
             )
-        if border_distances[number] < 0.9 * disc_radius:
+        if border_distances[electrode_index] < 0.9 * disc_radius:
             raise ValueError(
-                f"position: {label} lies on the surface's edge, {1e3 * border_distances[number]:.3g} mm from it; "
-                "move it inside."
+                f"position: {electrode_label} lies on the surface's edge, "
+                f"{1e3 * border_distances[electrode_index]:.3g} mm from it; move it inside."
             )
-        is_inside = np.linalg.norm(triangle_centres - nearest_points.points[number], axis=1) < disc_radius
-        normal_cosines = normal[is_inside] @ normal[nearest_points.triangle[number]]
+        is_inside = np.linalg.norm(triangle_centres - nearest_points.points[electrode_index], axis=1) < disc_radius
+        normal_cosines = normal[is_inside] @ normal[nearest_points.triangle[electrode_index]]
         if (np.abs(normal_cosines) < _MIN_NORMAL_COSINE).any():
             raise ValueError(
-                f"radius: {label} is larger than the surface's radius of curvature there; a disc so large is "
+                f"radius: {electrode_label} is larger than the surface's radius of curvature there; a disc so large is "
                 "no disc, give less."
             )

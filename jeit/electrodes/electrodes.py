@@ -166,8 +166,8 @@ def replace_contact_impedance(
 ) -> AbstractCompleteElectrodes:
     """Copy electrodes with a new `contact_impedance`, one number or (L,). Raises `ValueError` for values that are not
     positive."""
-    values = as_electrode_values("contact_impedance", contact_impedance, electrodes.num_electrodes, unit="ohm·m²")
-    return eqx.tree_at(lambda complete_electrodes: complete_electrodes.contact_impedance, electrodes, values)
+    impedances = as_electrode_values("contact_impedance", contact_impedance, electrodes.num_electrodes, unit="ohm·m²")
+    return eqx.tree_at(lambda complete_electrodes: complete_electrodes.contact_impedance, electrodes, impedances)
 
 
 def as_electrode_values(name: str, values, num_electrodes: int, *, unit: str) -> Float[Array, " L"]:
@@ -185,12 +185,12 @@ def as_electrode_values(name: str, values, num_electrodes: int, *, unit: str) ->
         )
     if not has_values(values):
         return jnp.broadcast_to(values, (num_electrodes,))
-    is_invalid = ~(np.isfinite(values) & (np.asarray(values) > 0))
-    if is_invalid.any():
-        first_index = int(np.flatnonzero(np.atleast_1d(is_invalid))[0])
+    is_invalid_value = ~(np.isfinite(values) & (np.asarray(values) > 0))
+    if is_invalid_value.any():
+        first_invalid_index = int(np.flatnonzero(np.atleast_1d(is_invalid_value))[0])
         raise ValueError(
-            f"{name} must be positive and finite, in {unit}; electrode {first_index + 1} has "
-            f"{float(np.atleast_1d(values)[first_index])}."
+            f"{name} must be positive and finite, in {unit}; electrode {first_invalid_index + 1} has "
+            f"{float(np.atleast_1d(values)[first_invalid_index])}."
         )
     return as_array(np.broadcast_to(values, (num_electrodes,)))
 
@@ -205,8 +205,8 @@ def as_positions(position, dimensions: tuple[int, ...]) -> Float[Array, "L d"]:
             f"position has shape {position.shape}; give one row per electrode, {allowed_shapes}, in metres."
         )
     if has_values(position) and not np.isfinite(position).all():
-        rows = np.flatnonzero(~np.isfinite(position).all(axis=1)) + 1
-        raise ValueError(f"position has NaN or infinite coordinates at electrodes {rows.tolist()}.")
+        nonfinite_rows = np.flatnonzero(~np.isfinite(position).all(axis=1)) + 1
+        raise ValueError(f"position has NaN or infinite coordinates at electrodes {nonfinite_rows.tolist()}.")
     return position
 
 

@@ -74,15 +74,19 @@ def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int | None
 
     if not isinstance(electrodes, FacePatches):
         return body.mesh(num_points=num_points, refine=electrodes.refinement(body) or None)
-    outline, height = body.outline, float(body.thickness)
+    body_outline, body_height = body.outline, float(body.thickness)
     positions = np.asarray(electrodes.position)
     half_sizes = np.stack([np.asarray(electrodes.width), np.asarray(electrodes.height)], axis=1) / 2
-    x_min, x_max, y_min, y_max = outline.extent
-    tolerance = _FACE_TOLERANCE * max(x_max - x_min, y_max - y_min, height)
-    is_horizontal = (np.abs(positions[:, 2]) < tolerance) | (np.abs(positions[:, 2] - height) < tolerance)
+    x_min, x_max, y_min, y_max = body_outline.extent
+    face_tolerance = _FACE_TOLERANCE * max(x_max - x_min, y_max - y_min, body_height)
+    is_horizontal = (np.abs(positions[:, 2]) < face_tolerance) | (
+        np.abs(positions[:, 2] - body_height) < face_tolerance
+    )
     vertical_ends = positions[~is_horizontal, 2, None] + half_sizes[~is_horizontal, 1:] * np.array([-1.0, 1.0])
-    if isinstance(outline, Rectangle):
-        is_on_x_wall = (np.abs(positions[:, 0] - x_min) < tolerance) | (np.abs(positions[:, 0] - x_max) < tolerance)
+    if isinstance(body_outline, Rectangle):
+        is_on_x_wall = (np.abs(positions[:, 0] - x_min) < face_tolerance) | (
+            np.abs(positions[:, 0] - x_max) < face_tolerance
+        )
         electrode_ends_x = _electrode_ends(positions[:, 0], half_sizes[:, 0], is_horizontal | ~is_on_x_wall)
         electrode_ends_y = np.concatenate(
             [
@@ -90,12 +94,17 @@ def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int | None
                 _electrode_ends(positions[:, 1], half_sizes[:, 0], is_on_x_wall & ~is_horizontal),
             ]
         )
-        return graded_box(outline, height, (electrode_ends_x, electrode_ends_y, vertical_ends.ravel()), num_points)
+        return graded_box(
+            body_outline, body_height, (electrode_ends_x, electrode_ends_y, vertical_ends.ravel()), num_points
+        )
     rim_points = [
         np.zeros((0, 2)),
-        *(_rim_points(outline, *patch) for patch in zip(positions, half_sizes, is_horizontal, strict=True)),
+        *(
+            _rim_points(body_outline, *patch_geometry)
+            for patch_geometry in zip(positions, half_sizes, is_horizontal, strict=True)
+        ),
     ]
-    return graded_layers(outline, height, vertical_ends.ravel(), np.concatenate(rim_points), num_points)
+    return graded_layers(body_outline, body_height, vertical_ends.ravel(), np.concatenate(rim_points), num_points)
 
 
 def _electrode_ends(
@@ -111,13 +120,15 @@ def _rim_points(outline, centre, half_size, is_horizontal: bool) -> Float[np.nda
     ends of an electrode on a wall."""
     if is_horizontal:
         angle = 2 * np.pi * np.arange(_NUM_RIM_POINTS) / _NUM_RIM_POINTS
-        circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        unit_circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         # For a rectangle, the points where rays from its centre meet its sides.
-        return centre[:2] + circle * half_size / np.abs(circle).max(axis=1, keepdims=True)
-    nearest_point = np.asarray(outline.nearest(centre[None, :2]))[0]
-    step = 1e-3 * half_size[0]
-    moved_points = np.asarray(outline.nearest(nearest_point + step * np.eye(2)))
-    tangent = (moved_points - nearest_point)[np.argmax(np.linalg.norm(moved_points - nearest_point, axis=1))]
+        return centre[:2] + unit_circle * half_size / np.abs(unit_circle).max(axis=1, keepdims=True)
+    nearest_outline_point = np.asarray(outline.nearest(centre[None, :2]))[0]
+    step_length = 1e-3 * half_size[0]
+    stepped_outline_points = np.asarray(outline.nearest(nearest_outline_point + step_length * np.eye(2)))
+    tangent = (stepped_outline_points - nearest_outline_point)[
+        np.argmax(np.linalg.norm(stepped_outline_points - nearest_outline_point, axis=1))
+    ]
     tangent = tangent / np.linalg.norm(tangent)
     return np.asarray(
         outline.nearest(np.stack([centre[:2] - half_size[0] * tangent, centre[:2] + half_size[0] * tangent]))
@@ -135,16 +146,16 @@ def check_on_surface(
 ) -> None:
     """Raise `ValueError` for the first electrode whose distance from the surface of the body exceeds `max_distances`
     metres. `distance_from_surface`: function that returns the distances (L,) of positions (L, 3), metres."""
-    distances = distance_from_surface(position)
-    for number in np.flatnonzero(distances > max_distances)[:1]:
-        remedy = "give a place on it."
+    distances_from_surface = distance_from_surface(position)
+    for electrode_index in np.flatnonzero(distances_from_surface > max_distances)[:1]:
+        advice_to_user = "give a place on it."
         if _all_on_surface(position / 1000, max_distances, distance_from_surface):
-            remedy = MILLIMETRE_HINT
+            advice_to_user = MILLIMETRE_HINT
         elif _all_on_surface(position * 1000, 1000 * max_distances, distance_from_surface):
-            remedy = "is the mesh in millimetres? Read it with scale = 1e-3."
+            advice_to_user = "is the mesh in millimetres? Read it with scale = 1e-3."
         raise ValueError(
-            f"position: electrode {number + 1} at {np.round(position[number], 6).tolist()} m lies "
-            f"{_length_text(float(distances[number]))} off the body's surface; {remedy}"
+            f"position: electrode {electrode_index + 1} at {np.round(position[electrode_index], 6).tolist()} m lies "
+            f"{_length_text(float(distances_from_surface[electrode_index]))} off the body's surface; {advice_to_user}"
         )
 
 
@@ -160,9 +171,11 @@ def _all_on_surface(position, max_distances, distance_from_surface: DistanceFunc
 def check_no_coincidence(position: Float[np.ndarray, "L 3"], size: Float[np.ndarray, " L"]) -> None:
     """Raise `ValueError` for the first two electrodes at the same position. `size`: smaller dimension of each
     electrode, metres."""
-    distances = np.linalg.norm(position[:, None] - position, axis=-1)
-    coincident = np.argwhere(np.triu(distances < _MIN_SEPARATION * np.minimum(size[:, None], size), 1))
-    for first_electrode, second_electrode in coincident[:1]:
+    distances_between_electrodes = np.linalg.norm(position[:, None] - position, axis=-1)
+    coincident_electrodes = np.argwhere(
+        np.triu(distances_between_electrodes < _MIN_SEPARATION * np.minimum(size[:, None], size), 1)
+    )
+    for first_electrode, second_electrode in coincident_electrodes[:1]:
         raise ValueError(
             f"position: electrodes {first_electrode + 1} and {second_electrode + 1} are at the same place, "
             f"{np.round(position[first_electrode], 6).tolist()} m; give each its own."
@@ -172,11 +185,15 @@ def check_no_coincidence(position: Float[np.ndarray, "L 3"], size: Float[np.ndar
 def check_size(name: str, sizes: Float[np.ndarray, " L"], max_size: float, object_name: str) -> None:
     """Raise `ValueError` with the argument's `name` for the first electrode larger than `max_size` metres, the size of
     the object that the electrode lies on; `object_name` names this object."""
-    for number in np.flatnonzero(sizes > (1 + _MIN_SEPARATION) * max_size)[:1]:
-        size = float(sizes[number])
-        unit_hint = MILLIMETRE_HINT if 10 * max_size < size <= 1000 * max_size else "give the size of what lies on it."
+    for electrode_index in np.flatnonzero(sizes > (1 + _MIN_SEPARATION) * max_size)[:1]:
+        electrode_size = float(sizes[electrode_index])
+        unit_hint = (
+            MILLIMETRE_HINT
+            if 10 * max_size < electrode_size <= 1000 * max_size
+            else "give the size of what lies on it."
+        )
         raise ValueError(
-            f"{name}: electrode {number + 1}'s is {_length_text(size)}, larger than {object_name}, "
+            f"{name}: electrode {electrode_index + 1}'s is {_length_text(electrode_size)}, larger than {object_name}, "
             f"{_length_text(max_size)}; {unit_hint}"
         )
 
@@ -184,16 +201,22 @@ def check_size(name: str, sizes: Float[np.ndarray, " L"], max_size: float, objec
 def check_placed(electrodes: AbstractMovableElectrodes, mesh: Mesh) -> None:
     """Raise `ValueError` for rectangular electrodes that lie off the surface of the mesh, or are larger than the
     surface."""
-    sizes = {name: np.asarray(value) for name, value in electrodes.geometry().items() if name in ("width", "height")}
-    points = np.asarray(mesh.points)
+    electrode_sizes = {
+        name: np.asarray(geometry_value)
+        for name, geometry_value in electrodes.geometry().items()
+        if name in ("width", "height")
+    }
+    mesh_points = np.asarray(mesh.points)
     from jeit.mesh.geodesic import Triangles
 
-    surface = Triangles(points, np.asarray(mesh.facets))
-    half_size = np.maximum(*sizes.values()) / 2
-    check_on_surface(np.asarray(electrodes.position), half_size, lambda places: surface.nearest(places).away)
-    diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
-    for name, size in sizes.items():
-        check_size(name, size, diagonal, "the body")
+    surface = Triangles(mesh_points, np.asarray(mesh.facets))
+    half_size = np.maximum(*electrode_sizes.values()) / 2
+    check_on_surface(
+        np.asarray(electrodes.position), half_size, lambda positions_to_check: surface.nearest(positions_to_check).away
+    )
+    diagonal = float(np.linalg.norm(np.ptp(mesh_points, axis=0)))
+    for name, sizes_along_axis in electrode_sizes.items():
+        check_size(name, sizes_along_axis, diagonal, "the body")
 
 
 def _length_text(metres: float) -> str:
@@ -247,10 +270,12 @@ class FacePatches(AbstractMovableElectrodes):
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Draw electrodes on horizontal faces as rectangles, all others as dots."""
         positions, is_flat = np.asarray(self.position), is_undistorted_from_above(mesh, self.position)
-        sizes = np.asarray(self.width), np.asarray(self.height)
-        for position, width, height, is_undistorted in zip(positions, *sizes, is_flat, strict=True):
+        electrode_sizes = np.asarray(self.width), np.asarray(self.height)
+        for position, electrode_width, electrode_height, is_undistorted in zip(
+            positions, *electrode_sizes, is_flat, strict=True
+        ):
             if is_undistorted:
-                pen.rectangle(position, width, height)
+                pen.rectangle(position, electrode_width, electrode_height)
             else:
                 pen.dot(position)
 
@@ -272,23 +297,26 @@ class FacePatches(AbstractMovableElectrodes):
         normals of the patches."""
         xp = namespace(self, mesh)
         area, half_size = facet_measures(mesh), xp.stack([self.width, self.height], axis=-1) / 2
-        normal, tangent, upward = tangent_frames(mesh, self.position)
+        normal, tangent, upward_direction = tangent_frames(mesh, self.position)
         corners = mesh.points[mesh.facets]
-        nearest_indices, is_reached = _reaching_patches(mesh, self.position, half_size, (normal, tangent, upward))
-        reached_facets = is_reached.any(axis=1).nonzero()[0] if xp is np else np.arange(len(area))
-        nearest_indices, is_reached = nearest_indices[reached_facets], is_reached[reached_facets]
-        offset = corners[reached_facets][:, None] - self.position[nearest_indices][:, :, None]  # (q, k, 3, 3)
+        nearest_indices, is_facet_reached = _reaching_patches(
+            mesh, self.position, half_size, (normal, tangent, upward_direction)
+        )
+        reached_facets = is_facet_reached.any(axis=1).nonzero()[0] if xp is np else np.arange(len(area))
+        nearest_indices, is_facet_reached = nearest_indices[reached_facets], is_facet_reached[reached_facets]
+        corner_offsets = corners[reached_facets][:, None] - self.position[nearest_indices][:, :, None]  # (q, k, 3, 3)
         corner_coordinates = xp.stack(
-            [(offset * axis[nearest_indices][:, :, None]).sum(axis=-1) for axis in (tangent, upward)], axis=-1
+            [(corner_offsets * axis[nearest_indices][:, :, None]).sum(axis=-1) for axis in (tangent, upward_direction)],
+            axis=-1,
         )
         # A triangle perpendicular to the patch has no projected area; replace it to avoid a division by zero.
-        corner_coordinates = xp.where(is_reached[..., None, None], corner_coordinates, _UNIT_TRIANGLE)
+        corner_coordinates = xp.where(is_facet_reached[..., None, None], corner_coordinates, _UNIT_TRIANGLE)
         covered_area, covered_mass = covered_moments(corner_coordinates, half_size[nearest_indices])
-        current = xp.where(is_reached, area[reached_facets][:, None] / self.contact_impedance[nearest_indices], 0)
+        current = xp.where(is_facet_reached, area[reached_facets][:, None] / self.contact_impedance[nearest_indices], 0)
         mass = (current[..., None, None] * covered_mass).sum(axis=1)
         nodes = mesh.facets[reached_facets]
-        shape = mesh.num_points, self.num_electrodes
-        load = sum_into(shape, (nodes[:, None], nearest_indices[..., None]), current[..., None] * covered_area)
+        load_shape = mesh.num_points, self.num_electrodes
+        load = sum_into(load_shape, (nodes[:, None], nearest_indices[..., None]), current[..., None] * covered_area)
         if xp is np:
             masses_of_all_patches: Any = np.zeros((len(area), 3, 3), mass.dtype)
             masses_of_all_patches[reached_facets] = mass
@@ -314,10 +342,12 @@ class FacePatches(AbstractMovableElectrodes):
                 f"{misplaced_electrodes[0] + 1}'s area is found on the mesh's surface; move it onto the surface, or "
                 "refine the mesh there if the patch is smaller than a facet."
             )
-        overlap = (covered_areas.T @ covered_areas) / np.sqrt(np.outer(*(2 * [(covered_areas**2).sum(axis=0)])))
-        np.fill_diagonal(overlap, 0)
-        if overlap.max() > 0.2:
-            first_electrode, second_electrode = np.unravel_index(overlap.argmax(), overlap.shape)
+        relative_overlap = (covered_areas.T @ covered_areas) / np.sqrt(
+            np.outer(*(2 * [(covered_areas**2).sum(axis=0)]))
+        )
+        np.fill_diagonal(relative_overlap, 0)
+        if relative_overlap.max() > 0.2:
+            first_electrode, second_electrode = np.unravel_index(relative_overlap.argmax(), relative_overlap.shape)
             raise ValueError(f"Electrodes {first_electrode + 1} and {second_electrode + 1} overlap; move them apart.")
 
 
@@ -332,15 +362,17 @@ def _reaching_patches(mesh: Mesh, position, half_size, frames):
     corners = mesh.points[mesh.facets]
     centres = corners.mean(axis=1)
     radius = xp.sqrt(((corners - centres[:, None]) ** 2).sum(axis=-1).max(axis=1))
-    offsets = [centres @ axis.T - (position * axis).sum(axis=1) for axis in frames]
-    excess_distances = [xp.maximum(abs(offsets[1 + i]) - half_size[:, i], 0) for i in range(2)]
-    is_facing = (facet_normals(mesh) @ frames[0].T > 0.5) & (abs(offsets[0]) < half_size.max(axis=1))
-    distance = undifferentiated(xp.where(is_facing, excess_distances[0] ** 2 + excess_distances[1] ** 2, xp.inf))
-    is_reached = distance <= undifferentiated(radius**2)[:, None]
-    count = min(_MAX_PATCHES_PER_TRIANGLE, len(position))
+    offsets_along_axes = [centres @ axis.T - (position * axis).sum(axis=1) for axis in frames]
+    excess_distances = [xp.maximum(abs(offsets_along_axes[1 + i]) - half_size[:, i], 0) for i in range(2)]
+    is_facing = (facet_normals(mesh) @ frames[0].T > 0.5) & (abs(offsets_along_axes[0]) < half_size.max(axis=1))
+    squared_distance = undifferentiated(
+        xp.where(is_facing, excess_distances[0] ** 2 + excess_distances[1] ** 2, xp.inf)
+    )
+    is_facet_reached = squared_distance <= undifferentiated(radius**2)[:, None]
+    num_nearest_patches = min(_MAX_PATCHES_PER_TRIANGLE, len(position))
     if xp is np:
-        count = max(1, min(count, int(is_reached.sum(axis=1).max(initial=0))))
-        nearest_indices = np.argsort(distance, axis=1, kind="stable")[:, :count]
+        num_nearest_patches = max(1, min(num_nearest_patches, int(is_facet_reached.sum(axis=1).max(initial=0))))
+        nearest_indices = np.argsort(squared_distance, axis=1, kind="stable")[:, :num_nearest_patches]
     else:
-        nearest_indices = jax.lax.top_k(-distance, count)[1]
-    return nearest_indices, xp.take_along_axis(is_reached, nearest_indices, axis=1)
+        nearest_indices = jax.lax.top_k(-squared_distance, num_nearest_patches)[1]
+    return nearest_indices, xp.take_along_axis(is_facet_reached, nearest_indices, axis=1)

@@ -62,13 +62,15 @@ def same_face(mesh: Mesh, position: Float[Array, "L 3"], radius: Float[Array, " 
     is rotated by 2 arcsin(r / 2R); for r = R the distance is r / 2 and the angle 60°. The matrix has no derivatives.
     """
     normal, corner = facet_normals(mesh), mesh.points[mesh.facets[:, 0]]
-    height = abs(normal @ position.T - (normal * corner).sum(axis=1)[:, None])
+    height_above_facet = abs(normal @ position.T - (normal * corner).sum(axis=1)[:, None])
     # Near an edge of the body the nearest triangle may lie on the adjacent face; its plane, however, is far from the
     # position.
-    facet_below_electrode = nearest_facets(mesh, position, 100 * height.T**2)
+    facet_below_electrode = nearest_facets(mesh, position, 100 * height_above_facet.T**2)
     normal_cosine = normal @ normal[facet_below_electrode].T
-    is_on_curved_face = (height < 0.55 * radius) & (normal_cosine > 0.45)
-    return undifferentiated((height < 0.2 * radius) & (normal_cosine > -0.5) | is_on_curved_face).astype(position.dtype)
+    is_on_curved_face = (height_above_facet < 0.55 * radius) & (normal_cosine > 0.45)
+    return undifferentiated((height_above_facet < 0.2 * radius) & (normal_cosine > -0.5) | is_on_curved_face).astype(
+        position.dtype
+    )
 
 
 def nearest_facets(
@@ -91,8 +93,10 @@ def tangent_frames(mesh: Mesh, position):
     xp = namespace(mesh, position)
     normal = facet_normals(mesh)[nearest_facets(mesh, position)]
     is_horizontal = abs(normal[:, 2:]) > 0.9
-    upward = xp.where(is_horizontal, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])).astype(normal.dtype)
-    tangent = xp.cross(upward, normal)
+    upward_direction = xp.where(is_horizontal, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])).astype(
+        normal.dtype
+    )
+    tangent = xp.cross(upward_direction, normal)
     tangent = tangent / xp.linalg.norm(tangent, axis=1, keepdims=True)
     return tuple(map(undifferentiated, (normal, tangent, xp.cross(normal, tangent))))
 
@@ -108,44 +112,57 @@ def covered_moments(
     """
     if namespace(corners, half_size) is not np:
         return _clipped_moments(corners, half_size)
-    limits = np.broadcast_to(half_size, (*corners.shape[:-2], 2))[..., None, :]
-    is_inside = (abs(corners) <= limits).all(axis=(-1, -2))
-    is_beyond_a_side = ((corners >= limits).all(axis=-2) | (corners <= -limits).all(axis=-2)).any(axis=-1)
-    mass: Any = np.where(is_inside[..., None, None], (1 + np.eye(3)) / 12, 0).astype(corners.dtype)
-    is_partly_covered = ~(is_inside | is_beyond_a_side)
-    mass[is_partly_covered] = _clipped_moments(corners[is_partly_covered], limits[is_partly_covered][..., 0, :])[1]
+    half_size_limits = np.broadcast_to(half_size, (*corners.shape[:-2], 2))[..., None, :]
+    is_wholly_covered = (abs(corners) <= half_size_limits).all(axis=(-1, -2))
+    is_beyond_a_side = ((corners >= half_size_limits).all(axis=-2) | (corners <= -half_size_limits).all(axis=-2)).any(
+        axis=-1
+    )
+    mass: Any = np.where(is_wholly_covered[..., None, None], (1 + np.eye(3)) / 12, 0).astype(corners.dtype)
+    is_partly_covered = ~(is_wholly_covered | is_beyond_a_side)
+    mass[is_partly_covered] = _clipped_moments(
+        corners[is_partly_covered], half_size_limits[is_partly_covered][..., 0, :]
+    )[1]
     return mass.sum(axis=-1), mass
 
 
 def _clipped_moments(corners, half_size):
     """Results of `covered_moments`, by clipping every triangle to its rectangle."""
     xp = namespace(corners, half_size)
-    outline = corners
+    clipped_outline = corners
     for axis in range(2):
-        outline = _clip_to_band(outline, axis, half_size[..., axis])
+        clipped_outline = _clip_to_band(clipped_outline, axis, half_size[..., axis])
     # Barycentric coordinates of the second and third corner, in which the triangle is (0, 0), (1, 0), (0, 1).
     first_sides, second_sides = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
-    offset = outline - corners[..., :1, :]
+    offset_from_corner = clipped_outline - corners[..., :1, :]
     double_area = _cross_product(first_sides, second_sides)[..., None]
-    coordinates = xp.stack(
-        [_cross_product(offset, second_sides[..., None, :]), _cross_product(first_sides[..., None, :], offset)], axis=-1
+    triangle_coordinates = xp.stack(
+        [
+            _cross_product(offset_from_corner, second_sides[..., None, :]),
+            _cross_product(first_sides[..., None, :], offset_from_corner),
+        ],
+        axis=-1,
     )
-    coordinates = coordinates / double_area[..., None]
-    next_coordinates = xp.roll(coordinates, -1, axis=-2)
+    triangle_coordinates = triangle_coordinates / double_area[..., None]
+    next_coordinates = xp.roll(triangle_coordinates, -1, axis=-2)
     # Signed areas of a fan of triangles from the first corner, doubled, since the area of the reference triangle is
     # 1/2.
-    fan_areas = _cross_product(coordinates, next_coordinates)
-    barycentric = [
-        xp.concatenate([1 - point.sum(axis=-1, keepdims=True), point], axis=-1)
-        for point in (coordinates, next_coordinates)
+    fan_areas = _cross_product(triangle_coordinates, next_coordinates)
+    barycentric_coordinates = [
+        xp.concatenate([1 - outline_points.sum(axis=-1, keepdims=True), outline_points], axis=-1)
+        for outline_points in (triangle_coordinates, next_coordinates)
     ]
-    barycentric_sum = barycentric[0] + barycentric[1] + np.array([1.0, 0.0, 0.0]).astype(coordinates.dtype)
+    barycentric_sum = (
+        barycentric_coordinates[0]
+        + barycentric_coordinates[1]
+        + np.array([1.0, 0.0, 0.0]).astype(triangle_coordinates.dtype)
+    )
     mass = sum(
-        xp.einsum("...k,...ki,...kj->...ij", fan_areas, point, point) for point in (barycentric_sum, *barycentric)
+        xp.einsum("...k,...ki,...kj->...ij", fan_areas, outline_points, outline_points)
+        for outline_points in (barycentric_sum, *barycentric_coordinates)
     )
     corner = np.zeros((3, 3))
     corner[0, 0] = 1
-    mass = (mass + fan_areas.sum(axis=-1)[..., None, None] * corner.astype(coordinates.dtype)) / 12
+    mass = (mass + fan_areas.sum(axis=-1)[..., None, None] * corner.astype(triangle_coordinates.dtype)) / 12
     # For triangles that are barely touched, only rounding errors remain, which small contact impedances would amplify:
     # set the value to zero, but keep its derivative. The load is computed as the sum of the mass, since for small
     # contact impedances any difference between load and mass would drive currents.
@@ -158,14 +175,16 @@ def _clip_to_band(outline: Float[Array, "*q k 2"], axis: int, half_width: Float[
     """Move the parts of closed polygons (…, k, 2) beyond ± `half_width` along an axis to ± `half_width`; each corner
     becomes three."""
     xp = namespace(outline, half_width)
-    step = xp.roll(outline, -1, axis=-2) - outline
-    axis_steps, half_width = step[..., axis], half_width[..., None]
-    slope = xp.where(axis_steps == 0, 1, axis_steps)
-    crossing_fractions = [xp.clip((side * half_width - outline[..., axis]) / slope, 0, 1) for side in (-1, 1)]
-    fractions = xp.stack(
+    outline_sides = xp.roll(outline, -1, axis=-2) - outline
+    axis_steps, half_width = outline_sides[..., axis], half_width[..., None]
+    nonzero_axis_steps = xp.where(axis_steps == 0, 1, axis_steps)
+    crossing_fractions = [
+        xp.clip((band_sign * half_width - outline[..., axis]) / nonzero_axis_steps, 0, 1) for band_sign in (-1, 1)
+    ]
+    crossing_fractions_in_order = xp.stack(
         [xp.zeros_like(axis_steps), xp.minimum(*crossing_fractions), xp.maximum(*crossing_fractions)], axis=-1
     )
-    corners = outline[..., None, :] + fractions[..., None] * step[..., None, :]
+    corners = outline[..., None, :] + crossing_fractions_in_order[..., None] * outline_sides[..., None, :]
     corners = corners.reshape(*corners.shape[:-3], 3 * corners.shape[-3], 2)  # also if there are no triangles
     clipped_coordinates = xp.clip(corners[..., axis], -half_width, half_width)
     other_coordinate = corners[..., 1 - axis]
@@ -202,7 +221,7 @@ class FacetElectrodes(AbstractCompleteElectrodes):
         if not facets:
             raise ValueError("facets is empty; give one list of facet indices for each electrode.")
         num_facets = mesh.facets.shape[0]
-        covers = np.zeros((num_facets, len(facets)))
+        covered_fractions = np.zeros((num_facets, len(facets)))
         for electrode, indices in enumerate(facets):
             indices = np.asarray(indices)
             if indices.size == 0 or not np.issubdtype(indices.dtype, np.integer):
@@ -212,14 +231,15 @@ class FacetElectrodes(AbstractCompleteElectrodes):
                     f"facets: electrode {electrode + 1} names facet {int(indices.max())}, and the mesh has "
                     f"{num_facets} boundary facets, counted from 0."
                 )
-            covers[indices, electrode] = 1
-        shared = np.flatnonzero(covers.sum(axis=1) > 1)
-        if shared.size:
-            first_electrode, second_electrode = np.flatnonzero(covers[shared[0]])[:2] + 1
+            covered_fractions[indices, electrode] = 1
+        shared_facets = np.flatnonzero(covered_fractions.sum(axis=1) > 1)
+        if shared_facets.size:
+            first_electrode, second_electrode = np.flatnonzero(covered_fractions[shared_facets[0]])[:2] + 1
             raise ValueError(
-                f"Electrodes {first_electrode} and {second_electrode} overlap: both cover boundary facet {shared[0]}."
+                f"Electrodes {first_electrode} and {second_electrode} overlap: both cover boundary facet "
+                f"{shared_facets[0]}."
             )
-        self.covers = jnp.asarray(covers)
+        self.covers = jnp.asarray(covered_fractions)
         self.contact_impedance = as_electrode_values(
             "contact_impedance", contact_impedance, len(facets), unit="ohm·m² (ohm·m in 2-D)"
         )
@@ -235,11 +255,11 @@ class FacetElectrodes(AbstractCompleteElectrodes):
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Draw the facets of a plane mesh; for a solid, a dot in the middle of each electrode."""
-        end_points, covers = np.asarray(mesh.points)[np.asarray(mesh.facets)], np.asarray(self.covers)
-        centres = covers.T @ end_points.mean(axis=1) / covers.sum(axis=0)[:, None]
-        for covered, centre in zip(covers.T, centres, strict=True):
+        end_points, covered_fractions = np.asarray(mesh.points)[np.asarray(mesh.facets)], np.asarray(self.covers)
+        centres = covered_fractions.T @ end_points.mean(axis=1) / covered_fractions.sum(axis=0)[:, None]
+        for fractions_of_electrode, centre in zip(covered_fractions.T, centres, strict=True):
             if mesh.dimension == 2:
-                pen.lines(list(end_points[covered > 0]), centre)
+                pen.lines(list(end_points[fractions_of_electrode > 0]), centre)
             else:
                 pen.dot(centre)
 
@@ -257,13 +277,13 @@ class FacetElectrodes(AbstractCompleteElectrodes):
         1))."""
         xp = namespace(self, mesh)
         d = mesh.dimension
-        measure = facet_measures(mesh)
-        admittance = self.covers / self.contact_impedance  # (b, L)
-        pairs = (np.ones((d, d)) + np.eye(d)).astype(measure.dtype) / (d * (d + 1))
-        mass = (measure * admittance.sum(axis=1))[:, None, None] * pairs
-        current = (measure[:, None] * admittance / d)[:, None, :]
-        shape = mesh.num_points, self.num_electrodes
-        load = sum_into(shape, mesh.facets, xp.broadcast_to(current, (*mesh.facets.shape, shape[1])))
+        facet_measure = facet_measures(mesh)
+        admittance_per_area = self.covers / self.contact_impedance  # (b, L)
+        unit_mass_matrix = (np.ones((d, d)) + np.eye(d)).astype(facet_measure.dtype) / (d * (d + 1))
+        mass = (facet_measure * admittance_per_area.sum(axis=1))[:, None, None] * unit_mass_matrix
+        current = (facet_measure[:, None] * admittance_per_area / d)[:, None, :]
+        load_shape = mesh.num_points, self.num_electrodes
+        load = sum_into(load_shape, mesh.facets, xp.broadcast_to(current, (*mesh.facets.shape, load_shape[1])))
         return Contact((mesh.facets,), (mass,), load)
 
     def check(self, mesh: Mesh) -> None:
@@ -293,12 +313,14 @@ def plates(mesh: Mesh, tags: Sequence[str], contact_impedance: ArrayLike) -> Fac
     electrodes = plates(solid, ["left", "right"], 0.01)
     ```
     """
-    for tag in tags:
-        if tag not in mesh.tags:
+    for surface_tag in tags:
+        if surface_tag not in mesh.tags:
             known_tags = ", ".join(sorted(mesh.tags)) or "none"
             surface_hint = " It is a surface, without tetrahedra: mesh the volume within." if mesh.is_surface else ""
-            raise ValueError(f"The mesh has no facets tagged '{tag}'; its tags are: {known_tags}.{surface_hint}")
-    return FacetElectrodes(mesh, [np.asarray(mesh.tags[tag]) for tag in tags], contact_impedance)
+            raise ValueError(
+                f"The mesh has no facets tagged '{surface_tag}'; its tags are: {known_tags}.{surface_hint}"
+            )
+    return FacetElectrodes(mesh, [np.asarray(mesh.tags[surface_tag]) for surface_tag in tags], contact_impedance)
 
 
 def electrodes_from_nodes(mesh: Mesh, nodes: Sequence, contact_impedance: ArrayLike) -> FacetElectrodes:
@@ -323,14 +345,14 @@ def electrodes_from_nodes(mesh: Mesh, nodes: Sequence, contact_impedance: ArrayL
     """
     if not has_values(mesh.facets):
         raise ValueError("electrodes_from_nodes needs a mesh with values, not one that is being traced.")
-    boundary = np.asarray(mesh.facets)
+    boundary_facets = np.asarray(mesh.facets)
     facets = []
-    for electrode, members in enumerate(nodes):
-        covered = np.flatnonzero(np.isin(boundary, np.asarray(members)).all(axis=1))
-        if covered.size == 0:
+    for electrode, nodes_of_electrode in enumerate(nodes):
+        covered_facets = np.flatnonzero(np.isin(boundary_facets, np.asarray(nodes_of_electrode)).all(axis=1))
+        if covered_facets.size == 0:
             raise ValueError(
-                f"nodes: the {len(members)} nodes of electrode {electrode + 1} span no boundary facet; an electrode of "
-                "a single node is a point electrode (NodeElectrodes)."
+                f"nodes: the {len(nodes_of_electrode)} nodes of electrode {electrode + 1} span no boundary facet; an "
+                "electrode of a single node is a point electrode (NodeElectrodes)."
             )
-        facets.append(covered)
+        facets.append(covered_facets)
     return FacetElectrodes(mesh, facets, contact_impedance)

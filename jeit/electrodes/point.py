@@ -67,9 +67,9 @@ class PointElectrodes(AbstractPointElectrodes):
     @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
         """Values of the n basis functions at the L electrodes as `load` (n, L) of the contact, with zero mass."""
-        cell, weights, _ = _find_containing_cells(self.position, mesh)
+        cell, barycentric_weights, _ = _find_containing_cells(self.position, mesh)
         node_indices = mesh.cells[cell], np.arange(self.num_electrodes)[:, None]
-        load = sum_into((mesh.num_points, self.num_electrodes), node_indices, weights)
+        load = sum_into((mesh.num_points, self.num_electrodes), node_indices, barycentric_weights)
         return _point_contact(self.contact_nodes(mesh), load)
 
     def check(self, mesh: Mesh) -> None:
@@ -80,24 +80,29 @@ class PointElectrodes(AbstractPointElectrodes):
             )
         if not has_values(self.position, mesh.points, mesh.cells):
             return
-        position, points = np.asarray(self.position), np.asarray(mesh.points)
+        position, mesh_points = np.asarray(self.position), np.asarray(mesh.points)
         distances_outside = np.asarray(_find_containing_cells(self.position, mesh)[2])
         # A point on a curved boundary lies slightly outside the polygon: allow a third of a cell.
-        far = np.flatnonzero(distances_outside < -1 / 3)
-        if far.size and mesh.is_surface:
+        electrodes_outside = np.flatnonzero(distances_outside < -1 / 3)
+        if electrodes_outside.size and mesh.is_surface:
             raise ValueError(
-                f"position: electrode {far[0] + 1} at {position[far[0]].tolist()} m lies off the surface, by more than "
-                f"a third of the nearest triangle; the surface spans {points.min(axis=0).tolist()} to "
-                f"{points.max(axis=0).tolist()} m. Move it onto the surface."
+                f"position: electrode {electrodes_outside[0] + 1} at {position[electrodes_outside[0]].tolist()} m lies "
+                "off the surface, by more than a third of the nearest triangle; the surface spans "
+                f"{mesh_points.min(axis=0).tolist()} to {mesh_points.max(axis=0).tolist()} m. Move it onto the surface."
             )
-        if far.size:
+        if electrodes_outside.size:
             raise ValueError(
-                f"position: electrode {far[0] + 1} at {position[far[0]].tolist()} m lies outside the mesh, which spans "
-                f"{points.min(axis=0).tolist()} to {points.max(axis=0).tolist()} m."
+                f"position: electrode {electrodes_outside[0] + 1} at {position[electrodes_outside[0]].tolist()} m lies "
+                f"outside the mesh, which spans {mesh_points.min(axis=0).tolist()} to "
+                f"{mesh_points.max(axis=0).tolist()} m."
             )
-        gap = np.linalg.norm(position[:, None] - position, axis=-1) + np.eye(len(position)) * 1e300
-        if gap.min() < 1e-9 * np.ptp(points, axis=0).max():
-            first_electrode, second_electrode = np.unravel_index(gap.argmin(), gap.shape)
+        distances_between_electrodes = (
+            np.linalg.norm(position[:, None] - position, axis=-1) + np.eye(len(position)) * 1e300
+        )
+        if distances_between_electrodes.min() < 1e-9 * np.ptp(mesh_points, axis=0).max():
+            first_electrode, second_electrode = np.unravel_index(
+                distances_between_electrodes.argmin(), distances_between_electrodes.shape
+            )
             raise ValueError(f"Electrodes {first_electrode + 1} and {second_electrode + 1} are at the same position.")
 
 
@@ -118,12 +123,12 @@ class NodeElectrodes(AbstractPointElectrodes):
 
     def __init__(self, nodes: ArrayLike):
         """Raises `ValueError` for anything but L distinct non-negative integers."""
-        array = np.asarray(nodes)
-        if array.ndim != 1 or array.size == 0 or not np.issubdtype(array.dtype, np.integer):
+        node_array = np.asarray(nodes)
+        if node_array.ndim != 1 or node_array.size == 0 or not np.issubdtype(node_array.dtype, np.integer):
             raise ValueError("nodes must be a list of node indices, one integer for each electrode.")
-        if array.min() < 0 or len(np.unique(array)) != len(array):
+        if node_array.min() < 0 or len(np.unique(node_array)) != len(node_array):
             raise ValueError("nodes must be distinct, non-negative, zero-based node indices.")
-        self.nodes = jnp.asarray(array, jnp.int32)
+        self.nodes = jnp.asarray(node_array, jnp.int32)
 
     @property
     def num_electrodes(self) -> int:
@@ -173,16 +178,18 @@ def _find_containing_cells(position, mesh: Mesh):
     corners = mesh.points[mesh.cells]  # (m, d + 1, d)
     # Basis functions are linear, so their values at a position follow from their gradients.
     local_coordinates = xp.einsum("mij,lmj->lmi", gradients(mesh)[:, 1:], position[:, None] - corners[:, 0])
-    barycentric = xp.concatenate([1 - local_coordinates.sum(axis=-1, keepdims=True), local_coordinates], axis=-1)
-    smallest_weights = undifferentiated(barycentric).min(axis=-1)
+    barycentric_coordinates = xp.concatenate(
+        [1 - local_coordinates.sum(axis=-1, keepdims=True), local_coordinates], axis=-1
+    )
+    smallest_weights = undifferentiated(barycentric_coordinates).min(axis=-1)
     if mesh.is_surface:  # a position may project into many triangles: prefer the closest
-        off = xp.einsum("mi,lmi->lm", normals(mesh), position[:, None] - corners[:, 0])
-        smallest_weights = xp.minimum(smallest_weights, 0) - abs(undifferentiated(off)) / xp.sqrt(
+        distance_off_plane = xp.einsum("mi,lmi->lm", normals(mesh), position[:, None] - corners[:, 0])
+        smallest_weights = xp.minimum(smallest_weights, 0) - abs(undifferentiated(distance_off_plane)) / xp.sqrt(
             2 * undifferentiated(measures(mesh))
         )
     cell = xp.argmax(smallest_weights, axis=1)
-    weights = xp.take_along_axis(barycentric, cell[:, None, None], 1)[:, 0]
-    return cell, weights, smallest_weights.max(axis=1)
+    barycentric_weights = xp.take_along_axis(barycentric_coordinates, cell[:, None, None], 1)[:, 0]
+    return cell, barycentric_weights, smallest_weights.max(axis=1)
 
 
 class IntegratedElectrodes(AbstractElectrodes):
@@ -197,8 +204,8 @@ class IntegratedElectrodes(AbstractElectrodes):
 
     def __init__(self, electrodes: AbstractElectrodes, mesh: Mesh):
         if has_values(electrodes, mesh):
-            integrals = on_host(electrodes).contact(on_host(mesh))
-            self.integrals = integrals if namespace(electrodes, mesh) is np else on_device(integrals)
+            contact_integrals = on_host(electrodes).contact(on_host(mesh))
+            self.integrals = contact_integrals if namespace(electrodes, mesh) is np else on_device(contact_integrals)
         else:
             self.integrals = electrodes.contact(mesh)
         self.point = electrodes.is_point

@@ -58,8 +58,10 @@ class SolvedFields(NamedTuple):
     def derivatives(self, changes: Sequence[ConductivityChange]) -> Float[np.ndarray, "M n"]:
         """Derivatives of the voltages with respect to the coefficients of all `changes`: -∫ dσ ∇u_drive · ∇u_measure.
         They are computed from integrals for pairs of electrodes."""
-        energies = np.concatenate([self._energy(*change) for change in changes])
-        return np.stack([-select_channels(self.protocol, impedance_change) for impedance_change in energies], axis=1)  # pyright: ignore
+        energy_changes = np.concatenate([self._energy(*conductivity_change) for conductivity_change in changes])
+        return np.stack(
+            [-select_channels(self.protocol, impedance_change) for impedance_change in energy_changes], axis=1
+        )  # pyright: ignore
 
     def _energy(self, cells, slope) -> Float[np.ndarray, "q L L"]:
         """Integrals ∫ dσ ∇F_k · ∇F_l for pairs of electrodes k, l and every coefficient of a change dσ. They are
@@ -69,10 +71,10 @@ class SolvedFields(NamedTuple):
             return np.stack([self._energy_everywhere(cell_change) for cell_change in slope.T])
         return _field_energies(self.mesh, self.fields, cells, slope)
 
-    def _energy_everywhere(self, change: Float[np.ndarray, " m"]) -> Float[np.ndarray, "L L"]:
+    def _energy_everywhere(self, cell_change: Float[np.ndarray, " m"]) -> Float[np.ndarray, "L L"]:
         empty_contacts = (None,) * (self.pattern.num_groups - 1)
-        values: Any = self.pattern.assemble(stiffness(self.mesh, change), *empty_contacts)  # pyright: ignore
-        return self.pattern.quadratic_form(values, self.fields)
+        stiffness_values: Any = self.pattern.assemble(stiffness(self.mesh, cell_change), *empty_contacts)  # pyright: ignore
+        return self.pattern.quadratic_form(stiffness_values, self.fields)
 
 
 def solved_fields(model: ForwardModel, conductivity: Float[np.ndarray, " m"]) -> SolvedFields:
@@ -89,28 +91,32 @@ def _field_energies(mesh: Mesh, fields, cells, conductivity_slope) -> Float[np.n
     work of the others.
     """
     nodes = np.asarray(mesh.cells)[cells]
-    gradient, measure = (np.asarray(values)[cells] for values in cached_geometry(mesh))
-    scaled_basis_gradients = np.ascontiguousarray(gradient.transpose(0, 2, 1)) * np.sqrt(measure)[:, None, None]
+    gradient, cell_measure = (np.asarray(geometry_array)[cells] for geometry_array in cached_geometry(mesh))
+    scaled_basis_gradients = np.ascontiguousarray(gradient.transpose(0, 2, 1)) * np.sqrt(cell_measure)[:, None, None]
     num_fields, is_nonzero = fields.shape[1], conductivity_slope != 0
     num_nonzero = is_nonzero.sum(axis=1)
-    energy = np.zeros((conductivity_slope.shape[1], num_fields**2), np.result_type(fields, conductivity_slope))
+    energy_products = np.zeros((conductivity_slope.shape[1], num_fields**2), np.result_type(fields, conductivity_slope))
     for chunk_of_indices in _split_indices(np.flatnonzero(num_nonzero > 1)):
         local_fields = scaled_basis_gradients[chunk_of_indices] @ fields[nodes[chunk_of_indices]]
-        energy += conductivity_slope[chunk_of_indices].T @ (local_fields.transpose(0, 2, 1) @ local_fields).reshape(
-            len(chunk_of_indices), -1
-        )
-    energy = energy.reshape(-1, num_fields, num_fields)
-    for coefficient, is_only_nonzero in enumerate((is_nonzero & (num_nonzero == 1)[:, None]).T):
+        energy_products += conductivity_slope[chunk_of_indices].T @ (
+            local_fields.transpose(0, 2, 1) @ local_fields
+        ).reshape(len(chunk_of_indices), -1)
+    energy_products = energy_products.reshape(-1, num_fields, num_fields)
+    for coefficient_index, is_only_nonzero in enumerate((is_nonzero & (num_nonzero == 1)[:, None]).T):
         for chunk_of_indices in _split_indices(np.flatnonzero(is_only_nonzero)):
             local_fields = scaled_basis_gradients[chunk_of_indices] @ fields[nodes[chunk_of_indices]]
-            weighted = conductivity_slope[chunk_of_indices, coefficient, None, None] * local_fields
-            energy[coefficient] += local_fields.reshape(-1, num_fields).T @ weighted.reshape(-1, num_fields)
-    return energy
+            scaled_local_fields = conductivity_slope[chunk_of_indices, coefficient_index, None, None] * local_fields
+            energy_products[coefficient_index] += local_fields.reshape(-1, num_fields).T @ scaled_local_fields.reshape(
+                -1, num_fields
+            )
+    return energy_products
 
 
 def _split_indices(indices: Int[np.ndarray, " k"]) -> list[Int[np.ndarray, " p"]]:
     """Divide `indices` into parts of `_CELLS_AT_ONCE`."""
-    return [indices[start : start + _CELLS_AT_ONCE] for start in range(0, len(indices), _CELLS_AT_ONCE)]
+    return [
+        indices[chunk_start : chunk_start + _CELLS_AT_ONCE] for chunk_start in range(0, len(indices), _CELLS_AT_ONCE)
+    ]
 
 
 # Contact impedance in ohm·m² of an electrode that carries no current, compared with an electrode of unit contact
@@ -123,23 +129,25 @@ class _ContactMass(NamedTuple):
     mass: Float[np.ndarray, "q k k"]
 
 
-def _select_contact(mesh: Mesh, electrodes: AbstractElectrodes, members: Bool[np.ndarray, " L"]) -> Contact:
-    """Contact integrals for unit contact impedance of the electrodes that are `members`, and open contacts of all
+def _select_contact(mesh: Mesh, electrodes: AbstractElectrodes, is_selected: Bool[np.ndarray, " L"]) -> Contact:
+    """Contact integrals for unit contact impedance of the electrodes with `is_selected`, and open contacts of all
     others."""
-    contact_impedance = np.where(members, 1.0, _OPEN_CONTACT_IMPEDANCE)
+    contact_impedance = np.where(is_selected, 1.0, _OPEN_CONTACT_IMPEDANCE)
     return on_host(electrodes.with_contact_impedance(contact_impedance)).contact(mesh)
 
 
 def _groups_without_neighbours(shares_cell_matrix: Bool[np.ndarray, "L L"]) -> list[Bool[np.ndarray, " L"]]:
     """Divide electrodes into as few groups as a simple search finds, so that no two electrodes of a group share a facet
     or cell. `shares_cell_matrix`: whether two electrodes share one. Each group is a mask of its members."""
-    groups: list[Bool[np.ndarray, " L"]] = []
-    for electrode, neighbours in enumerate(shares_cell_matrix):
-        group = next((group for group in groups if not (group & neighbours).any()), None)
-        if group is None:
-            groups.append(group := np.zeros(len(shares_cell_matrix), bool))
-        group[electrode] = True
-    return groups
+    electrode_groups: list[Bool[np.ndarray, " L"]] = []
+    for electrode, is_neighbour in enumerate(shares_cell_matrix):
+        free_group = next(
+            (free_group for free_group in electrode_groups if not (free_group & is_neighbour).any()), None
+        )
+        if free_group is None:
+            electrode_groups.append(free_group := np.zeros(len(shares_cell_matrix), bool))
+        free_group[electrode] = True
+    return electrode_groups
 
 
 class ContactSensitivity:
@@ -154,16 +162,20 @@ class ContactSensitivity:
         self._contact_masses: list[list[_ContactMass]] = [[] for _ in range(num_electrodes)]
         # If an electrode covers a part of a facet or cell, all nodes of this facet or cell have a load.
         is_touched = [(load[np.asarray(nodes)] != 0).all(axis=1) for nodes in contact.nodes]
-        counts = sum(touched.T.astype(float) @ touched for touched in is_touched)
-        groups = _groups_without_neighbours((counts > 0) & ~np.eye(num_electrodes, dtype=bool))
-        for members in groups:
-            own_contact = contact if members.all() else _select_contact(mesh, electrodes, members)
-            for nodes, mass, touched in zip(own_contact.nodes, own_contact.mass, is_touched, strict=True):
+        shared_node_counts = sum(
+            is_touched_by_electrode.T.astype(float) @ is_touched_by_electrode for is_touched_by_electrode in is_touched
+        )
+        electrode_groups = _groups_without_neighbours((shared_node_counts > 0) & ~np.eye(num_electrodes, dtype=bool))
+        for is_in_group in electrode_groups:
+            own_contact = contact if is_in_group.all() else _select_contact(mesh, electrodes, is_in_group)
+            for nodes, mass, is_touched_by_electrode in zip(
+                own_contact.nodes, own_contact.mass, is_touched, strict=True
+            ):
                 nodes, mass = np.asarray(nodes), np.asarray(mass)
-                size = np.abs(mass).max(axis=(1, 2), initial=0)
-                is_covered = size > 2 / _OPEN_CONTACT_IMPEDANCE * size.max(initial=0)
-                for electrode in np.flatnonzero(members):
-                    nodes_of_electrode = np.flatnonzero(is_covered & touched[:, electrode])
+                largest_mass_entries = np.abs(mass).max(axis=(1, 2), initial=0)
+                is_covered = largest_mass_entries > 2 / _OPEN_CONTACT_IMPEDANCE * largest_mass_entries.max(initial=0)
+                for electrode in np.flatnonzero(is_in_group):
+                    nodes_of_electrode = np.flatnonzero(is_covered & is_touched_by_electrode[:, electrode])
                     self._contact_masses[electrode].append(
                         _ContactMass(nodes[nodes_of_electrode], mass[nodes_of_electrode])
                     )
@@ -204,11 +216,12 @@ class PlacementSensitivity:
         self._step = _RELATIVE_FINITE_DIFFERENCE_SHIFT * float(np.ptp(np.asarray(mesh.points), axis=0).max())
         self._sensitivity = ContactSensitivity(mesh, electrodes)
         self._shifted_sensitivities = []
-        for direction in range(self.directions.shape[1]):
-            shift = np.zeros(self.directions.shape[:2])
-            shift[:, direction] = self._step
+        for direction_index in range(self.directions.shape[1]):
+            shift_lengths = np.zeros(self.directions.shape[:2])
+            shift_lengths[:, direction_index] = self._step
             shifted_electrodes = [
-                shift_electrodes(electrodes, self.directions, displacement) for displacement in (shift, -shift)
+                shift_electrodes(electrodes, self.directions, displacements)
+                for displacements in (shift_lengths, -shift_lengths)
             ]
             self._shifted_sensitivities.append(
                 [ContactSensitivity(mesh, moved_electrodes) for moved_electrodes in shifted_electrodes]
@@ -221,10 +234,11 @@ class PlacementSensitivity:
         contact = self._contact_impedance
         shift_derivatives = []
         for forward_sensitivity, backward_sensitivity in self._shifted_sensitivities:
-            energies = [
-                sensitivity(fields, impedance, contact) for sensitivity in (backward_sensitivity, forward_sensitivity)
+            contact_energies = [
+                shifted_sensitivity(fields, impedance, contact)
+                for shifted_sensitivity in (backward_sensitivity, forward_sensitivity)
             ]
-            shift_derivatives.append((energies[0] - energies[1]) / (2 * self._step))
+            shift_derivatives.append((contact_energies[0] - contact_energies[1]) / (2 * self._step))
         shift_derivatives = np.stack(shift_derivatives, axis=1).reshape(-1, *impedance.shape)
         return np.concatenate([shift_derivatives, self._sensitivity(fields, impedance, contact)])
 

@@ -232,11 +232,11 @@ def evaluate(model: ForwardModel, quantity: Callable[..., Any], conductivity) ->
         return _COMPILED_QUANTITIES[quantity](model, conductivity)
     model_parts = model.mesh, model.electrodes, model.protocol, model.system
     if not (model.at_once and has_values(conductivity)):
-        values = _COMPILED_QUANTITIES[quantity](integrated_model(*model_parts), conductivity)
-        return on_host(values) if namespace(model_parts[:3], conductivity) is np else values
+        quantity_values = _COMPILED_QUANTITIES[quantity](integrated_model(*model_parts), conductivity)
+        return on_host(quantity_values) if namespace(model_parts[:3], conductivity) is np else quantity_values
     with np.errstate(all="ignore"):
-        values = quantity(host_model(*model_parts), on_host(conductivity))
-    return values if namespace(model_parts[:3]) is np else on_device(values)
+        quantity_values = quantity(host_model(*model_parts), on_host(conductivity))
+    return quantity_values if namespace(model_parts[:3]) is np else on_device(quantity_values)
 
 
 def check_model(model: ForwardModel) -> None:
@@ -267,16 +267,16 @@ def _check_model_parts(mesh: Mesh, electrodes: AbstractElectrodes, protocol: Pro
 def select_channels(protocol: Protocol, impedance) -> Inexact[Array, " M"]:
     """Voltages of the channels (M,) for a transfer impedance Z: entries of the matrix measurement · Z · driveᵀ. The
     full matrix is computed only where this takes less work than computing the entries one by one."""
-    measured, driven = protocol.measurement, protocol.drive
+    measurement, drive = protocol.measurement, protocol.drive
     num_direct_products, num_matrix_products = (
         protocol.num_measurements * len(impedance),
-        len(measured) * (len(impedance) + len(driven)),
+        len(measurement) * (len(impedance) + len(drive)),
     )
     if num_direct_products < num_matrix_products:
-        products = (measured[protocol.measurement_index] @ impedance) * driven[protocol.drive_index]
-        return products.sum(axis=1)
-    table = measured @ impedance @ driven.T
-    return gather(table.reshape(-1), protocol.measurement_index * len(driven) + protocol.drive_index)
+        electrode_products = (measurement[protocol.measurement_index] @ impedance) * drive[protocol.drive_index]
+        return electrode_products.sum(axis=1)
+    voltage_table = measurement @ impedance @ drive.T
+    return gather(voltage_table.reshape(-1), protocol.measurement_index * len(drive) + protocol.drive_index)
 
 
 def channel_voltages(protocol: Protocol, impedance: ElectrodeImpedance) -> Inexact[Array, " M"]:
@@ -333,8 +333,8 @@ def voltages_and_jacobian_of(model: ForwardModel | IntegratedModel, conductivity
         jacobian = _jacobian_of_cells(protocol, field_gradients(mesh, fields))
     if conductivity.ndim == 1 and conductivity.shape[0] != mesh.num_cells:
         per_corner = jacobian.T / mesh.cells.shape[1]
-        shape = mesh.num_points, protocol.num_measurements
-        corners = [sum_into(shape, mesh.cells[:, k], per_corner) for k in range(mesh.cells.shape[1])]
+        jacobian_shape = mesh.num_points, protocol.num_measurements
+        corners = [sum_into(jacobian_shape, mesh.cells[:, k], per_corner) for k in range(mesh.cells.shape[1])]
         jacobian = functools.reduce(operator.add, corners).T
     return channel_voltages(protocol, impedance), jacobian
 
@@ -346,18 +346,21 @@ def _whole_jacobian(mesh: Mesh, protocol: Protocol, fields: Inexact[Array, "n L"
     def fill_block(cells: slice) -> None:
         jacobian[:, cells] = _jacobian_of_cells(protocol, gradient[:, cells])
 
-    blocks = _blocks_of_cells(mesh, protocol)
-    if len(blocks) < _MIN_PARALLEL_BLOCKS:
-        for cells in blocks:
+    cell_blocks = _blocks_of_cells(mesh, protocol)
+    if len(cell_blocks) < _MIN_PARALLEL_BLOCKS:
+        for cells in cell_blocks:
             fill_block(cells)
     else:
-        on_cores(fill_block, blocks)
+        on_cores(fill_block, cell_blocks)
     return jacobian
 
 
 def _blocks_of_cells(mesh: Mesh, protocol: Protocol) -> list[slice]:
-    size = max(1, _MAX_BLOCK_ENTRIES // protocol.num_measurements)
-    return [slice(start, min(start + size, mesh.num_cells)) for start in range(0, mesh.num_cells, size)]
+    cells_per_block = max(1, _MAX_BLOCK_ENTRIES // protocol.num_measurements)
+    return [
+        slice(first_cell, min(first_cell + cells_per_block, mesh.num_cells))
+        for first_cell in range(0, mesh.num_cells, cells_per_block)
+    ]
 
 
 def jacobian_blocks(
@@ -376,17 +379,17 @@ def field_products(mesh: Mesh, fields: Inexact[Array, "n L"]) -> Iterator[tuple[
     consecutive cells. Rows are in the order of `np.triu_indices`. The Jacobian of any channel is a weighted sum of
     these integrals. Computed in NumPy from the `fields` (n, L) of `fields_of`, in ohms."""
     gradient: Any = field_gradients(mesh, fields)
-    count = gradient.shape[-1]
-    starts = np.cumsum([0, *range(count, 0, -1)])
-    for start in range(0, mesh.num_cells, _CELLS_AT_ONCE):
-        cells = slice(start, min(start + _CELLS_AT_ONCE, mesh.num_cells))
-        gradients = np.ascontiguousarray(np.swapaxes(gradient[:, cells], 1, 2))
-        products = np.zeros((starts[-1], gradients.shape[-1]), gradients.dtype)
-        for field in range(count):
-            rows = products[starts[field] : starts[field + 1]]
-            for component in gradients:
-                rows += component[field] * component[field:]
-        yield cells, products
+    num_fields = gradient.shape[-1]
+    first_rows = np.cumsum([0, *range(num_fields, 0, -1)])
+    for first_cell in range(0, mesh.num_cells, _CELLS_AT_ONCE):
+        cells = slice(first_cell, min(first_cell + _CELLS_AT_ONCE, mesh.num_cells))
+        cell_gradients = np.ascontiguousarray(np.swapaxes(gradient[:, cells], 1, 2))
+        pair_products = np.zeros((first_rows[-1], cell_gradients.shape[-1]), cell_gradients.dtype)
+        for field_index in range(num_fields):
+            rows_of_field = pair_products[first_rows[field_index] : first_rows[field_index + 1]]
+            for gradient_component in cell_gradients:
+                rows_of_field += gradient_component[field_index] * gradient_component[field_index:]
+        yield cells, pair_products
 
 
 def _jacobian_of_cells(protocol: Protocol, gradient: Inexact[Array, "d b L"]) -> Inexact[Array, "M b"]:
@@ -394,12 +397,12 @@ def _jacobian_of_cells(protocol: Protocol, gradient: Inexact[Array, "d b L"]) ->
     gradients of the electrodes' fields in the cells."""
     xp, jacobian = namespace(gradient), host.zeros(())
     # With a single product for all patterns and axes, XLA does not recompute the gradients for every channel.
-    patterns = xp.concatenate([-protocol.drive, protocol.measurement])
-    rows = patterns @ gradient.reshape(-1, gradient.shape[-1]).T
-    for component in xp.split(rows, len(gradient), axis=1):
-        drive = gather(component, protocol.drive_index)
-        measure = gather(component, protocol.num_drives + protocol.measurement_index)
-        jacobian = jacobian + drive * measure
+    channel_patterns = xp.concatenate([-protocol.drive, protocol.measurement])
+    pattern_gradients = channel_patterns @ gradient.reshape(-1, gradient.shape[-1]).T
+    for gradient_component in xp.split(pattern_gradients, len(gradient), axis=1):
+        drive = gather(gradient_component, protocol.drive_index)
+        measurement_gradients = gather(gradient_component, protocol.num_drives + protocol.measurement_index)
+        jacobian = jacobian + drive * measurement_gradients
     return jacobian
 
 

@@ -85,12 +85,12 @@ def _check_values(conductivity: Any, normal: Any) -> None:
     if conductivity.ndim == 3:
         if not np.allclose(conductivity, np.swapaxes(conductivity, 1, 2), rtol=1e-12, atol=0):
             raise ValueError("conductivity tensors must be symmetric.")
-        real = conductivity.real
+        real_part = conductivity.real
         if normal is not None:  # tensors must be positive only within the surface: add a large value along its normal
             normal_projection = normal[:, :, None] * normal[:, None]
             projection = np.eye(3) - normal_projection
-            real = projection @ real @ projection + np.abs(real).max() * normal_projection
-        min_value = np.linalg.eigvalsh(real).min()
+            real_part = projection @ real_part @ projection + np.abs(real_part).max() * normal_projection
+        min_value = np.linalg.eigvalsh(real_part).min()
     else:
         min_value = conductivity.real.min()
     if min_value <= 0:
@@ -115,18 +115,18 @@ _last_geometry = RecentResultsCache(_gradients_and_measures, 1)
 
 def _unit_stiffness(mesh: Mesh) -> Inexact[Array, "p m"]:
     """Element stiffness matrices for unit conductivity, as defined in `stiffness`."""
-    gradient, measure = cached_geometry(mesh)
-    return _scaled_stiffness(gradient, gradient, measure)
+    gradient, cell_measure = cached_geometry(mesh)
+    return _scaled_stiffness(gradient, gradient, cell_measure)
 
 
 def _scaled_stiffness(gradient, flux, weight) -> Inexact[Array, "p m"]:
     """Lower triangles (p, m) of the products of gradients and fluxes (m, k, s), multiplied by the weights (m,)."""
     xp, axes = namespace(gradient, flux, weight), range(gradient.shape[2])
-    rows, columns = np.tril_indices(gradient.shape[1])
+    row_indices, column_indices = np.tril_indices(gradient.shape[1])
     return xp.stack(
         [
             weight * sum(gradient[:, row, axis] * flux[:, column, axis] for axis in axes)
-            for row, column in zip(rows, columns, strict=True)
+            for row, column in zip(row_indices, column_indices, strict=True)
         ]
     )
 
@@ -139,11 +139,11 @@ def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Arra
     Returns lower triangles (p, m) in siemens, with p = (d+1)(d+2)/2 entries for each of m cells."""
     if conductivity.ndim == 1 and namespace(mesh, conductivity) is np:
         return conductivity * _last_unit_stiffness(mesh)
-    gradient, measure = cached_geometry(mesh)
+    gradient, cell_measure = cached_geometry(mesh)
     if conductivity.ndim == 1:
-        return _scaled_stiffness(gradient, gradient, measure * conductivity)
+        return _scaled_stiffness(gradient, gradient, cell_measure * conductivity)
     return _scaled_stiffness(
-        gradient, namespace(mesh, conductivity).einsum("mij,mkj->mki", conductivity, gradient), measure
+        gradient, namespace(mesh, conductivity).einsum("mij,mkj->mki", conductivity, gradient), cell_measure
     )
 
 
@@ -154,12 +154,14 @@ def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> Inexact[Array,
     With this weight the product of the gradients of two fields u, w is the integral ∫_e ∇u·∇w over the cell e.
     """
     xp = namespace(mesh, fields)
-    gradient, measure = cached_geometry(mesh)
-    weighted = gradient * xp.sqrt(measure)[:, None, None]
+    gradient, cell_measure = cached_geometry(mesh)
+    weighted_basis_gradients = gradient * xp.sqrt(cell_measure)[:, None, None]
     corners = [gather(fields, nodes) for nodes in mesh.cells.T]
     return xp.stack(
         [
-            functools.reduce(operator.add, [weighted[:, k, axis, None] * corner for k, corner in enumerate(corners)])
+            functools.reduce(
+                operator.add, [weighted_basis_gradients[:, k, axis, None] * corner for k, corner in enumerate(corners)]
+            )
             for axis in range(mesh.space_dimension)
         ]
     )
@@ -191,17 +193,17 @@ class System(Module):
 
         Raises `ValueError` for an unknown name of a solver.
         """
-        groups = [np.asarray(nodes) for nodes in (mesh.cells, *electrodes.contact_nodes(mesh))]
-        pattern = SparsityPattern.from_elements(groups, size=mesh.num_points)
+        node_groups = [np.asarray(nodes) for nodes in (mesh.cells, *electrodes.contact_nodes(mesh))]
+        pattern = SparsityPattern.from_elements(node_groups, size=mesh.num_points)
         if not isinstance(solver, str):
             return cls(pattern, solver)
-        coordinates = np.asarray(mesh.points)
+        node_coordinates = np.asarray(mesh.points)
         if solver == "auto":
-            fronts = find_fronts(pattern, coordinates)
-            chosen_solver = choose_solver(pattern, coordinates)
+            fronts = find_fronts(pattern, node_coordinates)
+            chosen_solver = choose_solver(pattern, node_coordinates)
             return cls(pattern, chosen_solver, fronts if isinstance(chosen_solver, DirectSolver) else None)
         if solver == "cholesky":
-            return cls(pattern, SparseCholesky(analyse(pattern, coordinates)))
+            return cls(pattern, SparseCholesky(analyse(pattern, node_coordinates)))
         if solver == "cg":
             return cls(pattern, ConjugateGradient())
         raise ValueError(f"solver must be 'auto', 'cholesky', 'cg' or a lineax solver, not '{solver}'.")
@@ -218,31 +220,31 @@ class System(Module):
         empty_contacts = (None,) * len(contact.mass)
         stiffness_values = self.pattern.assemble(stiffness(mesh, conductivity), *empty_contacts)
         ground_conductances = ground_conductance(self.pattern.diagonal(stiffness_values), contact.load)
-        values = (
+        system_values = (
             stiffness_values if electrodes.is_point else stiffness_values + self.pattern.assemble(None, *contact.mass)
         )
-        values = values + namespace(values).concatenate(
-            [ground_conductances, np.zeros(len(values) - len(ground_conductances))]
+        system_values = system_values + namespace(system_values).concatenate(
+            [ground_conductances, np.zeros(len(system_values) - len(ground_conductances))]
         )
         load = contact.load if electrodes.is_point else append_ground(contact.load, ground_conductances)
-        return SparseSymmetric(values, self.pattern), load
+        return SparseSymmetric(system_values, self.pattern), load
 
     def solve(self, operator: SparseSymmetric, load: Inexact[Array, "n c"]) -> Inexact[Array, "n c"]:
         """Solution A⁻¹ load for the matrix A of `operator`, one column per load. Differentiable by implicit
         differentiation, whichever solver is used."""
         load = load.astype(operator.values.dtype)
         if self.fronts is not None and isinstance(load, np.ndarray):
-            solution: Any = factorise_fronts(self.fronts, host.asarray(operator.values)).solve(load)
-            return solution.astype(load.dtype)
+            solved_fields: Any = factorise_fronts(self.fronts, host.asarray(operator.values)).solve(load)
+            return solved_fields.astype(load.dtype)
         if isinstance(self.solver, NumpySolver) and isinstance(load, np.ndarray):
             return self.solver.solve_columns(operator, load)
-        constant = jax.lax.stop_gradient(operator)  # derivatives come from A X = B, not from the factor of A
-        state: Any = self.solver.init(constant, {})
+        constant_operator = jax.lax.stop_gradient(operator)  # derivatives come from A X = B, not from the factor of A
+        solver_state: Any = self.solver.init(constant_operator, {})
         solver = self.solver
         if isinstance(solver, ColumnSolver):  # all columns at once; other lineax solvers solve for one column at a time
 
             def solve_columns(_, columns):
-                return solver.solve_columns(state, columns)
+                return solver.solve_columns(solver_state, columns)
 
             def multiply(columns):
                 return operator.pattern.multiply(operator.values, columns)
@@ -250,7 +252,7 @@ class System(Module):
             return jax.lax.custom_linear_solve(multiply, load, solve_columns, symmetric=True)
 
         def column(vector):
-            return lx.linear_solve(operator, vector, self.solver, state=state, throw=False).value
+            return lx.linear_solve(operator, vector, self.solver, state=solver_state, throw=False).value
 
         return jax.vmap(column, in_axes=1, out_axes=1)(load)
 
@@ -259,8 +261,8 @@ class System(Module):
         work of `solve`."""
         load = load.astype(operator.values.dtype)
         if self.fronts is not None and isinstance(load, np.ndarray):
-            product: Any = factorise_fronts(self.fronts, host.asarray(operator.values)).quadratic_form(load)
-            return product.astype(load.dtype)
+            load_product: Any = factorise_fronts(self.fronts, host.asarray(operator.values)).quadratic_form(load)
+            return load_product.astype(load.dtype)
         if isinstance(self.solver, SparseCholesky):
             return quadratic_form(self.solver.plan, factorise(self.solver.plan, operator.values), load)
         return load.T @ self.solve(operator, load)

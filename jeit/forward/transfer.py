@@ -83,8 +83,8 @@ def impedance_parts(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, sy
 
 def _impedance_by_quadratic_form(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System):
     contact = electrodes.contact(mesh)
-    operator, load = system.grounded_system(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
-    return electrode_impedance(system.quadratic_form(operator, load), contact_resistance(electrodes, contact))
+    system_operator, load = system.grounded_system(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
+    return electrode_impedance(system.quadratic_form(system_operator, load), contact_resistance(electrodes, contact))
 
 
 _differentiable = eqx.filter_custom_jvp(_impedance_by_quadratic_form)
@@ -113,9 +113,9 @@ def electrode_fields(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, s
     Both are in volts per ampere; `conductivity` in S/m (2-D: S). Both are differentiable by implicit differentiation of
     the linear system, with one more solve per direction.
     """
-    solved = solved_system(mesh, conductivity, electrodes, system)
-    fields, potentials = solved.fields()
-    return fields - potentials.mean(axis=0), solved.impedance().transfer
+    solved_fields = solved_system(mesh, conductivity, electrodes, system)
+    fields, potentials = solved_fields.fields()
+    return fields - potentials.mean(axis=0), solved_fields.impedance().transfer
 
 
 class SolvedSystem(NamedTuple):
@@ -151,16 +151,18 @@ def unit_fields(
     the solution X at these nodes and the product loadᵀ X."""
     potentials = product
     if resistance is not None:
-        terminals = terminal_impedance(product)[:, :-1]
-        solution, potentials = solution @ terminals, terminals[:-1]
+        terminal_matrix = terminal_impedance(product)[:, :-1]
+        solution, potentials = solution @ terminal_matrix, terminal_matrix[:-1]
     return solution - solution.mean(axis=1, keepdims=True), potentials - potentials.mean(axis=1, keepdims=True)
 
 
 def solved_system(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System) -> SolvedSystem:
     """Solve the finite-element system for the loads of the electrodes; `conductivity` in S/m (2-D: S)."""
     contact = electrodes.contact(mesh)
-    operator, load = system.grounded_system(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
-    return SolvedSystem(operator, load, system.solve(operator, load), contact_resistance(electrodes, contact))
+    system_operator, load = system.grounded_system(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
+    return SolvedSystem(
+        system_operator, load, system.solve(system_operator, load), contact_resistance(electrodes, contact)
+    )
 
 
 @eqx.filter_jit
@@ -174,12 +176,12 @@ def fields_and_inverse(
     is the potential of one node for a unit current into another node. The choice of the electrode that is not floating
     does not affect the derivatives with respect to conductivity.
     """
-    fields, solution = strips.spread(solved.fields()[0]), strips.spread(solved.solution)
+    fields, unit_solution = strips.spread(solved.fields()[0]), strips.spread(solved.solution)
     inverse = near_inverse(strips, solved.operator, max_distance)
     if solved.resistance is None:
         return fields, inverse
     # The current that enters at a node leaves through an electrode: with X = A⁻¹ load, K⁻¹ = A⁻¹ + X Z Xᵀ.
-    return fields, inverse.add(solution, solution @ terminal_impedance(solved.product))
+    return fields, inverse.add(unit_solution, unit_solution @ terminal_impedance(solved.product))
 
 
 def contact_resistance(electrodes: AbstractElectrodes, contact: Contact) -> Inexact[Array, " L"] | None:
@@ -213,15 +215,15 @@ def terminal_impedance(product: Inexact[Array, "c c"]) -> Inexact[Array, "c c"]:
     because the contact impedances may differ by orders of magnitude.
     """
     xp = namespace(product)
-    coupling = (product + product.T) / 2 * (1 - np.eye(len(product)))
-    diagonal = coupling.sum(axis=0)
+    mutual_coupling = (product + product.T) / 2 * (1 - np.eye(len(product)))
+    diagonal = mutual_coupling.sum(axis=0)
     is_not_reference = np.arange(len(product)) != xp.argmax(undifferentiated(abs(diagonal)))
-    pairs = is_not_reference * is_not_reference[:, None]
-    scale = undifferentiated(1 / xp.sqrt(xp.where(is_not_reference, abs(diagonal), 1)))
-    scale = scale * scale[:, None]
-    matrix = (xp.diag(xp.where(is_not_reference, diagonal, 1)) - pairs * coupling) * scale
-    impedance = symmetric_inverse(matrix) * scale * pairs
-    return impedance + undifferentiated(_refinement_correction(coupling, impedance, xp.diag(is_not_reference)))
+    is_free_pair = is_not_reference * is_not_reference[:, None]
+    row_scale = undifferentiated(1 / xp.sqrt(xp.where(is_not_reference, abs(diagonal), 1)))
+    row_scale = row_scale * row_scale[:, None]
+    scaled_matrix = (xp.diag(xp.where(is_not_reference, diagonal, 1)) - is_free_pair * mutual_coupling) * row_scale
+    impedance = symmetric_inverse(scaled_matrix) * row_scale * is_free_pair
+    return impedance + undifferentiated(_refinement_correction(mutual_coupling, impedance, xp.diag(is_not_reference)))
 
 
 def _refinement_correction(
@@ -259,13 +261,13 @@ def _stationary_form(mesh, conductivity, electrodes, fields, impedance):
     contact = electrodes.contact(mesh)
     gradient = field_gradients(mesh, fields)
     if conductivity.ndim == 1:
-        energy = sum((component.T * conductivity) @ component for component in gradient)
+        body_energy = sum((gradient_component.T * conductivity) @ gradient_component for gradient_component in gradient)
     else:
-        energy = jnp.einsum("imp,mij,jmq->pq", gradient, conductivity, gradient)
+        body_energy = jnp.einsum("imp,mij,jmq->pq", gradient, conductivity, gradient)
     if electrodes.is_point:
-        source = contact.load.T @ fields
-        return source + source.T - energy
-    return -energy - _contact_energy(contact, fields, impedance)
+        contact_source = contact.load.T @ fields
+        return contact_source + contact_source.T - body_energy
+    return -body_energy - _contact_energy(contact, fields, impedance)
 
 
 def _contact_energy(contact: Contact, fields, impedance):
@@ -275,5 +277,7 @@ def _contact_energy(contact: Contact, fields, impedance):
     for nodes, mass in zip(contact.nodes, contact.mass, strict=True):
         local_fields = fields.at[nodes].get(mode="promise_in_bounds")  # (q, k, L)
         body_term += jnp.einsum("qip,qij,qjr->pr", local_fields, mass, local_fields)
-    coupling = fields.T @ contact.load @ impedance
-    return body_term - coupling - coupling.T + impedance.T @ (contact.load.sum(axis=0)[:, None] * impedance)
+    coupling_energy = fields.T @ contact.load @ impedance
+    return (
+        body_term - coupling_energy - coupling_energy.T + impedance.T @ (contact.load.sum(axis=0)[:, None] * impedance)
+    )

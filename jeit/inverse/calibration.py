@@ -50,26 +50,34 @@ def traced_fit(model: ForwardModel, measured: Float[Array, " M"], is_used, conta
     problem = on_device((model, measured, is_used))
     unit_voltages = jnp.where(is_used, model.voltages(1.0), 0)
     num_parameters = {"fixed": 1, "common": 2, "each": 1 + model.electrodes.num_electrodes}[contact]
-    start = jnp.full(
+    start_parameters = jnp.full(
         num_parameters, jnp.log(unit_voltages @ unit_voltages / (unit_voltages @ jnp.where(is_used, measured, 0)))
     )
     optimiser = optx.LevenbergMarquardt(rtol=_TRACED_TOLERANCE, atol=_TRACED_TOLERANCE)
     residual = partial(_relative_residual, contact)
-    frozen_start, frozen_problem = undifferentiated((start, problem))
-    solution = optx.least_squares(residual, optimiser, frozen_start, frozen_problem, max_steps=max_steps, throw=False)
+    frozen_start, frozen_problem = undifferentiated((start_parameters, problem))
+    fit_solution = optx.least_squares(
+        residual, optimiser, frozen_start, frozen_problem, max_steps=max_steps, throw=False
+    )
     parameters = as_minimum(
-        solution.value, problem, partial(_gradient, contact), partial(_normal_equations_solver, contact)
+        fit_solution.value, problem, partial(_misfit_gradient, contact), partial(_normal_equations_solver, contact)
     )
     fitted_model, conductivity = _fitted_model(contact, parameters, model)
     final_residual = residual(parameters, problem)
     covariance = symmetric_inverse(_normal_matrix(contact, parameters, problem))
     degrees_of_freedom = jnp.maximum(jnp.sum(is_used) - num_parameters, 1)
-    deviation = jnp.sqrt(covariance.diagonal() * (final_residual @ final_residual) / degrees_of_freedom)[1:]
+    relative_deviation = jnp.sqrt(covariance.diagonal() * (final_residual @ final_residual) / degrees_of_freedom)[1:]
     misfit = jnp.sqrt(final_residual @ final_residual)
-    outcome = jnp.where(jnp.isfinite(misfit), ended_number(solution.result), Status.FAILED.number)
-    num_steps = solution.stats["num_steps"]
+    status_number = jnp.where(jnp.isfinite(misfit), ended_number(fit_solution.result), Status.FAILED.number)
+    num_steps = fit_solution.stats["num_steps"]
     return TracedFit(
-        fitted_model, conductivity, fitted_model.voltages(conductivity), misfit, deviation, num_steps, outcome
+        fitted_model,
+        conductivity,
+        fitted_model.voltages(conductivity),
+        misfit,
+        relative_deviation,
+        num_steps,
+        status_number,
     )
 
 
@@ -78,20 +86,22 @@ def _fitted_model(contact: str, parameters, model: ForwardModel) -> tuple[Forwar
     conductivity = jnp.exp(parameters[0])
     if contact == "fixed":
         return model, conductivity
-    factor = jnp.exp(jnp.clip(parameters[1:] - parameters[0], -MAX_LOG_CONTACT_RATIO, MAX_LOG_CONTACT_RATIO))
-    impedance = model.electrodes.contact_impedance * factor
+    impedance_ratio = jnp.exp(jnp.clip(parameters[1:] - parameters[0], -MAX_LOG_CONTACT_RATIO, MAX_LOG_CONTACT_RATIO))
+    impedance = model.electrodes.contact_impedance * impedance_ratio
     return model.with_electrodes(model.electrodes.with_contact_impedance(impedance)), conductivity
 
 
 def _relative_residual(contact: str, parameters, problem):
     """Residual (predicted - measured) / ‖measured‖ (M,) of the channels in use, zero for the other channels."""
-    model, measured, is_used = problem
+    model, measured_voltages, is_used = problem
     fitted_model, conductivity = _fitted_model(contact, parameters, model)
-    predicted = fitted_model.voltages(conductivity)
-    return jnp.where(is_used, predicted - measured, 0) / jnp.linalg.norm(jnp.where(is_used, measured, 0))
+    predicted_voltages = fitted_model.voltages(conductivity)
+    return jnp.where(is_used, predicted_voltages - measured_voltages, 0) / jnp.linalg.norm(
+        jnp.where(is_used, measured_voltages, 0)
+    )
 
 
-def _gradient(contact: str, parameters, problem):
+def _misfit_gradient(contact: str, parameters, problem):
     """Gradient (p,) of half the sum of squared residuals with respect to the parameters."""
     return jax.grad(
         lambda trial_parameters: 0.5 * jnp.sum(_relative_residual(contact, trial_parameters, problem) ** 2)
@@ -106,8 +116,8 @@ def _normal_matrix(contact: str, parameters, problem):
 
 def _normal_equations_solver(contact: str, parameters, problem):
     """Function that multiplies a vector by the inverse of the normal matrix JᵀJ."""
-    inverse = symmetric_inverse(_normal_matrix(contact, parameters, problem))
-    return lambda vector: inverse @ vector
+    inverse_normal_matrix = symmetric_inverse(_normal_matrix(contact, parameters, problem))
+    return lambda right_side: inverse_normal_matrix @ right_side
 
 
 _REASON_BY_STATUS = {
@@ -122,7 +132,7 @@ _LARGE_MISFIT = 0.12
 # The largest voltage of a frame, in volts, must lie between this number and its reciprocal.
 _MIN_VOLTAGE = 1e-30
 # Relative change of the misfit or the parameters that ends a fit: on small meshes, and on large meshes.
-_TOLERANCE, _TOLERANCE_LARGE_MESH = 1e-8, 1e-4
+_FIT_TOLERANCE, _LARGE_MESH_FIT_TOLERANCE = 1e-8, 1e-4
 # Number of cells above which a mesh counts as large. A step of the fit on a large mesh takes seconds.
 _LARGE_MESH_CELLS = 30_000
 
@@ -184,24 +194,24 @@ class Calibration(Module):
     def note(self) -> str:
         """Sentence on estimated electrode positions, or else on a large misfit; empty if neither applies."""
         if self.shift is not None:
-            distances = 1e3 * np.linalg.norm(np.asarray(self.shift), axis=1)
+            shifts_in_mm = 1e3 * np.linalg.norm(np.asarray(self.shift), axis=1)
             return (
-                f"electrodes were estimated to be up to {distances.max():.2g} mm from where they are described (root "
-                f"mean square {np.sqrt(np.mean(distances**2)):.2g} mm), which explains the reference far better. If "
-                "the description is exact, look for another cause: contacts, channels, order."
+                f"electrodes were estimated to be up to {shifts_in_mm.max():.2g} mm from where they are described "
+                f"(root mean square {np.sqrt(np.mean(shifts_in_mm**2)):.2g} mm), which explains the reference far "
+                "better. If the description is exact, look for another cause: contacts, channels, order."
             )
         if not float(self.misfit) > _LARGE_MISFIT:
             return ""
         if self.model.mesh.dimension == 3:
-            possible_errors, remedy = (
+            possible_errors, further_errors = (
                 "size of the body, how high it is filled, places and sizes of the electrodes",
                 "",
             )
         else:
-            possible_errors, remedy = "radius, width of the electrodes", ", or the body deeper than a sheet"
+            possible_errors, further_errors = "radius, width of the electrodes", ", or the body deeper than a sheet"
         return (
             f"the model misses {100 * float(self.misfit):.0f} % of the reference: {possible_errors}, protocol or "
-            f"gain may be others than described{remedy}. An error that is the same in both frames hardly moves "
+            f"gain may be others than described{further_errors}. An error that is the same in both frames hardly moves "
             "the image of a change; but do not trust the size of the change, nor the background conductivity."
         )
 
@@ -244,21 +254,21 @@ def calibrate(
     """
     check_model(model)
     check_mask(mask)
-    measured = np.asarray(voltages) if has_values(voltages) else jnp.asarray(voltages)
-    number_type = complex if measured.dtype.kind == "c" else float
-    if measured.dtype.kind not in "biufc":
-        raise ValueError(f"voltages are {measured.dtype}; give numbers, in volts.")
-    measured = measured.astype(number_type)
-    shape = (model.protocol.num_measurements,)
-    is_used = np.ones(shape, bool) if mask is None else np.asarray(mask, bool)
-    if measured.shape != shape or is_used.shape != shape:
+    measured_voltages = np.asarray(voltages) if has_values(voltages) else jnp.asarray(voltages)
+    number_type = complex if measured_voltages.dtype.kind == "c" else float
+    if measured_voltages.dtype.kind not in "biufc":
+        raise ValueError(f"voltages are {measured_voltages.dtype}; give numbers, in volts.")
+    measured_voltages = measured_voltages.astype(number_type)
+    frame_shape = (model.protocol.num_measurements,)
+    is_used = np.ones(frame_shape, bool) if mask is None else np.asarray(mask, bool)
+    if measured_voltages.shape != frame_shape or is_used.shape != frame_shape:
         raise ValueError(
-            f"voltages has shape {measured.shape} and mask {is_used.shape}; protocol '{model.protocol.name}' has "
-            f"{shape}."
+            f"voltages has shape {measured_voltages.shape} and mask {is_used.shape}; protocol '{model.protocol.name}' "
+            f"has {frame_shape}."
         )
     check_name("contact", contact, ("common", "each", "fixed"))
     max_steps = check_steps("max_steps", max_steps)
-    if not has_values(model, measured):
+    if not has_values(model, measured_voltages):
         if number_type is complex:
             raise ValueError(
                 "voltages are complex, and inside jax.jit, jax.grad or jax.vmap only real ones can be fitted. Call "
@@ -266,80 +276,82 @@ def calibrate(
             )
         contact = "fixed" if model.electrodes.is_point else contact
         return Calibration(
-            *traced_fit(model, jnp.where(is_used, measured, 0), is_used, contact, max_steps), _TRACED_REASON
+            *traced_fit(model, jnp.where(is_used, measured_voltages, 0), is_used, contact, max_steps), _TRACED_REASON
         )
-    measured = np.where(is_used, measured, 0)
-    max_voltage = np.abs(measured).max()
+    measured_voltages = np.where(is_used, measured_voltages, 0)
+    max_voltage = np.abs(measured_voltages).max()
     if not np.isfinite(max_voltage) or max_voltage == 0:
         raise ValueError("voltages: the reference frame has no finite, non-zero values to calibrate on.")
     if not _MIN_VOLTAGE < max_voltage < 1 / _MIN_VOLTAGE:
         raise ValueError(f"voltages: the largest of the reference frame is {max_voltage:.3g} V; are they in volts?")
     with np.errstate(all="ignore"):
-        return _fit_parameters(model, measured, is_used, contact, max_steps)
+        return _fit_parameters(model, measured_voltages, is_used, contact, max_steps)
 
 
-def _fit_parameters(model: ForwardModel, measured, is_used, contact: str, max_steps: int) -> Calibration:
+def _fit_parameters(model: ForwardModel, measured_voltages, is_used, contact: str, max_steps: int) -> Calibration:
     if model.electrodes.is_point:
         contact = "fixed"
-    data_norm = np.linalg.norm(measured)
+    data_norm = np.linalg.norm(measured_voltages)
     # The starting conductivity is that with which the model's voltages fit the data best.
     unit_voltages = np.where(is_used, model.voltages(1.0), 0)
-    if not (unit_voltages @ measured).real > 0:
+    if not (unit_voltages @ measured_voltages).real > 0:
         raise ValueError(
             "voltages: they have the opposite sign of the model's. Is the polarity of drive or measurement turned "
             "round, or the order of the channels another than the protocol's?"
         )
-    is_complex = np.iscomplexobj(measured)
+    is_complex = np.iscomplexobj(measured_voltages)
     problem = _CalibrationProblem(model, contact, is_complex)
-    conductivity = np.log(unit_voltages @ unit_voltages / (unit_voltages @ measured))
-    initial = np.full(problem.num_parameters, conductivity.real)
+    conductivity = np.log(unit_voltages @ unit_voltages / (unit_voltages @ measured_voltages))
+    start_parameters = np.full(problem.num_parameters, conductivity.real)
     if is_complex:
-        initial[1] = conductivity.imag
+        start_parameters[1] = conductivity.imag
 
-    def real_and_imaginary_parts(residuals):
-        return np.concatenate([residuals.real, residuals.imag]) if is_complex else residuals
+    def real_and_imaginary_parts(complex_residuals):
+        return np.concatenate([complex_residuals.real, complex_residuals.imag]) if is_complex else complex_residuals
 
     def residual(parameters):
-        return real_and_imaginary_parts(np.where(is_used, problem.voltages(parameters) - measured, 0) / data_norm)
+        return real_and_imaginary_parts(
+            np.where(is_used, problem.voltages(parameters) - measured_voltages, 0) / data_norm
+        )
 
     def jacobian(parameters):
         return real_and_imaginary_parts(np.where(is_used[:, None], problem.jacobian(parameters), 0) / data_norm)
 
-    tolerance = _TOLERANCE_LARGE_MESH if model.mesh.num_cells > _LARGE_MESH_CELLS else _TOLERANCE
-    options: dict[str, Any] = {
-        "ftol": tolerance,
-        "xtol": tolerance,
+    fit_tolerance = _LARGE_MESH_FIT_TOLERANCE if model.mesh.num_cells > _LARGE_MESH_CELLS else _FIT_TOLERANCE
+    solver_options: dict[str, Any] = {
+        "ftol": fit_tolerance,
+        "xtol": fit_tolerance,
         "gtol": None,
         "max_nfev": max_steps,
         "jac": jacobian,
     }
-    solution = scipy.optimize.least_squares(residual, initial, **options)
-    fitted_model, conductivity = problem.model(solution.x)
-    voltages = as_array(problem.voltages(solution.x))
-    misfit = as_array(np.linalg.norm(residual(solution.x)))
-    status = Status.CONVERGED if solution.status > 0 else Status.STEP_LIMIT
+    fit_solution = scipy.optimize.least_squares(residual, start_parameters, **solver_options)
+    fitted_model, conductivity = problem.model(fit_solution.x)
+    voltages = as_array(problem.voltages(fit_solution.x))
+    misfit = as_array(np.linalg.norm(residual(fit_solution.x)))
+    status = Status.CONVERGED if fit_solution.status > 0 else Status.STEP_LIMIT
     status = status if np.isfinite(misfit) else Status.FAILED
-    reason = "" if status == Status.CONVERGED else _REASON_BY_STATUS[status].format(max_steps)
-    contact_deviation: Any = _standard_deviations(solution)[problem.first_contact :]
+    reason_of_end = "" if status == Status.CONVERGED else _REASON_BY_STATUS[status].format(max_steps)
+    contact_deviation: Any = _standard_deviations(fit_solution)[problem.first_contact :]
     return Calibration(
         fitted_model,
         as_array(conductivity),
         voltages,
         misfit,
         contact_deviation,
-        int(solution.njev),
+        int(fit_solution.njev),
         status.number,
-        reason,
+        reason_of_end,
     )
 
 
-def _standard_deviations(solution: "scipy.optimize.OptimizeResult") -> Float[np.ndarray, " p"]:
+def _standard_deviations(fit_solution: "scipy.optimize.OptimizeResult") -> Float[np.ndarray, " p"]:
     """Standard deviations of the fitted parameters, estimated from the Jacobian and the residuals as if the residuals
     were independent errors of equal variance."""
-    _, singular_values, right_vectors = np.linalg.svd(solution.jac, full_matrices=False)
-    degrees_of_freedom = max(np.count_nonzero(solution.fun) - len(solution.x), 1)
+    _, singular_values, right_vectors = np.linalg.svd(fit_solution.jac, full_matrices=False)
+    degrees_of_freedom = max(np.count_nonzero(fit_solution.fun) - len(fit_solution.x), 1)
     return np.linalg.norm(right_vectors / singular_values[:, None], axis=0) * np.sqrt(
-        2 * solution.cost / degrees_of_freedom
+        2 * fit_solution.cost / degrees_of_freedom
     )
 
 
@@ -377,10 +389,10 @@ class _CalibrationProblem:
         if self.contact == "fixed":
             return self.initial_model, conductivity
         electrodes = self.initial_model.electrodes
-        factor = np.exp(
+        impedance_ratio = np.exp(
             np.clip(parameters[self.first_contact :] - parameters[0], -MAX_LOG_CONTACT_RATIO, MAX_LOG_CONTACT_RATIO)
         )
-        impedance = np.asarray(electrodes.contact_impedance) * factor
+        impedance = np.asarray(electrodes.contact_impedance) * impedance_ratio
         return self.initial_model.with_electrodes(electrodes.with_contact_impedance(impedance)), conductivity
 
     def voltages(self, parameters):
@@ -394,7 +406,9 @@ class _CalibrationProblem:
         if self.sensitivity is None:
             return self._add_phase_derivative(conductivity_derivative, conductivity_derivative)
         contact_derivatives = self.sensitivity(fields, impedance, model.electrodes.contact_impedance)
-        contact_columns = np.stack([self.select(derivative) for derivative in contact_derivatives], axis=1)
+        contact_columns = np.stack(
+            [self.select(contact_derivative) for contact_derivative in contact_derivatives], axis=1
+        )
         derivative_at_fixed_contact = conductivity_derivative + contact_columns.sum(
             axis=1, keepdims=True
         )  # z·σ is proportional to σ

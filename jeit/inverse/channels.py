@@ -62,21 +62,31 @@ class IndependentChannels(Module):
         if not has_values(protocol):
             num_channels = protocol.num_measurements
             return cls(as_array(np.arange(num_channels)), as_array(np.eye(num_channels)))
-        drive, measurement = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
-        bilinear_forms = drive[:, :, None] * measurement[:, None, :]
-        rows, columns = np.triu_indices(protocol.num_electrodes)
-        bilinear_forms = (bilinear_forms + np.swapaxes(bilinear_forms, 1, 2))[:, rows, columns]
+        drive_patterns, measurement_patterns = (
+            np.asarray(protocol.channel_drive),
+            np.asarray(protocol.channel_measurement),
+        )
+        bilinear_forms = drive_patterns[:, :, None] * measurement_patterns[:, None, :]
+        row_electrodes, column_electrodes = np.triu_indices(protocol.num_electrodes)
+        bilinear_forms = (bilinear_forms + np.swapaxes(bilinear_forms, 1, 2))[:, row_electrodes, column_electrodes]
         form_norms = np.linalg.norm(bilinear_forms, axis=1)
-        factorisation: Any = scipy.linalg.qr((bilinear_forms / form_norms[:, None]).T, mode="r", pivoting=True)
-        triangle, order = factorisation[-2:]
-        rank = int(np.sum(np.abs(np.diag(triangle)) > _RANK_TOLERANCE))
-        dependent_coefficients = scipy.linalg.solve_triangular(triangle[:rank, :rank], triangle[:rank, rank:])
-        combination_matrix = np.empty((len(bilinear_forms), rank))
-        combination_matrix[order] = np.concatenate([np.eye(rank), dependent_coefficients.T]) / form_norms[order[:rank]]
+        qr_factorisation: Any = scipy.linalg.qr((bilinear_forms / form_norms[:, None]).T, mode="r", pivoting=True)
+        triangular_factor, pivot_order = qr_factorisation[-2:]
+        num_independent = int(np.sum(np.abs(np.diag(triangular_factor)) > _RANK_TOLERANCE))
+        dependent_coefficients = scipy.linalg.solve_triangular(
+            triangular_factor[:num_independent, :num_independent], triangular_factor[:num_independent, num_independent:]
+        )
+        combination_matrix = np.empty((len(bilinear_forms), num_independent))
+        combination_matrix[pivot_order] = (
+            np.concatenate([np.eye(num_independent), dependent_coefficients.T])
+            / form_norms[pivot_order[:num_independent]]
+        )
         combination_matrix *= form_norms[:, None]
         combination_matrix[np.abs(combination_matrix) < _RANK_TOLERANCE * np.abs(combination_matrix).max()] = 0
-        ascending_order = np.argsort(order[:rank])
-        return cls(as_array(order[:rank][ascending_order]), as_array(combination_matrix[:, ascending_order]))
+        ascending_order = np.argsort(pivot_order[:num_independent])
+        return cls(
+            as_array(pivot_order[:num_independent][ascending_order]), as_array(combination_matrix[:, ascending_order])
+        )
 
     def weigh(self, noise: Float[Array, " M"]) -> "ChannelWeighting":
         """Compute the map from voltages to `Data`; `noise` (M,): standard deviation of the voltages, volts."""
@@ -114,13 +124,15 @@ def _combine_voltages(weighing: ChannelWeighting, voltages) -> Data:
 
 @numpy_or_compiled
 def _compute_weighing(combination, noise) -> ChannelWeighting:
-    weighted = combination / noise[:, None]
-    precision = weighted.T @ weighted
-    weight = namespace(precision).sqrt(precision.diagonal())
-    precision = precision / (weight * weight[:, None])
+    whitened_combination = combination / noise[:, None]
+    precision = whitened_combination.T @ whitened_combination
+    inverse_deviations = namespace(precision).sqrt(precision.diagonal())
+    precision = precision / (inverse_deviations * inverse_deviations[:, None])
     covariance = symmetric_inverse(precision)
-    estimator = (covariance / weight[:, None]) @ (weighted / weight / noise[:, None]).T
-    return ChannelWeighting(noise, estimator, weight, covariance, precision)
+    estimator = (covariance / inverse_deviations[:, None]) @ (
+        whitened_combination / inverse_deviations / noise[:, None]
+    ).T
+    return ChannelWeighting(noise, estimator, inverse_deviations, covariance, precision)
 
 
 @numpy_or_compiled
@@ -146,11 +158,15 @@ def relative_noise(
     ```
     """
     xp = namespace(voltages, mask)
-    magnitude = abs(xp.asarray(voltages))
-    is_used = xp.isfinite(magnitude) if mask is None else xp.asarray(mask) & xp.isfinite(magnitude)
-    median_magnitude = xp.nanmedian(xp.where(is_used, magnitude, xp.nan))
+    voltage_magnitudes = abs(xp.asarray(voltages))
+    is_used_channel = (
+        xp.isfinite(voltage_magnitudes) if mask is None else xp.asarray(mask) & xp.isfinite(voltage_magnitudes)
+    )
+    median_magnitude = xp.nanmedian(xp.where(is_used_channel, voltage_magnitudes, xp.nan))
     return xp.where(
-        is_used, relative * xp.sqrt(xp.where(is_used, magnitude, 0) ** 2 + (floor * median_magnitude) ** 2), 1.0
+        is_used_channel,
+        relative * xp.sqrt(xp.where(is_used_channel, voltage_magnitudes, 0) ** 2 + (floor * median_magnitude) ** 2),
+        1.0,
     )
 
 
@@ -163,9 +179,9 @@ def electrode_misfits(
     see `relative_noise`; `mask`: True for usable channels. The ratio is 1 for electrodes that no usable channel uses. A
     misfit far above 1 indicates an electrode whose gain, offset or position differs from the model's.
     """
-    is_used = np.asarray(mask)
-    reads_electrode = (np.asarray(protocol.channel_measurement) != 0) & is_used[:, None]
-    squared_sums = np.where(is_used, np.abs(np.asarray(residual) / np.asarray(noise)) ** 2, 0) @ reads_electrode
+    is_used_channel = np.asarray(mask)
+    reads_electrode = (np.asarray(protocol.channel_measurement) != 0) & is_used_channel[:, None]
+    squared_sums = np.where(is_used_channel, np.abs(np.asarray(residual) / np.asarray(noise)) ** 2, 0) @ reads_electrode
     num_readings = reads_electrode.sum(axis=0)
     root_mean_squares = np.sqrt(squared_sums / np.maximum(num_readings, 1))
     median_misfit = np.median(root_mean_squares[num_readings > 0])
@@ -202,23 +218,32 @@ def repeated_noise(
         raise ValueError("frames are complex; give their real part or magnitude.")
     if not (np.isfinite(prior_frames) and prior_frames >= 0):
         raise ValueError(f"prior_frames must be a number from 0; it is {prior_frames}.")
-    values = np.asarray(frames, float)
-    if values.ndim != 2 or len(values) < 2:
-        raise ValueError(f"frames has shape {values.shape}; give at least two repeated frames, (frames, channels).")
-    is_used = np.ones(values.shape, bool) if mask is None else np.asarray(mask)
-    if is_used.dtype != bool or is_used.shape not in (values.shape, values.shape[1:]):
-        raise ValueError(f"mask must be booleans of shape {values.shape} or {values.shape[1:]}.")
-    is_used = np.broadcast_to(is_used, values.shape)
-    if not np.isfinite(values[is_used]).all():
+    voltages_of_frames = np.asarray(frames, float)
+    if voltages_of_frames.ndim != 2 or len(voltages_of_frames) < 2:
+        raise ValueError(
+            f"frames has shape {voltages_of_frames.shape}; give at least two repeated frames, (frames, channels)."
+        )
+    is_used_value = np.ones(voltages_of_frames.shape, bool) if mask is None else np.asarray(mask)
+    if is_used_value.dtype != bool or is_used_value.shape not in (
+        voltages_of_frames.shape,
+        voltages_of_frames.shape[1:],
+    ):
+        raise ValueError(
+            f"mask must be booleans of shape {voltages_of_frames.shape} or {voltages_of_frames.shape[1:]}."
+        )
+    is_used_value = np.broadcast_to(is_used_value, voltages_of_frames.shape)
+    if not np.isfinite(voltages_of_frames[is_used_value]).all():
         raise ValueError("frames: some voltages in use are NaN or infinite; mask them.")
-    num_frames = is_used.sum(axis=0)
-    mean = np.where(is_used, values, 0).sum(axis=0) / np.maximum(num_frames, 1)
-    squares = np.where(is_used, (values - mean) ** 2, 0).sum(axis=0)
+    num_frames = is_used_value.sum(axis=0)
+    mean = np.where(is_used_value, voltages_of_frames, 0).sum(axis=0) / np.maximum(num_frames, 1)
+    sums_of_squares = np.where(is_used_value, (voltages_of_frames - mean) ** 2, 0).sum(axis=0)
     has_variance = num_frames >= 2
     if not has_variance.any():
         raise ValueError("mask: it leaves no channel with two frames.")
-    if not squares[has_variance].any():
+    if not sums_of_squares[has_variance].any():
         raise ValueError("frames: all are alike, so the noise cannot be estimated; is one frame repeated?")
-    median_variance = np.median((squares[has_variance] / (num_frames[has_variance] - 1))[squares[has_variance] > 0])
+    median_variance = np.median(
+        (sums_of_squares[has_variance] / (num_frames[has_variance] - 1))[sums_of_squares[has_variance] > 0]
+    )
     degrees_of_freedom = np.where(has_variance, num_frames - 1, 1) + prior_frames
-    return np.where(has_variance, np.sqrt((squares + prior_frames * median_variance) / degrees_of_freedom), 1.0)
+    return np.where(has_variance, np.sqrt((sums_of_squares + prior_frames * median_variance) / degrees_of_freedom), 1.0)

@@ -60,15 +60,17 @@ class DirectProblem(Module):
             if jnp.iscomplexobj(regularised_covariance)
             else symmetric_inverse(regularised_covariance)
         )
-        matrix = self.product @ inverse
+        reconstruction_matrix = self.product @ inverse
         if self.null_space.shape[1]:
             null_space_data = self.jacobian @ self.null_space
             weighted_null_space_data = inverse @ null_space_data
             null_space_weights = weighted_null_space_data @ jnp.linalg.pinv(
                 adjoint(null_space_data) @ weighted_null_space_data
             )
-            matrix = matrix + (self.null_space - matrix @ null_space_data) @ adjoint(null_space_weights)
-        return matrix @ self.directions.T
+            reconstruction_matrix = reconstruction_matrix + (
+                self.null_space - reconstruction_matrix @ null_space_data
+            ) @ adjoint(null_space_weights)
+        return reconstruction_matrix @ self.directions.T
 
 
 # Singular values below this fraction of the largest singular value are rounding errors.
@@ -113,25 +115,31 @@ class Linearisation(Module):
             )
         if np.shape(conductivity) not in ((), (model.mesh.num_cells,)):
             raise ValueError("conductivity: give one number, or one value per cell: the image has a value per cell.")
-        channels, root_weight = used_channels(model, noise, mask)
-        if has_values(model, conductivity, root_weight, prior):
-            directions = data_directions(model.protocol, channels, root_weight)
+        used_channel_indices, inverse_noise = used_channels(model, noise, mask)
+        if has_values(model, conductivity, inverse_noise, prior):
+            data_basis = data_directions(model.protocol, used_channel_indices, inverse_noise)
             reduced_jacobian: Any = combined_jacobian(
-                model, conductivity, channels, (root_weight[:, None] * directions).T
+                model, conductivity, used_channel_indices, (inverse_noise[:, None] * data_basis).T
             )
-            product = prior.covariance_product(model.mesh, reduced_jacobian.conj())
-            num_redundant_channels = model.protocol.repeated_facts(channels)
+            covariance_times_jacobian = prior.covariance_product(model.mesh, reduced_jacobian.conj())
+            num_redundant_channels = model.protocol.repeated_facts(used_channel_indices)
             null_space = prior.null_space(model.mesh)
             spectrum = Spectrum.create(
-                reduced_jacobian, product, null_space, as_array(directions), num_redundant_channels
+                reduced_jacobian,
+                covariance_times_jacobian,
+                null_space,
+                as_array(data_basis),
+                num_redundant_channels,
             )
         else:
             jacobian = model.jacobian(conductivity)
-            directions = _traced_directions(model.protocol, channels, root_weight)
-            reduced_jacobian = directions.T @ (root_weight[:, None] * jacobian[channels])
-            product = prior.covariance_product(model.mesh, reduced_jacobian.conj())
-            spectrum = DirectProblem(directions, reduced_jacobian, product, prior.null_space(model.mesh))
-        return cls(spectrum, prior, channels, root_weight, model.protocol.num_measurements)
+            data_basis = _traced_directions(model.protocol, used_channel_indices, inverse_noise)
+            reduced_jacobian = data_basis.T @ (inverse_noise[:, None] * jacobian[used_channel_indices])
+            covariance_times_jacobian = prior.covariance_product(model.mesh, reduced_jacobian.conj())
+            spectrum = DirectProblem(
+                data_basis, reduced_jacobian, covariance_times_jacobian, prior.null_space(model.mesh)
+            )
+        return cls(spectrum, prior, used_channel_indices, inverse_noise, model.protocol.num_measurements)
 
     def whiten(self, difference: ArrayLike) -> Float[Array, " K"]:
         """Change of voltages `difference` (M,) divided by the standard deviations of the channels, for the channels in
@@ -146,10 +154,10 @@ class Linearisation(Module):
             )
         if not has_values(difference, self.root_weight):
             return self.root_weight * jnp.asarray(difference)[self.channels]
-        data = self.root_weight * np.asarray(difference)[self.channels]
-        if not np.isfinite(data).all():
+        weighted_difference = self.root_weight * np.asarray(difference)[self.channels]
+        if not np.isfinite(weighted_difference).all():
             raise ValueError("difference has NaN or infinite voltages in channels in use; mask them.")
-        return as_array(data)
+        return as_array(weighted_difference)
 
     def matrix(self, hyperparameter) -> Float[Array, "m M"]:
         """Reconstruction matrix (m, M) for hyperparameter λ: change of conductivity per volt, zero for channels not in
@@ -161,18 +169,20 @@ class Linearisation(Module):
                 .at[:, self.channels]
                 .set(channel_matrix)
             )
-        images, weights = self.factors(hyperparameter)
-        return as_array(images @ weights)
+        images, channel_weights = self.factors(hyperparameter)
+        return as_array(images @ channel_weights)
 
     def factors(self, hyperparameter) -> tuple[Float[np.ndarray, "m k"], Float[np.ndarray, "k M"]]:
         """Factors of the reconstruction matrix: images (m, k), and weights of the images (k, M) in 1 / volts. Not
         available for traced problems."""
         assert isinstance(self.spectrum, Spectrum)
         spectrum, host_hyperparameter = on_host((self.spectrum, hyperparameter))  # NumPy arrays are not copied
-        images, whitened = (np.asarray(factor) for factor in spectrum.factors(host_hyperparameter))
-        weights: Any = np.zeros((whitened.shape[0], self.num_channels), whitened.dtype)
-        weights[:, self.channels] = whitened * self.root_weight
-        return images, weights
+        images, whitened_weights = (
+            np.asarray(matrix_factor) for matrix_factor in spectrum.factors(host_hyperparameter)
+        )
+        channel_weights: Any = np.zeros((whitened_weights.shape[0], self.num_channels), whitened_weights.dtype)
+        channel_weights[:, self.channels] = whitened_weights * self.root_weight
+        return images, channel_weights
 
 
 def combined_blocks(
@@ -189,11 +199,11 @@ def combined_blocks(
     if num_electrodes * (num_electrodes + 1) // 2 < len(channels):
         # There are fewer products of fields than channels, so the products are computed: ∂v = -Σ_ab d_a m_b ∫ ∇u_a ·
         # ∇u_b.
-        weights, blocks = -weights @ _linear_forms(model.protocol, channels), field_products(mesh, fields)
+        weights, field_product_blocks = -weights @ _linear_forms(model.protocol, channels), field_products(mesh, fields)
     else:
-        blocks = jacobian_blocks(mesh, protocol, fields)
-    for cells, block in blocks:
-        yield cells, weights @ np.asarray(block)
+        field_product_blocks = jacobian_blocks(mesh, protocol, fields)
+    for cells, field_product_block in field_product_blocks:
+        yield cells, weights @ np.asarray(field_product_block)
 
 
 def combined_jacobian(
@@ -203,8 +213,8 @@ def combined_jacobian(
     S)."""
     number_type = complex if np.iscomplexobj(conductivity) else float
     jacobian = np.empty((len(weights), model.mesh.num_cells), number_type)
-    for cells, block in combined_blocks(model, conductivity, channels, weights):
-        jacobian[:, cells] = block
+    for cells, jacobian_block in combined_blocks(model, conductivity, channels, weights):
+        jacobian[:, cells] = jacobian_block
     return jacobian
 
 
@@ -213,24 +223,24 @@ def used_channels(model: ForwardModel, noise, mask) -> tuple[np.ndarray, Float[A
     volts. Raises `ValueError` for an invalid mask or noise."""
     check_mask(mask)
     num_channels = model.protocol.num_measurements
-    is_used = np.ones(num_channels, bool) if mask is None else np.asarray(mask, bool)
-    if is_used.shape != (num_channels,) or not is_used.any():
+    is_used_channel = np.ones(num_channels, bool) if mask is None else np.asarray(mask, bool)
+    if is_used_channel.shape != (num_channels,) or not is_used_channel.any():
         raise ValueError(f"mask must be ({num_channels},) booleans with at least one True: one for each channel.")
-    deviation = np.asarray(noise, float) if has_values(noise) else jnp.asarray(noise, float)
-    if deviation.shape not in ((), (num_channels,)):
+    noise_deviation = np.asarray(noise, float) if has_values(noise) else jnp.asarray(noise, float)
+    if noise_deviation.shape not in ((), (num_channels,)):
         raise ValueError(
-            f"noise has shape {deviation.shape}; give one number, or one for each channel: ({num_channels},)."
+            f"noise has shape {noise_deviation.shape}; give one number, or one for each channel: ({num_channels},)."
         )
-    deviation = namespace(deviation).broadcast_to(deviation, (num_channels,))[is_used]
-    if has_values(deviation) and not (np.isfinite(deviation) & (deviation > 0)).all():
+    noise_deviation = namespace(noise_deviation).broadcast_to(noise_deviation, (num_channels,))[is_used_channel]
+    if has_values(noise_deviation) and not (np.isfinite(noise_deviation) & (noise_deviation > 0)).all():
         raise ValueError("noise must be positive and finite for every channel in use.")
-    return np.flatnonzero(is_used), 1 / deviation
+    return np.flatnonzero(is_used_channel), 1 / noise_deviation
 
 
 def check_mask(mask) -> None:
     """Raise `ValueError` for a traced mask, because the number of channels in use must be known."""
-    remedy = "give it as an array of NumPy, outside; to weigh channels by what is traced, give noise"
-    check_has_values("mask", mask, "which channels are used depends on", remedy)
+    advice_to_user = "give it as an array of NumPy, outside; to weigh channels by what is traced, give noise"
+    check_has_values("mask", mask, "which channels are used depends on", advice_to_user)
 
 
 def data_directions(protocol: Protocol, channels, root_weight) -> Float[np.ndarray, "K r"]:
@@ -240,10 +250,10 @@ def data_directions(protocol: Protocol, channels, root_weight) -> Float[np.ndarr
     For a drive d and a measurement m, which sum to zero, and a symmetric matrix G (the transfer impedance or its
     derivative), Σ_ab d_a m_b G_ab = Σ_a<b (d_a m_b + d_b m_a)(G_ab - (G_aa + G_bb)/2).
     """
-    directions, singular_values, _ = np.linalg.svd(
+    right_singular_vectors, singular_values, _ = np.linalg.svd(
         root_weight[:, None] * _pair_coefficients(protocol, channels), full_matrices=False
     )
-    return directions[:, singular_values > _RANK_TOLERANCE * singular_values[0]]
+    return right_singular_vectors[:, singular_values > _RANK_TOLERANCE * singular_values[0]]
 
 
 def _traced_directions(protocol: Protocol, channels, root_weight) -> Float[Array, "K r"]:
@@ -260,15 +270,18 @@ def _traced_directions(protocol: Protocol, channels, root_weight) -> Float[Array
 def _pair_coefficients(protocol: Protocol, channels) -> Float[np.ndarray, "K e"]:
     """Coefficients (K, e) by which the voltages of K channels depend on the transfer impedances of e pairs of
     electrodes."""
-    rows, columns = np.triu_indices(protocol.num_electrodes)
-    return _linear_forms(protocol, channels)[:, rows < columns]
+    row_electrodes, column_electrodes = np.triu_indices(protocol.num_electrodes)
+    return _linear_forms(protocol, channels)[:, row_electrodes < column_electrodes]
 
 
 def _linear_forms(protocol: Protocol, channels) -> Float[np.ndarray, "K f"]:
     """Coefficients (K, f) by which the voltages of K channels depend linearly on the symmetric matrix of transfer
     impedances between electrodes, of which f entries are in the upper triangle and on the diagonal."""
     drive = np.asarray(protocol.drive)[np.asarray(protocol.drive_index)[channels]]
-    measurement = np.asarray(protocol.measurement)[np.asarray(protocol.measurement_index)[channels]]
-    rows, columns = np.triu_indices(protocol.num_electrodes)
-    symmetric_sums = drive[:, rows] * measurement[:, columns] + drive[:, columns] * measurement[:, rows]
-    return np.where(rows < columns, symmetric_sums, symmetric_sums / 2)
+    measurement_patterns = np.asarray(protocol.measurement)[np.asarray(protocol.measurement_index)[channels]]
+    row_electrodes, column_electrodes = np.triu_indices(protocol.num_electrodes)
+    symmetric_sums = (
+        drive[:, row_electrodes] * measurement_patterns[:, column_electrodes]
+        + drive[:, column_electrodes] * measurement_patterns[:, row_electrodes]
+    )
+    return np.where(row_electrodes < column_electrodes, symmetric_sums, symmetric_sums / 2)

@@ -42,7 +42,7 @@ from jeit_solvers.engines import RecentResultsCache, as_array, on_host
 _INDIVIDUAL_CONTACT_DEVIATION, _COMMON_CONTACT_DEVIATION, _CONDUCTIVITY_DEVIATION = 1.0, 4.0, 2.0
 # Maximum numbers of steps of the two fits, before and after κ is estimated, and the tolerance of their cost, by
 # dimension of the mesh. A step in a solid takes a second.
-_MAX_STEPS, _RTOL = {2: (40, 40), 3: (5, 3)}, {2: 1e-4, 3: 3e-3}
+_MAX_STEPS, _RELATIVE_TOLERANCE = {2: (40, 40), 3: (5, 3)}, {2: 1e-4, 3: 3e-3}
 # Default standard deviation of electrode positions, as a share of the width of the body: 2° of a disk.
 _RELATIVE_POSITION_DEVIATION = 0.0175
 # Minimum of κ, the noise in units of `relative_noise`: 0.1 means 0.1 % of a voltage.
@@ -74,12 +74,12 @@ class Uncertainty:
 
     def __post_init__(self):
         for name, upper_limit in (("position", np.inf), ("drift", np.inf), ("size", 1.0), ("other", 1.0)):
-            value: Any = getattr(self, name)
-            is_valid = is_number(value) and np.isfinite(value) and 0 <= float(value) <= upper_limit
-            if not (is_valid or (value is None and name == "position")):
-                expected = "metres, 0 or more" if name == "position" else "a share, not per cent"
-                expected += " from 0 to 1" if upper_limit == 1 else ""
-                raise ValueError(f"{name} must be a number, {expected}; it is {describe(value)}.")
+            field_value: Any = getattr(self, name)
+            is_valid = is_number(field_value) and np.isfinite(field_value) and 0 <= float(field_value) <= upper_limit
+            if not (is_valid or (field_value is None and name == "position")):
+                expected_value = "metres, 0 or more" if name == "position" else "a share, not per cent"
+                expected_value += " from 0 to 1" if upper_limit == 1 else ""
+                raise ValueError(f"{name} must be a number, {expected_value}; it is {describe(field_value)}.")
 
     def position_on(self, mesh: Mesh) -> float:
         """`position`, or its default on a mesh, metres."""
@@ -139,16 +139,19 @@ class ModelError(NamedTuple):
         matrix with its transpose.
         """
         electrodes: Any = model.electrodes
-        sensitivity, protocol = PlacementSensitivity(model.mesh, electrodes), on_host(model.protocol)
+        placement_sensitivity, protocol = PlacementSensitivity(model.mesh, electrodes), on_host(model.protocol)
 
-        def channels(impedances):
+        def channel_rows(impedances):
             return np.stack([np.asarray(select_channels(protocol, impedance)) for impedance in impedances], axis=1)
 
-        derivatives, background_derivatives = (
-            sensitivity(*map(np.asarray, model.fields(cell_values))) for cell_values in (conductivity, background)
+        impedance_derivatives, background_derivatives = (
+            placement_sensitivity(*map(np.asarray, model.fields(cell_values)))
+            for cell_values in (conductivity, background)
         )
-        drift_errors = self.drift * channels(derivatives[-electrodes.num_electrodes :])
-        return np.concatenate([channels(derivatives - background_derivatives) @ self.factor, drift_errors], axis=1)
+        drift_errors = self.drift * channel_rows(impedance_derivatives[-electrodes.num_electrodes :])
+        return np.concatenate(
+            [channel_rows(impedance_derivatives - background_derivatives) @ self.factor, drift_errors], axis=1
+        )
 
 
 class _LinearisedModel(NamedTuple):
@@ -188,33 +191,37 @@ def place_electrodes(
     placed = place_electrodes(model, reference, deviation=1e-3)
     ```
     """
-    measured, used = check_frame(model, voltages, mask)
-    check_has_values("place_electrodes", (model, measured), "the fit takes steps of NumPy", "take calibrate")
-    width = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
-    if not (is_number(deviation) and 0 <= deviation < width):
+    measured_voltages, is_used_channel = check_frame(model, voltages, mask)
+    check_has_values("place_electrodes", (model, measured_voltages), "the fit takes steps of NumPy", "take calibrate")
+    body_width = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
+    if not (is_number(deviation) and 0 <= deviation < body_width):
         raise ValueError(
-            f"deviation must be a number of metres, less than the width of the body, {width:.3g} m; it is "
+            f"deviation must be a number of metres, less than the width of the body, {body_width:.3g} m; it is "
             f"{describe(deviation)}."
         )
     if not isinstance(model.electrodes, AbstractMovableElectrodes):
         raise ValueError(f"electrodes: {type(model.electrodes).__name__} have no position that can be estimated.")
-    problem = _PlacementProblem(model, np.asarray(measured), used, deviation)
+    problem = _PlacementProblem(model, np.asarray(measured_voltages), is_used_channel, deviation)
     num_coefficients, noise_scale = len(problem.spread), 1.0
     coefficients: Any = np.zeros(num_coefficients)
     fitted_point, covariance = None, np.eye(num_coefficients)
     for max_steps in _MAX_STEPS[model.mesh.dimension]:
-        descent = Descent(rtol=_RTOL[model.mesh.dimension], damping=1e-2, history=max_steps + 1)
-        coefficients, _ = descent.at_once(problem.expand, coefficients, noise_scale, max_steps)
+        gauss_newton_descent = Descent(
+            rtol=_RELATIVE_TOLERANCE[model.mesh.dimension], damping=1e-2, history=max_steps + 1
+        )
+        coefficients, _ = gauss_newton_descent.at_once(problem.expand, coefficients, noise_scale, max_steps)
         fitted_point = problem.at(coefficients)
         if fitted_point is None or not np.isfinite(fitted_point.voltages).all():
             raise ValueError("voltages: no electrode positions were found that explain them.")
         noise_scale, covariance = problem.noise_and_covariance(fitted_point, noise_scale)
     assert fitted_point is not None
-    factor, shape = problem.factor(covariance), problem.directions.shape[:2]
-    num_shifts = shape[0] * shape[1]
-    shift = (problem.spread @ coefficients)[1 : 1 + num_shifts].reshape(shape)
-    shift_deviation = np.linalg.norm(factor[:num_shifts], axis=1).reshape(shape)
-    return Placement(fitted_point.model, fitted_point.conductivity, shift, shift_deviation, ModelError(factor))
+    covariance_factor, shape_of_shifts = problem.factor(covariance), problem.directions.shape[:2]
+    num_shifts = shape_of_shifts[0] * shape_of_shifts[1]
+    position_shift = (problem.spread @ coefficients)[1 : 1 + num_shifts].reshape(shape_of_shifts)
+    shift_deviation = np.linalg.norm(covariance_factor[:num_shifts], axis=1).reshape(shape_of_shifts)
+    return Placement(
+        fitted_point.model, fitted_point.conductivity, position_shift, shift_deviation, ModelError(covariance_factor)
+    )
 
 
 class _PlacementProblem:
@@ -249,39 +256,39 @@ class _PlacementProblem:
         """Compute the model with the parameters that follow from the `coefficients`; None if electrodes would overlap
         or leave the body."""
         num_electrodes, num_directions = self.directions.shape[:2]
-        parameters = self.spread @ coefficients
-        shifts, log_contact = (
-            parameters[1 : 1 + num_electrodes * num_directions].reshape(num_electrodes, num_directions),
-            parameters[1 + num_electrodes * num_directions :],
+        physical_parameters = self.spread @ coefficients
+        position_shifts, log_contact = (
+            physical_parameters[1 : 1 + num_electrodes * num_directions].reshape(num_electrodes, num_directions),
+            physical_parameters[1 + num_electrodes * num_directions :],
         )
-        log_conductivity = self.log_conductivity + parameters[0]
+        log_conductivity = self.log_conductivity + physical_parameters[0]
         described_electrodes: Any = self.described_model.electrodes
-        shifted_electrodes: Any = shift_electrodes(described_electrodes, self.directions, shifts)
-        impedance = np.asarray(described_electrodes.contact_impedance) * np.exp(log_contact - parameters[0])
+        shifted_electrodes: Any = shift_electrodes(described_electrodes, self.directions, position_shifts)
+        impedance = np.asarray(described_electrodes.contact_impedance) * np.exp(log_contact - physical_parameters[0])
         try:
             model = self.described_model.with_electrodes(shifted_electrodes.with_contact_impedance(impedance))
         except ValueError:
             return None
         conductivity = float(np.exp(log_conductivity))
-        fields, transfer = on_host(model.fields(conductivity))
-        predicted = np.asarray(select_channels(self.protocol, transfer))
-        return _LinearisedModel(model, conductivity, fields, transfer, predicted)
+        fields, transfer_impedance = on_host(model.fields(conductivity))
+        predicted_voltages = np.asarray(select_channels(self.protocol, transfer_impedance))
+        return _LinearisedModel(model, conductivity, fields, transfer_impedance, predicted_voltages)
 
     def expand(self, coefficients, scale: float) -> QuadraticModel:
         """Cost at the coefficients, and the function that computes a Levenberg-Marquardt step, for a `scale` κ of the
         noise."""
-        point = self.at(coefficients)
-        if point is None:
+        linearised_model = self.at(coefficients)
+        if linearised_model is None:
             return np.inf, lambda damping: None  # pyright: ignore
-        residual = self._residual(point) / scale
-        cost = 0.5 * (residual @ residual + coefficients @ coefficients)
-        identity: Any = np.eye(len(residual))
+        residual = self._residual(linearised_model) / scale
+        objective_value = 0.5 * (residual @ residual + coefficients @ coefficients)
+        data_identity: Any = np.eye(len(residual))
 
-        def step(damping):
-            rows = self.jacobian(point) / scale
-            return ridge_model(residual, rows, coefficients, identity, identity)[1](damping)  # pyright: ignore
+        def regularised_step(damping):
+            weighted_jacobian = self.jacobian(linearised_model) / scale
+            return ridge_model(residual, weighted_jacobian, coefficients, data_identity, data_identity)[1](damping)  # pyright: ignore
 
-        return cost, step
+        return objective_value, regularised_step
 
     def noise_and_covariance(self, point: _LinearisedModel, scale: float) -> tuple[float, Float[np.ndarray, "p p"]]:
         """Noise scale κ estimated from the residual of a fit at `scale`, and the posterior covariance of the
@@ -290,12 +297,12 @@ class _PlacementProblem:
         Dependent channels count once: the number of degrees of freedom of the residual is the number of independent
         channels minus the effective number of parameters of the fit.
         """
-        residual, rows = self._residual(point), self.jacobian(point)
+        residual, jacobian_rows = self._residual(point), self.jacobian(point)
         num_independent = min(self.num_independent, len(residual))
         independent_data_share = num_independent / len(residual)
         # Computed from eigenvalues, the covariance stays positive definite where rounding makes the Hessian's inverse
         # indefinite.
-        eigenvalues, eigenvectors = np.linalg.eigh(rows.T @ rows)
+        eigenvalues, eigenvectors = np.linalg.eigh(jacobian_rows.T @ jacobian_rows)
         eigenvalues = np.maximum(eigenvalues, 0)
         num_fitted = np.sum(eigenvalues / (eigenvalues + scale**2))
         degrees_of_freedom = max(num_independent - num_fitted, 0.3 * num_independent)
@@ -325,7 +332,7 @@ class _PlacementProblem:
         impedance_derivatives = np.concatenate(
             [-point.impedance[None], placement_derivatives]
         )  # the first column with respect to log σ at fixed zσ
-        rows = np.stack(
+        channel_rows = np.stack(
             [np.asarray(select_channels(self.protocol, impedance)) for impedance in impedance_derivatives], axis=1
         )
-        return (rows / self.noise[:, None])[self.used] @ self.spread
+        return (channel_rows / self.noise[:, None])[self.used] @ self.spread

@@ -85,8 +85,8 @@ class Spectrum(Module):
 
     def reconstruction(self, hyperparameter) -> Float[Array, "m M"]:
         """Reconstruction matrix R_λ (m, M) for whitened data."""
-        images, weights = self.factors(hyperparameter)
-        return images @ weights
+        images, data_weights = self.factors(hyperparameter)
+        return images @ data_weights
 
     def factors(self, hyperparameter) -> tuple[Float[Array, "m k"], Float[Array, "k M"]]:
         """Factors of R_λ = images · weights: images (m, k) and weights (k, M), k at most the dimension of the data plus
@@ -108,9 +108,9 @@ class Spectrum(Module):
     def squared_modes(self) -> Float[np.ndarray, " k"]:
         """Squared absolute value of each of the `modes`, averaged over all cells, or on large meshes over a subset of
         about `_NUM_MEAN_CELLS` cells."""
-        images, weights = evaluate_in_numpy(_mode_factors, self)
+        images, data_weights = evaluate_in_numpy(_mode_factors, self)
         sampled_images = images[:: max(1, len(images) // _NUM_MEAN_CELLS)]
-        return np.mean(np.abs(sampled_images @ weights) ** 2, axis=0)
+        return np.mean(np.abs(sampled_images @ data_weights) ** 2, axis=0)
 
     def candidates(self, size: int = 200) -> Float[np.ndarray, " K"]:
         """Candidate λ (K,), logarithmically spaced from 1e-6 to 10 times the square root of the largest eigenvalue."""
@@ -123,9 +123,9 @@ class Spectrum(Module):
         if data is None or not has_values(data):
             return np.zeros(0), np.zeros(0)
         eigenvalues = np.asarray(self.eigenvalues)
-        components = abs(adjoint(np.asarray(self.basis)) @ np.asarray(data))
-        damped = (components / (eigenvalues + candidates[:, None] ** 2)) ** 2
-        return candidates**2 * np.sqrt(damped.sum(axis=1)), np.sqrt(damped @ eigenvalues)
+        data_components = abs(adjoint(np.asarray(self.basis)) @ np.asarray(data))
+        damped_components = (data_components / (eigenvalues + candidates[:, None] ** 2)) ** 2
+        return candidates**2 * np.sqrt(damped_components.sum(axis=1)), np.sqrt(damped_components @ eigenvalues)
 
 
 @numpy_or_compiled
@@ -134,26 +134,26 @@ def _decompose(jacobian, product, null_space, directions):
     data_covariance = directions @ (jacobian @ product) @ directions.T
     null_space_data = directions @ (jacobian @ null_space)
     if null_space.shape[1] == 0:
-        eigenvalues, vectors = symmetric_eigen((data_covariance + adjoint(data_covariance)) / 2)
-        return vectors, xp.maximum(eigenvalues, 0), null_space_data, data_covariance
-    complement = xp.linalg.qr(null_space_data, mode="complete")[0][:, null_space.shape[1] :]
-    projected = adjoint(complement) @ data_covariance @ complement
-    eigenvalues, vectors = symmetric_eigen((projected + adjoint(projected)) / 2)
-    return complement @ vectors, xp.maximum(eigenvalues, 0), null_space_data, data_covariance
+        eigenvalues, projected_eigenvectors = symmetric_eigen((data_covariance + adjoint(data_covariance)) / 2)
+        return projected_eigenvectors, xp.maximum(eigenvalues, 0), null_space_data, data_covariance
+    null_space_complement = xp.linalg.qr(null_space_data, mode="complete")[0][:, null_space.shape[1] :]
+    projected_covariance = adjoint(null_space_complement) @ data_covariance @ null_space_complement
+    eigenvalues, projected_eigenvectors = symmetric_eigen((projected_covariance + adjoint(projected_covariance)) / 2)
+    return null_space_complement @ projected_eigenvectors, xp.maximum(eigenvalues, 0), null_space_data, data_covariance
 
 
 @numpy_or_compiled
 def _reconstruction_factors(spectrum: Spectrum, hyperparameter):
     basis, xp = spectrum.basis, namespace(spectrum)
     inverse = (basis / (spectrum.eigenvalues + hyperparameter**2)) @ adjoint(basis)
-    weights = spectrum.directions.T @ inverse
+    data_weights = spectrum.directions.T @ inverse
     if spectrum.null_space.shape[1] == 0:
-        return spectrum.images, weights
+        return spectrum.images, data_weights
     # Coefficients of the null space, fitted by least squares to the data that the penalised part does not explain.
     coefficients = xp.linalg.pinv(spectrum.observed_null_space)
-    unexplained = np.eye(basis.shape[0]) - spectrum.outer @ inverse
+    unexplained_projector = np.eye(basis.shape[0]) - spectrum.outer @ inverse
     images = xp.concatenate([spectrum.images, spectrum.null_space], axis=1)
-    return images, xp.concatenate([weights, coefficients @ unexplained])
+    return images, xp.concatenate([data_weights, coefficients @ unexplained_projector])
 
 
 @numpy_or_compiled
@@ -168,15 +168,15 @@ def _spectrum_image(spectrum: Spectrum, data, hyperparameter):
 
 @numpy_or_compiled
 def _modes(spectrum: Spectrum):
-    images, weights = _mode_factors(spectrum)
-    return images @ weights
+    images, data_weights = _mode_factors(spectrum)
+    return images @ data_weights
 
 
 def _mode_factors(spectrum: Spectrum):
-    weights, xp = spectrum.directions.T @ spectrum.basis, namespace(spectrum)
+    data_weights, xp = spectrum.directions.T @ spectrum.basis, namespace(spectrum)
     if spectrum.null_space.shape[1] == 0:
-        return spectrum.images, weights
+        return spectrum.images, data_weights
     null_space_weights = xp.linalg.pinv(spectrum.observed_null_space) @ (spectrum.outer @ spectrum.basis)
     return xp.concatenate([spectrum.images, -spectrum.null_space], axis=1), xp.concatenate(
-        [weights, null_space_weights]
+        [data_weights, null_space_weights]
     )

@@ -81,8 +81,8 @@ class Posterior(Module):
 
     def standard_deviation(self) -> Float[Array, " m"]:
         """Standard deviation of the conductivity of every cell, S/m (2-D: S), with the link linearised."""
-        estimate, deviation = _sample_estimates(self)
-        return self.inversion.link.slope(estimate) * deviation
+        estimate, deviation_of_estimate = _sample_estimates(self)
+        return self.inversion.link.slope(estimate) * deviation_of_estimate
 
     def credible_interval(self, probability: float = 0.95) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Lower and upper limits, S/m (2-D: S), between which the conductivity of a cell lies with this `probability`,
@@ -94,11 +94,11 @@ class Posterior(Module):
         if not 0 < probability < 1:
             raise ValueError(f"probability must lie between 0 and 1; it is {probability}.")
         normal_quantile = scipy.special.ndtri(0.5 + probability / 2)
-        estimate, deviation = _sample_estimates(self)
-        link = self.inversion.link
-        return link.conductivity(estimate - normal_quantile * deviation), link.conductivity(
-            estimate + normal_quantile * deviation
-        )
+        estimate, deviation_of_estimate = _sample_estimates(self)
+        conductivity_link = self.inversion.link
+        return conductivity_link.conductivity(
+            estimate - normal_quantile * deviation_of_estimate
+        ), conductivity_link.conductivity(estimate + normal_quantile * deviation_of_estimate)
 
     def region(self, cells: ArrayLike) -> tuple[float | Float[Array, ""], float | Float[Array, ""]]:
         """Mean conductivity of the selected `cells`, weighted by area (3-D: volume), and its standard deviation, S/m
@@ -117,27 +117,29 @@ class Posterior(Module):
         is_in_region[indices] = True
         if not is_in_region.any():
             raise ValueError("cells: none is chosen; give at least one.")
-        weight = jnp.where(is_in_region, cell_measures, 0) / cell_measures[is_in_region].sum()
-        mean, deviation = _weighted_mean(self, weight)
-        return (float(mean), float(deviation)) if has_values(mean) else (mean, deviation)
+        region_weights = jnp.where(is_in_region, cell_measures, 0) / cell_measures[is_in_region].sum()
+        mean, deviation_of_mean = _weighted_mean(self, region_weights)
+        return (float(mean), float(deviation_of_mean)) if has_values(mean) else (mean, deviation_of_mean)
 
     def unknowns(self) -> dict[str, Float[Array, " k"]]:
         """Standard deviations of the unknowns estimated along with the conductivity, in the units of
         `Reconstruction.unknowns`; obtained by linearisation for quantities whose logarithm was estimated."""
-        model, values = self.inversion.model, self.inversion.values(self.coefficients)
+        model, unknown_values = self.inversion.model, self.inversion.values(self.coefficients)
         first_index = self.inversion.basis.num_coefficients
-        deviation = jnp.sqrt(1 - jnp.sum((self.root @ self.cross) ** 2, axis=0))
-        deviations = {}
-        for unknown, value in zip(self.inversion.unknowns, values, strict=True):
-            tangent = jnp.ones_like(value)
-            _, slope = jax.jvp(
-                lambda values, parameter=unknown: parameter.quantity(model, values), (value,), (tangent,)
+        coefficient_deviations = jnp.sqrt(1 - jnp.sum((self.root @ self.cross) ** 2, axis=0))
+        deviations_by_name = {}
+        for unknown, unknown_value in zip(self.inversion.unknowns, unknown_values, strict=True):
+            deviation_tangent = jnp.ones_like(unknown_value)
+            _, quantity_slope = jax.jvp(
+                lambda unknown_values, parameter=unknown: parameter.quantity(model, unknown_values),
+                (unknown_value,),
+                (deviation_tangent,),
             )
-            deviations[type(unknown).__name__] = (
-                slope * unknown.deviation * deviation[first_index : first_index + unknown.size]
+            deviations_by_name[type(unknown).__name__] = (
+                quantity_slope * unknown.deviation * coefficient_deviations[first_index : first_index + unknown.size]
             )
             first_index += unknown.size
-        return deviations
+        return deviations_by_name
 
     def sample(self, key: PRNGKeyArray, number: int) -> Float[Array, "number m"]:
         """Draw conductivities (number, m) from the posterior, S/m (2-D: S). Raises `ValueError` if `key` is not a key
@@ -219,14 +221,14 @@ def _sample_estimates(posterior: Posterior):
     unknown_indicators = [
         np.arange(len(coefficients)) == coefficient_index for coefficient_index in range(num_basis, len(coefficients))
     ]
-    unknown_images = [inversion.estimate(coefficients + indicator) - estimate for indicator in unknown_indicators]
+    unknown_images = [inversion.estimate(coefficients + unit_vector) - estimate for unit_vector in unknown_indicators]
     variance = posterior.prior.variance(basis) + sum(image**2 for image in unknown_images)
     num_rows = len(posterior.root)
-    for start in range(0, num_rows, _ROWS_AT_ONCE):
-        gain = posterior.root[start : start + _ROWS_AT_ONCE] @ posterior.cross
-        row_images = expand_rows(basis, gain[:, :num_basis])
+    for first_row in range(0, num_rows, _ROWS_AT_ONCE):
+        gain_rows = posterior.root[first_row : first_row + _ROWS_AT_ONCE] @ posterior.cross
+        row_images = expand_rows(basis, gain_rows[:, :num_basis])
         for coefficient_index, image in enumerate(unknown_images):
-            row_images = row_images + gain[:, num_basis + coefficient_index, None] * image
+            row_images = row_images + gain_rows[:, num_basis + coefficient_index, None] * image
         variance = variance - (row_images**2).sum(axis=0)
     return estimate, xp.sqrt(xp.maximum(variance, 0))
 
@@ -236,14 +238,17 @@ def _weighted_mean(posterior: Posterior, weight):
     """Sum of the cells' conductivities weighted with `weight` (m,), and the posterior standard deviation of the sum."""
     inversion, coefficients, xp = posterior.inversion, posterior.coefficients, namespace(posterior, weight)
     estimate, num_basis = inversion.estimate(coefficients), inversion.basis.num_coefficients
-    slope = weight * inversion.link.slope(estimate)
+    weighted_slope = weight * inversion.link.slope(estimate)
     unknown_indicators = [
         np.arange(len(coefficients)) == coefficient_index for coefficient_index in range(num_basis, len(coefficients))
     ]
     unknown_slopes = [
-        slope @ (inversion.estimate(coefficients + indicator) - estimate) for indicator in unknown_indicators
+        weighted_slope @ (inversion.estimate(coefficients + unit_vector) - estimate)
+        for unit_vector in unknown_indicators
     ]
-    gradient = xp.concatenate([inversion.basis.restrict(slope[None])[0], xp.asarray(unknown_slopes, slope.dtype)])
+    gradient = xp.concatenate(
+        [inversion.basis.restrict(weighted_slope[None])[0], xp.asarray(unknown_slopes, weighted_slope.dtype)]
+    )
     prior_variance = gradient @ posterior.prior.covariance_product(gradient[:, None])[:, 0]
     variance = prior_variance - xp.sum((posterior.root @ (posterior.cross @ gradient)) ** 2)
     return weight @ inversion.link.conductivity(estimate), xp.sqrt(xp.maximum(variance, 0))
@@ -256,8 +261,13 @@ def _draw_samples(posterior: Posterior, prior_draws, noise_draws):
     inversion, inverse_root, xp = posterior.inversion, posterior.root, namespace(posterior, prior_draws)
     prior_samples = posterior.prior.draw_samples(prior_draws.T).T
     data_samples = prior_samples @ posterior.jacobian.T + noise_draws @ xp.linalg.cholesky(inversion.data.covariance).T
-    samples = prior_samples - (data_samples @ inverse_root.T @ inverse_root) @ posterior.cross
-    return xp.stack([inversion.conductivity(sample) for sample in posterior.coefficients + samples])
+    coefficient_samples = prior_samples - (data_samples @ inverse_root.T @ inverse_root) @ posterior.cross
+    return xp.stack(
+        [
+            inversion.conductivity(sampled_coefficients)
+            for sampled_coefficients in posterior.coefficients + coefficient_samples
+        ]
+    )
 
 
 def image_noise(reconstruction: Reconstruction) -> Float[np.ndarray, " m"]:
@@ -285,9 +295,9 @@ def image_noise(reconstruction: Reconstruction) -> Float[np.ndarray, " m"]:
     covariance, num_basis = inversion.data.covariance, inversion.basis.num_coefficients
     noise_root = np.linalg.cholesky(covariance).T @ np.linalg.inv(jacobian @ jacobian.T + covariance)
     variance = np.zeros(len(inversion.reference))
-    for start in range(0, len(noise_root), _ROWS_AT_ONCE):
-        gain = noise_root[start : start + _ROWS_AT_ONCE] @ jacobian
-        variance += np.sum([inversion.basis.expand(row[:num_basis]) ** 2 for row in gain], axis=0)
+    for first_row in range(0, len(noise_root), _ROWS_AT_ONCE):
+        gain_rows = noise_root[first_row : first_row + _ROWS_AT_ONCE] @ jacobian
+        variance += np.sum([inversion.basis.expand(row[:num_basis]) ** 2 for row in gain_rows], axis=0)
     return max(1.0, float(reconstruction.misfit)) * np.sqrt(variance)
 
 
@@ -340,14 +350,14 @@ def detectable_strength(
     """
     check_has_values("detectable_strength", (model, background, noise), "it is computed in NumPy", "call it outside")
     conductivity = np.asarray(check_background(model, background))
-    channels, root_weight = used_channels(model, noise, mask)
+    channel_indices, inverse_noise = used_channels(model, noise, mask)
     fields = evaluate(model, fields_and_impedance_of, conductivity)[0]
-    mesh, protocol, fields = on_host((model.mesh, model.protocol.subset(channels), fields))
+    mesh, protocol, fields = on_host((model.mesh, model.protocol.subset(channel_indices), fields))
     if cells is not None:
         mesh, conductivity = eqx.tree_at(lambda mesh: mesh.cells, mesh, mesh.cells[cells]), conductivity[cells]
     squared_norm = np.empty(mesh.num_cells)
-    for block, jacobian in jacobian_blocks(mesh, protocol, fields):
-        squared_norm[block] = np.square(root_weight) @ np.square(jacobian)
+    for cell_block, jacobian in jacobian_blocks(mesh, protocol, fields):
+        squared_norm[cell_block] = np.square(inverse_noise) @ np.square(jacobian)
     return _DETECTABLE_NORM * np.asarray(measures(mesh)) / (mesh.dimension * conductivity * np.sqrt(squared_norm))
 
 
@@ -375,18 +385,20 @@ def detectable_diameters(
     num_cells, cells = model.mesh.num_cells, None
     if num_cells > _MAX_EXAMINED_CELLS:
         cells = np.sort(np.random.default_rng(0).choice(num_cells, _MAX_EXAMINED_CELLS, replace=False))
-    strength = detectable_strength(model, background, noise, mask, cells)
+    strengths_of_cells = detectable_strength(model, background, noise, mask, cells)
     cell_measures = np.asarray(measures(on_host(model.mesh)))
-    largest, weights = float(cell_measures.sum()), cell_measures if cells is None else cell_measures[cells]
-    return _diameters(strength, weights, largest, model.mesh.dimension)
+    body_measure, cell_weights = float(cell_measures.sum()), cell_measures if cells is None else cell_measures[cells]
+    return _diameters(strengths_of_cells, cell_weights, body_measure, model.mesh.dimension)
 
 
-def _diameters(strength, weights, largest: float, dimension: int) -> DetectableDiameters:
-    """Diameters of insulating bodies of the detectable `strength` in cells with `weights`; infinite for areas or
-    volumes above the `largest`."""
-    order = np.argsort(strength)
-    shares = np.cumsum(weights[order]) / weights.sum()
+def _diameters(detectable_strengths, cell_weights, max_measure: float, dimension: int) -> DetectableDiameters:
+    """Diameters of insulating bodies of the `detectable_strengths` in cells with `cell_weights`; infinite for areas or
+    volumes above `max_measure`."""
+    order_by_strength = np.argsort(detectable_strengths)
+    cumulative_shares = np.cumsum(cell_weights[order_by_strength]) / cell_weights.sum()
     # An insulating disk has its area as strength, an insulating ball half its volume.
-    sizes = strength[order[np.searchsorted(shares, (0.5, _ALMOST_ALL))]] * (1 if dimension == 2 else 2)
-    diameters = 2 * np.sqrt(sizes / np.pi) if dimension == 2 else np.cbrt(6 * sizes / np.pi)
-    return DetectableDiameters(*np.where(sizes < largest, diameters, np.inf).tolist())
+    quantile_measures = detectable_strengths[
+        order_by_strength[np.searchsorted(cumulative_shares, (0.5, _ALMOST_ALL))]
+    ] * (1 if dimension == 2 else 2)
+    diameters = 2 * np.sqrt(quantile_measures / np.pi) if dimension == 2 else np.cbrt(6 * quantile_measures / np.pi)
+    return DetectableDiameters(*np.where(quantile_measures < max_measure, diameters, np.inf).tolist())

@@ -85,18 +85,20 @@ class ConductingDisk:
         angle = np.asarray(angle, dtype=float)
         if self.inclusion_ratio == 0.0:
             return np.zeros_like(angle)
-        contrast = (self.inclusion_conductivity - self.conductivity) / (self.inclusion_conductivity + self.conductivity)
-        mode_numbers = np.arange(1, 3 + int(np.ceil(np.log(1e-18) / (2.0 * np.log(self.inclusion_ratio)))))
-        decay = contrast * self.inclusion_ratio ** (2.0 * mode_numbers)
-        series = np.polynomial.chebyshev.chebval(
-            np.cos(angle), np.concatenate([[0.0], -2.0 * decay / (1.0 + decay) / mode_numbers])
+        reflection_coefficient = (self.inclusion_conductivity - self.conductivity) / (
+            self.inclusion_conductivity + self.conductivity
         )
-        return series / (np.pi * self.conductivity)
+        mode_numbers = np.arange(1, 3 + int(np.ceil(np.log(1e-18) / (2.0 * np.log(self.inclusion_ratio)))))
+        mode_coefficients = reflection_coefficient * self.inclusion_ratio ** (2.0 * mode_numbers)
+        image_series = np.polynomial.chebyshev.chebval(
+            np.cos(angle), np.concatenate([[0.0], -2.0 * mode_coefficients / (1.0 + mode_coefficients) / mode_numbers])
+        )
+        return image_series / (np.pi * self.conductivity)
 
     def kernel(self, angle: np.ndarray) -> np.ndarray:
         """The Neumann-to-Dirichlet kernel N of the disk, in ohm, at nonzero angular distances."""
-        logarithm = -np.log(np.abs(2.0 * np.sin(np.asarray(angle) / 2.0)))
-        return logarithm / (np.pi * self.conductivity) + self.inclusion_kernel(angle)
+        log_kernel = -np.log(np.abs(2.0 * np.sin(np.asarray(angle) / 2.0)))
+        return log_kernel / (np.pi * self.conductivity) + self.inclusion_kernel(angle)
 
 
 def point_transfer_impedance(disk: ConductingDisk, angles: np.ndarray) -> np.ndarray:
@@ -106,10 +108,10 @@ def point_transfer_impedance(disk: ConductingDisk, angles: np.ndarray) -> np.nda
     The potential at a point that feeds a current is infinite, so the diagonal is set to zero. Use the matrix only for
     channels that do not measure on driven electrodes.
     """
-    distance = angles[:, None] - angles[None, :]
+    angle_differences = angles[:, None] - angles[None, :]
     off_diagonal = ~np.eye(len(angles), dtype=bool)
-    impedance = np.zeros(distance.shape, dtype=np.result_type(disk.kernel(np.ones(1))))
-    impedance[off_diagonal] = disk.kernel(distance[off_diagonal])
+    impedance = np.zeros(angle_differences.shape, dtype=np.result_type(disk.kernel(np.ones(1))))
+    impedance[off_diagonal] = disk.kernel(angle_differences[off_diagonal])
     return impedance
 
 
@@ -123,8 +125,8 @@ def point_potentials(disk: ConductingDisk, angles: np.ndarray, current: np.ndarr
     """Potential (V) at `points` (n, 2) of a disk without inclusion; `current` (L,), with sum zero, enters at
     `angles`."""
     projected_points = disk.radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    distance = np.linalg.norm(points[:, None, :] - projected_points[None, :, :], axis=-1)
-    return -np.log(distance) @ current / (np.pi * disk.conductivity)
+    distances_to_electrodes = np.linalg.norm(points[:, None, :] - projected_points[None, :, :], axis=-1)
+    return -np.log(distances_to_electrodes) @ current / (np.pi * disk.conductivity)
 
 
 def logarithm_moments(order: int) -> np.ndarray:
@@ -132,10 +134,10 @@ def logarithm_moments(order: int) -> np.ndarray:
     `order`."""
     m, n = np.meshgrid(np.arange(order), np.arange(order), indexing="ij")
     with np.errstate(divide="ignore"):
-        moments = 8.0 / ((m + n) * (m + n + 2.0) * ((m - n) ** 2.0 - 1.0))
-    moments[(m + n) % 2 == 1] = 0.0
-    moments[0, 0] = 4.0 * np.log(2.0) - 6.0
-    return moments
+        chebyshev_moments = 8.0 / ((m + n) * (m + n + 2.0) * ((m - n) ** 2.0 - 1.0))
+    chebyshev_moments[(m + n) % 2 == 1] = 0.0
+    chebyshev_moments[0, 0] = 4.0 * np.log(2.0) - 6.0
+    return chebyshev_moments
 
 
 def arc_transfer_impedance(
@@ -152,39 +154,43 @@ def arc_transfer_impedance(
     `contact_impedance` (L,) is in ohm·m. For drive patterns D and measurement patterns M with sum zero, the voltages
     are M Z Dᵀ, where Z is the matrix returned.
     """
-    num = len(angles)
-    half_angles = np.broadcast_to(widths, (num,)) / (2.0 * disk.radius)
-    z = np.broadcast_to(contact_impedance, (num,))
-    nodes, weights = np.polynomial.legendre.leggauss(2 * order + 16)
+    num_electrodes = len(angles)
+    half_angles = np.broadcast_to(widths, (num_electrodes,)) / (2.0 * disk.radius)
+    z = np.broadcast_to(contact_impedance, (num_electrodes,))
+    nodes, quadrature_weights = np.polynomial.legendre.leggauss(2 * order + 16)
     basis = np.polynomial.legendre.legvander(nodes, order - 1)
-    weighted = weights[:, None] * basis
+    weighted_basis = quadrature_weights[:, None] * basis
 
-    theta = angles[:, None] + half_angles[:, None] * nodes
-    dtype = np.result_type(disk.kernel(np.ones(1)), z)
-    galerkin_matrix = np.zeros((num, order, num, order), dtype=dtype)
-    source = np.zeros((num, order, num))
-    for row in range(num):
-        for column in range(num):
-            distance = theta[row][:, None] - theta[column][None, :]
-            scale = disk.radius**2 * half_angles[row] * half_angles[column]
+    node_angles = angles[:, None] + half_angles[:, None] * nodes
+    matrix_dtype = np.result_type(disk.kernel(np.ones(1)), z)
+    galerkin_matrix = np.zeros((num_electrodes, order, num_electrodes, order), dtype=matrix_dtype)
+    mean_potential_source = np.zeros((num_electrodes, order, num_electrodes))
+    for row in range(num_electrodes):
+        for column in range(num_electrodes):
+            angle_differences = node_angles[row][:, None] - node_angles[column][None, :]
+            galerkin_scale = disk.radius**2 * half_angles[row] * half_angles[column]
             if row != column:
-                block = weighted.T @ disk.kernel(distance) @ weighted
+                galerkin_block = weighted_basis.T @ disk.kernel(angle_differences) @ weighted_basis
             else:
                 # 2 sin(δ/2)/δ, computed with sinc(x) = sin(πx)/(πx), is the smooth factor of the logarithm's argument.
-                smooth_kernel_part = -np.log(np.sinc(distance / (2.0 * np.pi))) / (np.pi * disk.conductivity)
-                block = weighted.T @ (smooth_kernel_part + disk.inclusion_kernel(distance)) @ weighted
-                logarithm = logarithm_moments(order)
-                logarithm[0, 0] += 4.0 * np.log(half_angles[row])
-                block = block - logarithm / (np.pi * disk.conductivity)
+                smooth_kernel_part = -np.log(np.sinc(angle_differences / (2.0 * np.pi))) / (np.pi * disk.conductivity)
+                galerkin_block = (
+                    weighted_basis.T @ (smooth_kernel_part + disk.inclusion_kernel(angle_differences)) @ weighted_basis
+                )
+                log_moments = logarithm_moments(order)
+                log_moments[0, 0] += 4.0 * np.log(half_angles[row])
+                galerkin_block = galerkin_block - log_moments / (np.pi * disk.conductivity)
                 mass = disk.radius * half_angles[row] * 2.0 / (2.0 * np.arange(order) + 1.0)
                 galerkin_matrix[row, :, row, :] += z[row] * np.diag(mass)
-            galerkin_matrix[row, :, column, :] += scale * block
-        source[row, 0, row] = 2.0 * disk.radius * half_angles[row]
+            galerkin_matrix[row, :, column, :] += galerkin_scale * galerkin_block
+        mean_potential_source[row, 0, row] = 2.0 * disk.radius * half_angles[row]
 
-    source = source.reshape(num * order, num)
-    density = np.linalg.solve(galerkin_matrix.reshape(num * order, num * order), source)
-    impedance = np.linalg.inv(source.T @ density)
-    centring_matrix = np.eye(num) - 1.0 / num
+    mean_potential_source = mean_potential_source.reshape(num_electrodes * order, num_electrodes)
+    current_density = np.linalg.solve(
+        galerkin_matrix.reshape(num_electrodes * order, num_electrodes * order), mean_potential_source
+    )
+    impedance = np.linalg.inv(mean_potential_source.T @ current_density)
+    centring_matrix = np.eye(num_electrodes) - 1.0 / num_electrodes
     return centring_matrix @ impedance @ centring_matrix
 
 
@@ -198,8 +204,8 @@ def disc_contact_resistance(conductivity: complex, radius: float, contact_impeda
     of a ring of width λ.
     """
     transfer_length = np.sqrt(conductivity * contact_impedance)
-    argument = radius / transfer_length
-    return transfer_length * ive(0, argument) / (2.0 * np.pi * conductivity * radius * ive(1, argument))
+    bessel_argument = radius / transfer_length
+    return transfer_length * ive(0, bessel_argument) / (2.0 * np.pi * conductivity * radius * ive(1, bessel_argument))
 
 
 def centre_to_rim_resistance(
@@ -209,9 +215,9 @@ def centre_to_rim_resistance(
 
     `contact_impedance` of the disc is in ohm·m², `rim_contact_impedance` in ohm·m.
     """
-    spreading = np.log(disk.radius / radius) / (2.0 * np.pi * disk.conductivity)
-    rim = rim_contact_impedance / (2.0 * np.pi * disk.radius)
-    return disc_contact_resistance(disk.conductivity, radius, contact_impedance) + spreading + rim
+    spreading_resistance = np.log(disk.radius / radius) / (2.0 * np.pi * disk.conductivity)
+    rim_resistance = rim_contact_impedance / (2.0 * np.pi * disk.radius)
+    return disc_contact_resistance(disk.conductivity, radius, contact_impedance) + spreading_resistance + rim_resistance
 
 
 def disc_transfer_impedance(
@@ -226,62 +232,73 @@ def disc_transfer_impedance(
 
     `positions` (L, 2) and `radii` (L,) in metres, `contact_impedance` (L,) in ohm·m²; the disk has no inclusion.
     """
-    num = len(positions)
+    num_electrodes = len(positions)
     multipole_orders = np.arange(1, num_multipoles + 1)
     centre = positions[:, 0] + 1j * positions[:, 1]
     num_samples = 4 * num_multipoles
-    circle = np.exp(2j * np.pi * np.arange(num_samples) / num_samples)
+    unit_circle = np.exp(2j * np.pi * np.arange(num_samples) / num_samples)
     # Row n of `multipole_analysis_matrix` maps samples on a circle to the coefficient of cos nφ, and row N + n to that
     # of sin nφ.
-    harmonics = circle ** multipole_orders[:, None]
-    multipole_analysis_matrix = np.concatenate([harmonics.real, harmonics.imag]) * (2.0 / num_samples)
-    dtype = np.result_type(disk.conductivity, contact_impedance, 1.0)
-    centring_matrix = np.eye(num) - 1.0 / num
+    complex_harmonics = unit_circle ** multipole_orders[:, None]
+    multipole_analysis_matrix = np.concatenate([complex_harmonics.real, complex_harmonics.imag]) * (2.0 / num_samples)
+    matrix_dtype = np.result_type(disk.conductivity, contact_impedance, 1.0)
+    centring_matrix = np.eye(num_electrodes) - 1.0 / num_electrodes
 
-    regular_kernel = np.zeros((num, 2 * num_multipoles, num, 2 * num_multipoles))
-    regular_mean = np.zeros((num, num, 2 * num_multipoles))
-    fed_multipoles = np.zeros((num, 2 * num_multipoles, num))
-    fed_mean = np.zeros((num, num))
-    reflection_factors = np.zeros((num, 2 * num_multipoles), dtype=dtype)
-    contact = np.zeros(num, dtype=dtype)
-    for electrode_index in range(num):
+    regular_kernel = np.zeros((num_electrodes, 2 * num_multipoles, num_electrodes, 2 * num_multipoles))
+    regular_mean = np.zeros((num_electrodes, num_electrodes, 2 * num_multipoles))
+    fed_multipoles = np.zeros((num_electrodes, 2 * num_multipoles, num_electrodes))
+    fed_mean = np.zeros((num_electrodes, num_electrodes))
+    reflection_factors = np.zeros((num_electrodes, 2 * num_multipoles), dtype=matrix_dtype)
+    contact = np.zeros(num_electrodes, dtype=matrix_dtype)
+    for electrode_index in range(num_electrodes):
         transfer_length = np.sqrt(disk.conductivity * contact_impedance[electrode_index])
-        argument = radii[electrode_index] / transfer_length
-        slope = argument * ive(multipole_orders + 1, argument) / ive(multipole_orders, argument) + multipole_orders
-        reflection_factors[electrode_index] = np.tile((multipole_orders - slope) / (multipole_orders + slope), 2)
+        bessel_argument = radii[electrode_index] / transfer_length
+        logarithmic_derivative = (
+            bessel_argument * ive(multipole_orders + 1, bessel_argument) / ive(multipole_orders, bessel_argument)
+            + multipole_orders
+        )
+        reflection_factors[electrode_index] = np.tile(
+            (multipole_orders - logarithmic_derivative) / (multipole_orders + logarithmic_derivative), 2
+        )
         contact[electrode_index] = disc_contact_resistance(
             disk.conductivity, radii[electrode_index], contact_impedance[electrode_index]
         )
 
-        point = centre[electrode_index] + radii[electrode_index] * circle
-        for source in range(num):
+        rim_points = centre[electrode_index] + radii[electrode_index] * unit_circle
+        for source_index in range(num_electrodes):
             # The image is a²/w̄ − w_l = (a² − w_l w̄)/w̄; its term log|w̄| cancels for currents with sum zero.
-            logarithm = -np.log(np.abs(disk.radius**2 - centre[source] * point.conj()))
+            log_kernel = -np.log(np.abs(disk.radius**2 - centre[source_index] * rim_points.conj()))
             # The multipole cos nφ is the real part of (b/(w − w_l))^n, and sin nφ is minus its imaginary part.
-            field_of_source = (radii[source] * point.conj() / (disk.radius**2 - centre[source] * point.conj()))[
-                :, None
-            ] ** multipole_orders
-            if electrode_index == source:
-                logarithm = logarithm - np.log(radii[source])
+            field_of_source = (
+                radii[source_index] * rim_points.conj() / (disk.radius**2 - centre[source_index] * rim_points.conj())
+            )[:, None] ** multipole_orders
+            if electrode_index == source_index:
+                log_kernel = log_kernel - np.log(radii[source_index])
             else:
-                logarithm = logarithm - np.log(np.abs(point - centre[source]))
+                log_kernel = log_kernel - np.log(np.abs(rim_points - centre[source_index]))
                 field_of_source = (
-                    field_of_source + (radii[source] / (point - centre[source]))[:, None] ** multipole_orders
+                    field_of_source
+                    + (radii[source_index] / (rim_points - centre[source_index]))[:, None] ** multipole_orders
                 )
-            multipoles = np.concatenate([field_of_source.real, -field_of_source.imag], axis=1)
-            regular_kernel[electrode_index, :, source, :] = multipole_analysis_matrix @ multipoles
-            regular_mean[electrode_index, source] = multipoles.mean(axis=0)
-            fed_multipoles[electrode_index, :, source] = multipole_analysis_matrix @ logarithm
-            fed_mean[electrode_index, source] = logarithm.mean()
+            source_multipoles = np.concatenate([field_of_source.real, -field_of_source.imag], axis=1)
+            regular_kernel[electrode_index, :, source_index, :] = multipole_analysis_matrix @ source_multipoles
+            regular_mean[electrode_index, source_index] = source_multipoles.mean(axis=0)
+            fed_multipoles[electrode_index, :, source_index] = multipole_analysis_matrix @ log_kernel
+            fed_mean[electrode_index, source_index] = log_kernel.mean()
 
     current = centring_matrix / (2.0 * np.pi * disk.conductivity)
-    size = num * 2 * num_multipoles
-    scatter = reflection_factors[:, :, None, None] * regular_kernel
+    num_unknowns = num_electrodes * 2 * num_multipoles
+    scattering_matrix = reflection_factors[:, :, None, None] * regular_kernel
     incident_multipoles = reflection_factors[:, :, None] * fed_multipoles
-    amplitude = np.linalg.solve(
-        np.eye(size) - scatter.reshape(size, size), incident_multipoles.reshape(size, num) @ current
+    multipole_amplitudes = np.linalg.solve(
+        np.eye(num_unknowns) - scattering_matrix.reshape(num_unknowns, num_unknowns),
+        incident_multipoles.reshape(num_unknowns, num_electrodes) @ current,
     )
-    potential = fed_mean @ current + regular_mean.reshape(num, size) @ amplitude + contact[:, None] * centring_matrix
+    potential = (
+        fed_mean @ current
+        + regular_mean.reshape(num_electrodes, num_unknowns) @ multipole_amplitudes
+        + contact[:, None] * centring_matrix
+    )
     return centring_matrix @ potential
 
 
@@ -296,9 +313,9 @@ def sphere_sheet_impedance(positions: np.ndarray, conductivity: complex) -> np.n
     Sheet `conductivity` in siemens. The potential at a point that feeds a current is infinite; the diagonal is set to
     zero.
     """
-    distance = np.linalg.norm(positions[:, None] - positions, axis=-1)
-    np.fill_diagonal(distance, 1.0)
-    return -np.log(distance) / (2 * np.pi * conductivity)
+    distances_between_electrodes = np.linalg.norm(positions[:, None] - positions, axis=-1)
+    np.fill_diagonal(distances_between_electrodes, 1.0)
+    return -np.log(distances_between_electrodes) / (2 * np.pi * conductivity)
 
 
 def sleeve_sheet_impedance(
@@ -312,15 +329,15 @@ def sleeve_sheet_impedance(
     is set to zero, where the potential is infinite.
     """
     angle_difference = angles[:, None] - angles
-    z, source = heights[:, None], heights
+    z, source_heights = heights[:, None], heights
     num_images = int(np.ceil(_MAX_IMAGE_DISTANCE * radius / (2 * height))) + 1
     potential = np.zeros(angle_difference.shape)
     for k in range(-num_images, num_images + 1):
-        for axial_distance in (z - source + 2 * k * height, z + source + 2 * k * height):
-            decay = np.exp(-np.abs(axial_distance) / radius)
-            squared_distance = 1 - 2 * decay * np.cos(angle_difference) + decay**2
+        for axial_distance in (z - source_heights + 2 * k * height, z + source_heights + 2 * k * height):
+            exponential_decay = np.exp(-np.abs(axial_distance) / radius)
+            squared_distance = 1 - 2 * exponential_decay * np.cos(angle_difference) + exponential_decay**2
             potential -= np.log(np.where(squared_distance > 0, squared_distance, 1.0)) / 2
-    rod = (z**2 + source**2) / (2 * height) - np.maximum(z, source)
-    potential += rod / radius
+    axial_mean_term = (z**2 + source_heights**2) / (2 * height) - np.maximum(z, source_heights)
+    potential += axial_mean_term / radius
     np.fill_diagonal(potential, 0.0)
     return potential / (2 * np.pi * conductivity)

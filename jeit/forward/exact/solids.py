@@ -64,10 +64,13 @@ def face_patch_impedance(
     differ by c/2.
     """
     a, b, c = size
-    wavenumbers = [np.arange(number) * np.pi / side for number, side in zip(num_modes, (a, b), strict=True)]
+    wavenumbers = [
+        np.arange(num_modes_along_axis) * np.pi / body_side
+        for num_modes_along_axis, body_side in zip(num_modes, (a, b), strict=True)
+    ]
     modes_x, modes_y = (
-        np.sinc(k * width / 2 / np.pi) * np.cos(k * positions[:, axis, None])
-        for axis, (k, width) in enumerate(zip(wavenumbers, patch, strict=True))
+        np.sinc(k * patch_width / 2 / np.pi) * np.cos(k * positions[:, axis, None])
+        for axis, (k, patch_width) in enumerate(zip(wavenumbers, patch, strict=True))
     )
     decay_rates = np.hypot(wavenumbers[0][:, None], wavenumbers[1])
     decay_rates[0, 0] = 1.0
@@ -100,23 +103,25 @@ class ConductingCylinder:
         """Ratio F(R₂) / F'(R₂), (n, m) in metres, of the radial functions F of the modes n < `num_around` and m <
         `num_along`; 0 for the constant mode."""
         bessel_orders = np.arange(num_around)[:, None]
-        ratio = self.inner_radius / self.radius
-        response = np.zeros((num_around, num_along))
-        power = ratio ** (2.0 * bessel_orders[1:, 0])
-        response[1:, 0] = self.radius / bessel_orders[1:, 0] * (1 + power) / (1 - power)
+        radius_ratio = self.inner_radius / self.radius
+        mode_response = np.zeros((num_around, num_along))
+        power_of_ratio = radius_ratio ** (2.0 * bessel_orders[1:, 0])
+        mode_response[1:, 0] = self.radius / bessel_orders[1:, 0] * (1 + power_of_ratio) / (1 - power_of_ratio)
         axial_wavenumbers = np.arange(1, num_along) * np.pi / self.height
         outer_bessel = _Bessel(num_around, axial_wavenumbers * self.radius)
-        response[:, 1:] = 1 / (axial_wavenumbers * outer_bessel.growth)
+        mode_response[:, 1:] = 1 / (axial_wavenumbers * outer_bessel.growth)
         if self.inner_radius > 0:
             inner_bessel = _Bessel(num_around, axial_wavenumbers * self.inner_radius)
             # Ratio of the K_n term of F to its I_n term at R₂.
-            share = (
+            second_kind_share = (
                 inner_bessel.growth
                 / inner_bessel.decay
                 * np.exp(inner_bessel.log_i - inner_bessel.log_k + outer_bessel.log_k - outer_bessel.log_i)
             )
-            response[:, 1:] *= (1 + share) / (1 - share * outer_bessel.decay / outer_bessel.growth)
-        return response
+            mode_response[:, 1:] *= (1 + second_kind_share) / (
+                1 - second_kind_share * outer_bessel.decay / outer_bessel.growth
+            )
+        return mode_response
 
 
 def wall_patch_impedance(
@@ -138,9 +143,11 @@ def wall_patch_impedance(
     circumferential_factor = np.sinc(n * size[0] / (2 * cylinder.radius) / np.pi)
     axial_factors = np.sinc(axial_wavenumber * size[1] / 2 / np.pi) * np.cos(axial_wavenumber * heights[:, None])
     mode_factors = np.outer(np.where(n > 0, 2, 1), np.where(m > 0, 2, 1))
-    weight = mode_factors * cylinder.response(*num_modes) * circumferential_factor[:, None] ** 2
+    mode_weights = mode_factors * cylinder.response(*num_modes) * circumferential_factor[:, None] ** 2
     angular_factors = np.cos(n * (angles[:, None] - angles)[..., None])
-    impedance = np.einsum("lkn,nm,lm,km->lk", angular_factors, weight, axial_factors, axial_factors, optimize=True)
+    impedance = np.einsum(
+        "lkn,nm,lm,km->lk", angular_factors, mode_weights, axial_factors, axial_factors, optimize=True
+    )
     return impedance / (2 * np.pi * cylinder.radius * cylinder.height * cylinder.conductivity)
 
 
@@ -151,11 +158,11 @@ class _Bessel:
     def __init__(self, count: int, x: np.ndarray):
         bessel_orders = np.arange(count)[:, None]
         first_kind_ratios, second_kind_ratios = np.empty((count, len(x))), np.empty((count, len(x)))
-        ratio = x / (2.0 * (count + 60))
+        bessel_ratio = x / (2.0 * (count + 60))
         for n in range(count + 59, -1, -1):  # I_{n+1} / I_n
-            ratio = 1 / (2 * (n + 1) / x + ratio)
+            bessel_ratio = 1 / (2 * (n + 1) / x + bessel_ratio)
             if n < count:
-                first_kind_ratios[n] = ratio
+                first_kind_ratios[n] = bessel_ratio
         second_kind_ratios[0] = kve(1, x) / kve(0, x)  # K_{n+1} / K_n
         for n in range(1, count):
             second_kind_ratios[n] = 2 * n / x + 1 / second_kind_ratios[n - 1]
@@ -187,12 +194,12 @@ def cap_impedance(sphere: ConductingSphere, directions: np.ndarray, radius: floa
     straight line from centre to rim, as for `jeit.electrodes.FaceDiscs`. `num_modes`: number of modes summed.
     """
     n = np.arange(1, num_modes + 1)
-    cosine = 1 - (radius / sphere.radius) ** 2 / 2  # a chord is 2 R sin(α/2)
-    values = np.polynomial.legendre.legvander(np.array([cosine]), num_modes + 1)[0]
-    mean = (values[n - 1] - values[n + 1]) / ((2 * n + 1) * (1 - cosine))
-    power = (sphere.inner_radius / sphere.radius) ** (2.0 * n + 1)
-    response = (1 + n / (n + 1) * power) / (n * (1 - power))
-    cosines = np.clip(directions @ directions.T, -1, 1)
-    coefficients = np.concatenate([[0.0], (2 * n + 1) * response * mean**2])
-    series = np.polynomial.legendre.legval(cosines, coefficients)
-    return series / (4 * np.pi * sphere.radius * sphere.conductivity)
+    cap_cosine = 1 - (radius / sphere.radius) ** 2 / 2  # a chord is 2 R sin(α/2)
+    legendre_values = np.polynomial.legendre.legvander(np.array([cap_cosine]), num_modes + 1)[0]
+    mean = (legendre_values[n - 1] - legendre_values[n + 1]) / ((2 * n + 1) * (1 - cap_cosine))
+    power_of_ratio = (sphere.inner_radius / sphere.radius) ** (2.0 * n + 1)
+    mode_response = (1 + n / (n + 1) * power_of_ratio) / (n * (1 - power_of_ratio))
+    cosines_between_caps = np.clip(directions @ directions.T, -1, 1)
+    coefficients = np.concatenate([[0.0], (2 * n + 1) * mode_response * mean**2])
+    legendre_series = np.polynomial.legendre.legval(cosines_between_caps, coefficients)
+    return legendre_series / (4 * np.pi * sphere.radius * sphere.conductivity)

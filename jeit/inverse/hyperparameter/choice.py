@@ -59,9 +59,16 @@ class Choice(Module):
     @classmethod
     def given(cls, hyperparameter: ArrayLike) -> "Choice":
         """Create a choice from a value of λ that the user specified."""
-        value = as_array(hyperparameter, float)
+        hyperparameter_array = as_array(hyperparameter, float)
         empty_curve = as_array(np.zeros(0))
-        return cls(value, as_array(np.reshape(value, 1)), empty_curve, empty_curve, empty_curve, "given")
+        return cls(
+            hyperparameter_array,
+            as_array(np.reshape(hyperparameter_array, 1)),
+            empty_curve,
+            empty_curve,
+            empty_curve,
+            "given",
+        )
 
     @classmethod
     def among(
@@ -80,10 +87,19 @@ class Choice(Module):
 
         `curves`: residual and penalty at every candidate, or empty arrays.
         """
-        edge = {0: "smallest", len(candidates) - 1: "largest"}.get(int(index), "") if between is None else ""
-        value = candidates[index] if between is None else between
-        residual, penalty = (as_array(curve, float) for curve in curves)
-        return cls(as_array(value), as_array(candidates), as_array(criterion), residual, penalty, rule, target, edge)
+        end_of_range = {0: "smallest", len(candidates) - 1: "largest"}.get(int(index), "") if between is None else ""
+        chosen_hyperparameter = candidates[index] if between is None else between
+        residual, penalty = (as_array(curve_values, float) for curve_values in curves)
+        return cls(
+            as_array(chosen_hyperparameter),
+            as_array(candidates),
+            as_array(criterion),
+            residual,
+            penalty,
+            rule,
+            target,
+            end_of_range,
+        )
 
     @property
     def note(self) -> str:
@@ -102,5 +118,5 @@ class Choice(Module):
         """
         if np.size(curve) == 0:
             raise ValueError(f"curve: this choice ('{self.rule}') has none; let a rule choose, and give it data.")
-        value = self.hyperparameter if hyperparameter is None else hyperparameter
-        return float(np.interp(np.log(value), np.log(np.asarray(self.candidates)), np.asarray(curve)))
+        shown_hyperparameter = self.hyperparameter if hyperparameter is None else hyperparameter
+        return float(np.interp(np.log(shown_hyperparameter), np.log(np.asarray(self.candidates)), np.asarray(curve)))

@@ -47,8 +47,8 @@ def choose_hyperparameter(
     if not (isinstance(rule, str) or callable(rule)):
         raise ValueError(f"rule: give one of {', '.join(RULES)}, not {rule!r}; a number needs no choosing.")
     linearisation = Linearisation.create(model, conductivity, prior=prior, noise=noise, mask=mask)
-    data = None if difference is None else linearisation.whiten(difference)
-    return choose(linearisation.spectrum, rule, data, model.mesh)
+    whitened_data = None if difference is None else linearisation.whiten(difference)
+    return choose(linearisation.spectrum, rule, whitened_data, model.mesh)
 
 
 def compare_rules(
@@ -82,12 +82,12 @@ def compare_rules(
     {name: choice.hyperparameter for name, choice in choices.items()}
     ```
     """
-    rules, report = RULES if rules is None else rules, progress or (lambda step: None)
-    report("linearise")
+    rules, report_progress = RULES if rules is None else rules, progress or (lambda progress_message: None)
+    report_progress("linearise")
     linearisation = Linearisation.create(model, conductivity, prior=prior, noise=noise, mask=mask)
-    data = linearisation.whiten(difference)
-    choices = {}
-    for name, rule in rules.items():
-        report(name)
-        choices[name] = choose(linearisation.spectrum, rule, data, model.mesh)
-    return choices
+    whitened_data = linearisation.whiten(difference)
+    choice_by_rule = {}
+    for name, choose_by_rule in rules.items():
+        report_progress(name)
+        choice_by_rule[name] = choose(linearisation.spectrum, choose_by_rule, whitened_data, model.mesh)
+    return choice_by_rule

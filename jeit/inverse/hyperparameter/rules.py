@@ -64,17 +64,21 @@ def best_resolution(
             "signal_to_noise and num_targets must be positive, and there must be at least one target; they are "
             f"{signal_to_noise} and {num_targets}."
         )
-    candidates = spectrum.candidates()[::4]
+    candidate_hyperparameters = spectrum.candidates()[::4]
     radii = blur_radius(
-        spectrum, mesh, select_spread_cells(mesh, num_targets), candidates, signal_to_noise=signal_to_noise
+        spectrum,
+        mesh,
+        select_spread_cells(mesh, num_targets),
+        candidate_hyperparameters,
+        signal_to_noise=signal_to_noise,
     )
     mean_radius = radii.mean(axis=1)
     return Choice.among(
         "best-resolution",
-        candidates,
+        candidate_hyperparameters,
         int(np.argmin(mean_radius)),
         mean_radius,
-        spectrum.curves(data, candidates),
+        spectrum.curves(data, candidate_hyperparameters),
         target=None,
     )
 
@@ -98,21 +102,26 @@ def blur_radius(
     """
     cell_areas = np.asarray(measures(mesh))
     eigenvalues, modes = np.asarray(spectrum.eigenvalues), np.asarray(spectrum.modes())
-    signals = np.asarray(spectrum.directions) @ np.asarray(spectrum.reduced)[:, targets]
-    signal_norms = np.linalg.norm(signals, axis=0)
-    strength = signal_to_noise * np.sqrt(len(signals)) / np.maximum(signal_norms, np.finfo(float).tiny)
-    components = adjoint(np.asarray(spectrum.basis)) @ signals
+    signals_of_targets = np.asarray(spectrum.directions) @ np.asarray(spectrum.reduced)[:, targets]
+    signal_norms = np.linalg.norm(signals_of_targets, axis=0)
+    target_strengths = (
+        signal_to_noise * np.sqrt(len(signals_of_targets)) / np.maximum(signal_norms, np.finfo(float).tiny)
+    )
+    signal_components = adjoint(np.asarray(spectrum.basis)) @ signals_of_targets
     # Data that images in the prior's null space explain are imaged independently of λ.
     null_space_weights = np.asarray(spectrum.null_space) @ np.linalg.pinv(np.asarray(spectrum.observed_null_space))
-    null_space_images, null_space_variance = null_space_weights @ signals, np.sum(abs(null_space_weights) ** 2, axis=1)
-    damping = 1 / (eigenvalues + np.asarray(candidates)[:, None] ** 2)
-    variance = damping**2 @ (abs(modes) ** 2).T + null_space_variance
+    null_space_images, null_space_variance = (
+        null_space_weights @ signals_of_targets,
+        np.sum(abs(null_space_weights) ** 2, axis=1),
+    )
+    damping_factors = 1 / (eigenvalues + np.asarray(candidates)[:, None] ** 2)
+    variance = damping_factors**2 @ (abs(modes) ** 2).T + null_space_variance
     expected_areas = np.empty((len(candidates), len(targets)))
     for candidate_index in range(len(candidates)):
-        image = np.real(modes @ (damping[candidate_index][:, None] * components) + null_space_images)
+        image = np.real(modes @ (damping_factors[candidate_index][:, None] * signal_components) + null_space_images)
         excess_over_half = image - image[targets, np.arange(len(targets))] / 2
         expected_areas[candidate_index] = cell_areas @ ndtr(
-            strength * excess_over_half / np.sqrt(variance[candidate_index])[:, None]
+            target_strengths * excess_over_half / np.sqrt(variance[candidate_index])[:, None]
         )
     return (expected_areas / cell_areas.sum()) ** (1 / mesh.dimension)
 
@@ -122,17 +131,23 @@ def select_spread_cells(mesh: Mesh, num_cells: int) -> Int[np.ndarray, " T"]:
     regular lattice."""
     centres, cell_measures = np.asarray(centroids(mesh)), np.asarray(measures(mesh))
     lower_corner, upper_corner = np.asarray(mesh.points).min(axis=0), np.asarray(mesh.points).max(axis=0)
-    spacing = (cell_measures.sum() / num_cells) ** (1 / mesh.dimension)
-    counts = np.maximum(np.round((upper_corner - lower_corner) / spacing).astype(int), 1)
-    coordinates = [
-        start + (np.arange(num_steps) + 0.5) * (end - start) / num_steps
-        for start, end, num_steps in zip(lower_corner, upper_corner, counts, strict=True)
+    grid_spacing = (cell_measures.sum() / num_cells) ** (1 / mesh.dimension)
+    num_grid_points = np.maximum(np.round((upper_corner - lower_corner) / grid_spacing).astype(int), 1)
+    axis_coordinates = [
+        first_coordinate + (np.arange(num_intervals) + 0.5) * (last_coordinate - first_coordinate) / num_intervals
+        for first_coordinate, last_coordinate, num_intervals in zip(
+            lower_corner, upper_corner, num_grid_points, strict=True
+        )
     ]
-    grid_points = np.stack(np.meshgrid(*coordinates, indexing="ij"), axis=-1).reshape(-1, mesh.space_dimension)
-    distances, nearest_cells = (np.asarray(result) for result in KDTree(centres).query(grid_points))
+    grid_points = np.stack(np.meshgrid(*axis_coordinates, indexing="ij"), axis=-1).reshape(-1, mesh.space_dimension)
+    distances_to_cells, nearest_cells = (
+        np.asarray(query_result) for query_result in KDTree(centres).query(grid_points)
+    )
     # A surface in space passes between lattice points, so lattice points up to half a spacing from the surface count as
     # inside.
-    is_inside = distances <= (spacing / 2 if mesh.is_surface else cell_measures[nearest_cells] ** (1 / mesh.dimension))
+    is_inside = distances_to_cells <= (
+        grid_spacing / 2 if mesh.is_surface else cell_measures[nearest_cells] ** (1 / mesh.dimension)
+    )
     return np.unique(nearest_cells[is_inside] if is_inside.any() else nearest_cells)
 
 
@@ -149,19 +164,19 @@ def greit_noise_figure(
     `image_mode_coefficients`: XYᵀV; `data_signal_to_noise`: signal-to-noise ratio of the data; `measure`: areas of the
     cells. White noise of unit variance in the data gives a cell of the image the variance Σ (XYᵀV)² / (Λ + λ²)².
     """
-    weight = measure / measure.sum()
-    noise_gain = weight @ image_mode_coefficients**2
+    cell_weights = measure / measure.sum()
+    noise_gain = cell_weights @ image_mode_coefficients**2
 
     def excess_noise_figure(log_hyperparameter) -> float:
         filter_values = 1 / (eigenvalues + np.exp(2 * log_hyperparameter))
         noise, image = (
             np.sqrt(noise_gain @ filter_values**2),
-            weight @ np.abs(image_mode_coefficients @ (signal * filter_values)),
+            cell_weights @ np.abs(image_mode_coefficients @ (signal * filter_values)),
         )
         return float(np.log(data_signal_to_noise * noise / image / target))
 
-    grid = np.log(np.sqrt(eigenvalues.max()) * np.logspace(-6, 1, 71))
-    grid_excesses = np.array([excess_noise_figure(grid_point) for grid_point in grid])
+    log_hyperparameters = np.log(np.sqrt(eigenvalues.max()) * np.logspace(-6, 1, 71))
+    grid_excesses = np.array([excess_noise_figure(grid_hyperparameter) for grid_hyperparameter in log_hyperparameters])
     below_target = np.flatnonzero(grid_excesses <= 0)
     if below_target.size == 0 or below_target[0] == 0:
         min_figure, max_figure = target * np.exp([grid_excesses.min(), grid_excesses.max()])
@@ -169,7 +184,7 @@ def greit_noise_figure(
             f"noise_figure: no hyperparameter gives {target:g}; here it lies between {min_figure:.3g} and "
             f"{max_figure:.3g}. A larger radius brings it down; a larger noise_figure takes a noisier image."
         )
-    search_interval = (grid[below_target[0] - 1], grid[below_target[0]])
+    search_interval = (log_hyperparameters[below_target[0] - 1], log_hyperparameters[below_target[0]])
     return float(np.exp(scipy.optimize.root_scalar(excess_noise_figure, bracket=search_interval, rtol=1e-10).root))
 
 
@@ -193,15 +208,17 @@ def generalised_cross_validation(spectrum: Spectrum, data: ArrayLike | None, mes
     choose_hyperparameter(model, 1.0, rule=lambda *problem: generalised_cross_validation(*problem), difference=change)
     ```
     """
-    candidates, data = spectrum.candidates(), _check_data(data, "gcv")
-    residual, penalty = spectrum.curves(data, candidates)
+    candidate_hyperparameters, data = spectrum.candidates(), _check_data(data, "gcv")
+    residual, penalty = spectrum.curves(data, candidate_hyperparameters)
     # Repeated readings have filter 1 but no residual, so their number is subtracted from the number of channels and
     # from the trace.
     num_independent = len(data) - spectrum.repeated
     gcv_scores = (
-        num_independent * residual**2 / (_filter_factors(spectrum, candidates).sum(axis=1) - spectrum.repeated) ** 2
+        num_independent
+        * residual**2
+        / (_filter_factors(spectrum, candidate_hyperparameters).sum(axis=1) - spectrum.repeated) ** 2
     )
-    return Choice.among("gcv", candidates, int(np.argmin(gcv_scores)), gcv_scores, (residual, penalty))
+    return Choice.among("gcv", candidate_hyperparameters, int(np.argmin(gcv_scores)), gcv_scores, (residual, penalty))
 
 
 def discrepancy(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = None, *, noise: float = 1.0) -> Choice:
@@ -227,32 +244,35 @@ def discrepancy(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = 
     choose_hyperparameter(model, 1.0, rule=rule, difference=change, noise=1e-4).hyperparameter
     ```
     """
-    candidates, data = spectrum.candidates(), _check_data(data, "discrepancy")
-    components = abs(adjoint(np.asarray(spectrum.basis)) @ data)
+    candidate_hyperparameters, data = spectrum.candidates(), _check_data(data, "discrepancy")
+    data_components = abs(adjoint(np.asarray(spectrum.basis)) @ data)
     degrees_of_freedom = spectrum.freedom * (2 if np.iscomplexobj(data) else 1)
-    residual, penalty = spectrum.curves(data, candidates)
-    criterion = residual / np.sqrt(degrees_of_freedom)
-    allowed_indices = np.flatnonzero(criterion <= noise)
+    residual, penalty = spectrum.curves(data, candidate_hyperparameters)
+    normalised_residual = residual / np.sqrt(degrees_of_freedom)
+    allowed_indices = np.flatnonzero(normalised_residual <= noise)
     candidate_index = allowed_indices[-1] if allowed_indices.size else 0
     search_interval = None
-    if allowed_indices.size and candidate_index + 1 < len(candidates):
+    if allowed_indices.size and candidate_index + 1 < len(candidate_hyperparameters):
 
-        def excess_misfit(log_value) -> float:
+        def excess_misfit(log_hyperparameter) -> float:
             return float(
-                np.sqrt(((_filter_factors(spectrum, np.exp(log_value)) * components) ** 2).sum() / degrees_of_freedom)
+                np.sqrt(
+                    ((_filter_factors(spectrum, np.exp(log_hyperparameter)) * data_components) ** 2).sum()
+                    / degrees_of_freedom
+                )
                 - noise
             )
 
         search_interval = np.exp(
             scipy.optimize.root_scalar(
-                excess_misfit, bracket=np.log(candidates[candidate_index : candidate_index + 2])
+                excess_misfit, bracket=np.log(candidate_hyperparameters[candidate_index : candidate_index + 2])
             ).root
         )
     return Choice.among(
         "discrepancy",
-        candidates,
+        candidate_hyperparameters,
         candidate_index,
-        criterion,
+        normalised_residual,
         (residual, penalty),
         target=float(noise),
         between=search_interval,
@@ -276,11 +296,11 @@ def l_curve(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = None
     choose_hyperparameter(model, 1.0, rule=lambda *problem: l_curve(*problem), difference=change, noise=1e-6)
     ```
     """
-    candidates, data = spectrum.candidates(), _check_data(data, "l-curve")
-    residual, penalty = spectrum.curves(data, candidates)
-    curvature = _curvature(spectrum, data, candidates)
+    candidate_hyperparameters, data = spectrum.candidates(), _check_data(data, "l-curve")
+    residual, penalty = spectrum.curves(data, candidate_hyperparameters)
+    curvature = _curvature(spectrum, data, candidate_hyperparameters)
     curvature = np.where(np.isfinite(curvature), curvature, np.min(curvature[np.isfinite(curvature)], initial=0))
-    return Choice.among("l-curve", candidates, int(np.argmax(curvature)), curvature, (residual, penalty))
+    return Choice.among("l-curve", candidate_hyperparameters, int(np.argmax(curvature)), curvature, (residual, penalty))
 
 
 def noise_figure(
@@ -306,18 +326,18 @@ def noise_figure(
     image = one_step(model, 1.0, hyperparameter=rule).image(change)
     ```
     """
-    candidates = spectrum.candidates()
+    candidate_hyperparameters = spectrum.candidates()
     eigenvalues = np.asarray(spectrum.eigenvalues)
-    gain = spectrum.squared_modes()
-    noise_weights = gain / (eigenvalues + candidates[:, None] ** 2) ** 2
+    squared_modes = spectrum.squared_modes()
+    noise_weights = squared_modes / (eigenvalues + candidate_hyperparameters[:, None] ** 2) ** 2
     image_ratio = noise_weights @ eigenvalues / noise_weights.sum(axis=1)
-    figure = np.sqrt(eigenvalues.sum() / spectrum.freedom / image_ratio)
+    noise_figures = np.sqrt(eigenvalues.sum() / spectrum.freedom / image_ratio)
     return Choice.among(
         "noise-figure",
-        candidates,
-        int(np.argmin(np.abs(np.log(figure / target)))),
-        figure,
-        spectrum.curves(data, candidates),
+        candidate_hyperparameters,
+        int(np.argmin(np.abs(np.log(noise_figures / target)))),
+        noise_figures,
+        spectrum.curves(data, candidate_hyperparameters),
         target=target,
     )
 
@@ -348,36 +368,42 @@ def choose(spectrum: Any, hyperparameter: float | str | Rule | Choice, data, mes
         _check_problem(spectrum, getattr(hyperparameter, "__name__", "given"))
         return hyperparameter(spectrum, data, mesh)
     if has_values(hyperparameter):
-        value = np.asarray(hyperparameter)
-        if value.shape != () or value.dtype.kind not in "iuf" or not (np.isfinite(value) and value > 0):
+        hyperparameter_value = np.asarray(hyperparameter)
+        if (
+            hyperparameter_value.shape != ()
+            or hyperparameter_value.dtype.kind not in "iuf"
+            or not (np.isfinite(hyperparameter_value) and hyperparameter_value > 0)
+        ):
             raise ValueError(f"hyperparameter must be positive and finite; it is {hyperparameter}.")
     return Choice.given(hyperparameter)
 
 
 def _check_problem(problem, name: str) -> None:
     """Raise `ValueError` for a traced problem, because a rule for λ needs numerical values."""
-    remedy = "give a number, such as the one that jeit.inverse.choose_hyperparameter finds outside"
-    check_has_values("hyperparameter: the problem", problem, f"the rule '{name}' looks at", remedy)
+    advice_to_user = "give a number, such as the one that jeit.inverse.choose_hyperparameter finds outside"
+    check_has_values("hyperparameter: the problem", problem, f"the rule '{name}' looks at", advice_to_user)
 
 
 def _filter_factors(spectrum: Spectrum, candidates) -> Float[np.ndarray, "K r"]:
-    squared = np.atleast_1d(candidates)[:, None] ** 2
-    return squared / (np.asarray(spectrum.eigenvalues) + squared)
+    squared_candidates = np.atleast_1d(candidates)[:, None] ** 2
+    return squared_candidates / (np.asarray(spectrum.eigenvalues) + squared_candidates)
 
 
 def _curvature(spectrum: Spectrum, data, candidates) -> Float[np.ndarray, " K"]:
     """Curvature of the L-curve with parameter t = log λ, computed with df/dt = 2f(1 - f) for the filter f."""
-    filters, eigenvalues = _filter_factors(spectrum, candidates), np.asarray(spectrum.eigenvalues)
+    filter_factors, eigenvalues = _filter_factors(spectrum, candidates), np.asarray(spectrum.eigenvalues)
     squared_components = abs(adjoint(np.asarray(spectrum.basis)) @ data) ** 2
     penalty_terms = (
         squared_components * eigenvalues / (eigenvalues + candidates[:, None] ** 2) ** 2
     )  # the sum is the penalty
-    residual_terms = squared_components * filters**2  # its sum is ‖r‖²
+    residual_terms = squared_components * filter_factors**2  # its sum is ‖r‖²
     # The derivatives with respect to t are 4 residual_terms (1 - f) and -4 penalty_terms f.
     residual_derivatives = _second_log_derivative(
-        residual_terms, 4 * (1 - filters), 8 * (1 - filters) * (2 - 3 * filters)
+        residual_terms, 4 * (1 - filter_factors), 8 * (1 - filter_factors) * (2 - 3 * filter_factors)
     )
-    penalty_derivatives = _second_log_derivative(penalty_terms, -4 * filters, -8 * filters * (1 - 3 * filters))
+    penalty_derivatives = _second_log_derivative(
+        penalty_terms, -4 * filter_factors, -8 * filter_factors * (1 - 3 * filter_factors)
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         return (residual_derivatives[0] * penalty_derivatives[1] - penalty_derivatives[0] * residual_derivatives[1]) / (
             residual_derivatives[0] ** 2 + penalty_derivatives[0] ** 2
@@ -387,17 +413,17 @@ def _curvature(spectrum: Spectrum, data, candidates) -> Float[np.ndarray, " K"]:
 def _second_log_derivative(terms, first_factors, second_factors):
     """First and second derivatives of ½ log Σ terms, where the first and second derivatives of the terms are the
     products terms · first_factors and terms · second_factors."""
-    total = terms.sum(axis=1)
-    slope = (terms * first_factors).sum(axis=1) / total
-    return slope / 2, ((terms * second_factors).sum(axis=1) / total - slope**2) / 2
+    sum_of_terms = terms.sum(axis=1)
+    log_slope = (terms * first_factors).sum(axis=1) / sum_of_terms
+    return log_slope / 2, ((terms * second_factors).sum(axis=1) / sum_of_terms - log_slope**2) / 2
 
 
 def _check_data(data, rule: str) -> Float[np.ndarray, " M"]:
     if data is None:
         raise ValueError(f"The rule '{rule}' looks at the data: give difference, the change of voltages to be imaged.")
-    remedy = "give a number as hyperparameter, such as the one that the rule finds outside"
-    check_has_values("difference (voltages)", data, f"the rule '{rule}' looks at", remedy)
-    values = np.asarray(data)
-    if not (np.isfinite(values).all() and values.any()):
+    advice_to_user = "give a number as hyperparameter, such as the one that the rule finds outside"
+    check_has_values("difference (voltages)", data, f"the rule '{rule}' looks at", advice_to_user)
+    data_values = np.asarray(data)
+    if not (np.isfinite(data_values).all() and data_values.any()):
         raise ValueError(f"The rule '{rule}' looks at the data, and they are all zero, NaN or infinite: give others.")
-    return values
+    return data_values

@@ -87,15 +87,17 @@ def greit(
     ```
     """
     check_model(model)
-    remedy = (
+    advice_to_user = (
         "work it out once outside: its image() is what JAX transforms; or take one_step, which can be differentiated"
     )
-    check_has_values("model, conductivity or noise", (model, conductivity, noise), "GREIT is trained on", remedy)
+    check_has_values(
+        "model, conductivity or noise", (model, conductivity, noise), "GREIT is trained on", advice_to_user
+    )
     mesh = model.mesh
     check_flat(mesh, "GREIT's targets")
     radius = float(model.electrodes.num_electrodes**-0.5) if radius is None else radius
     _check_options(radius, target_radius, num_targets, hyperparameter, noise_figure)
-    channels, root_weight = used_channels(model, noise, mask)
+    channel_indices, inverse_noise = used_channels(model, noise, mask)
     if jnp.iscomplexobj(conductivity):
         raise ValueError("conductivity is complex; linear images are of real ones: give its real part.")
     if np.shape(conductivity) not in ((), (mesh.num_cells,)):
@@ -109,19 +111,19 @@ def greit(
     desired_images = _desired_images(mesh, positions, target_coverage.T @ cell_measures, radius * body_radius)
     # Responses are computed only for those combinations of channels that a body can change, which are fewer than the
     # channels.
-    directions = data_directions(model.protocol, channels, root_weight)
-    weighted_directions = directions.T * np.asarray(root_weight)  # (r, K)
-    responses, cell_coverage = np.zeros((len(weighted_directions), len(positions))), target_coverage.tocsr()
-    for cells, block in combined_blocks(model, conductivity, channels, weighted_directions):
-        responses += (cell_coverage[cells].T @ block.T).T / np.sqrt(len(positions))
-    eigenvalues, vectors = np.linalg.eigh(responses @ responses.T)
+    data_basis = data_directions(model.protocol, channel_indices, inverse_noise)
+    weighted_directions = data_basis.T * np.asarray(inverse_noise)  # (r, K)
+    target_responses, cell_coverage = np.zeros((len(weighted_directions), len(positions))), target_coverage.tocsr()
+    for cells, jacobian_block in combined_blocks(model, conductivity, channel_indices, weighted_directions):
+        target_responses += (cell_coverage[cells].T @ jacobian_block.T).T / np.sqrt(len(positions))
+    eigenvalues, eigenvectors = np.linalg.eigh(target_responses @ target_responses.T)
     eigenvalues = np.maximum(eigenvalues, 0)
-    image_modes = desired_images @ (responses.T @ vectors) / np.sqrt(len(positions))
+    image_modes = desired_images @ (target_responses.T @ eigenvectors) / np.sqrt(len(positions))
     if isinstance(hyperparameter, str):
-        central_response = responses[:, np.argmin(np.linalg.norm(positions - body_centre, axis=1))]
-        data_signal_to_noise = float(np.abs(directions @ central_response).mean())
+        central_response = target_responses[:, np.argmin(np.linalg.norm(positions - body_centre, axis=1))]
+        data_signal_to_noise = float(np.abs(data_basis @ central_response).mean())
         sampled_cells = slice(None, None, max(1, len(cell_measures) // _NUM_MEAN_CELLS))
-        signal_components = vectors.T @ central_response
+        signal_components = eigenvectors.T @ central_response
         chosen_hyperparameter = greit_noise_figure(
             noise_figure,
             eigenvalues,
@@ -132,10 +134,14 @@ def greit(
         )
     else:
         chosen_hyperparameter = float(hyperparameter)
-    weights = np.zeros((len(eigenvalues), model.protocol.num_measurements))
-    weights[:, channels] = (vectors / (eigenvalues + chosen_hyperparameter**2)).T @ directions.T * root_weight
-    rule = "noise-figure" if isinstance(hyperparameter, str) else "given"
-    return LinearReconstruction.of_factors(model, (image_modes, weights), chosen_hyperparameter, rule, "GREIT")
+    channel_weights = np.zeros((len(eigenvalues), model.protocol.num_measurements))
+    channel_weights[:, channel_indices] = (
+        (eigenvectors / (eigenvalues + chosen_hyperparameter**2)).T @ data_basis.T * inverse_noise
+    )
+    name_of_rule = "noise-figure" if isinstance(hyperparameter, str) else "given"
+    return LinearReconstruction.of_factors(
+        model, (image_modes, channel_weights), chosen_hyperparameter, name_of_rule, "GREIT"
+    )
 
 
 def _ball_radius(measure: float, dimension: int) -> float:
@@ -151,56 +157,68 @@ def _ball_measure(radius: float, dimension: int) -> float:
 def _place_targets(mesh: Mesh, centre, radius: float, num_targets: int) -> tuple[np.ndarray, scipy.sparse.csc_array]:
     """Centres (K, d) of the K training targets that lie in the body, and the fraction (m, K) of every cell that each
     target covers."""
-    cell_measures, points = np.asarray(measures(mesh)), np.asarray(mesh.points)
-    lower_corner, upper_corner = points.min(axis=0), points.max(axis=0)
+    cell_measures, mesh_points = np.asarray(measures(mesh)), np.asarray(mesh.points)
+    lower_corner, upper_corner = mesh_points.min(axis=0), mesh_points.max(axis=0)
     if mesh.dimension == 2:
-        spacing = np.sqrt(2 / np.sqrt(3) * cell_measures.sum() / num_targets)
-        grid = _hexagonal_lattice(lower_corner, upper_corner, centre, spacing)
+        lattice_spacing = np.sqrt(2 / np.sqrt(3) * cell_measures.sum() / num_targets)
+        target_lattice = _hexagonal_lattice(lower_corner, upper_corner, centre, lattice_spacing)
     else:
-        spacing = np.cbrt(cell_measures.sum() / num_targets)
-        grid = _cubic_lattice(lower_corner, upper_corner, centre, spacing)
-    tree, entry_groups = KDTree(grid), []
-    for samples, sample_cells, fractions_of_samples in _sample_points(
+        lattice_spacing = np.cbrt(cell_measures.sum() / num_targets)
+        target_lattice = _cubic_lattice(lower_corner, upper_corner, centre, lattice_spacing)
+    lattice_tree, entry_groups = KDTree(target_lattice), []
+    for sample_points, sample_cells, fractions_of_samples in _sample_points(
         mesh, radius / _SAMPLES_PER_RADIUS[mesh.dimension]
     ):
         if mesh.dimension == 3:
-            offsets = (samples - centre) / spacing
-            offsets -= np.rint(offsets)  # offset from the nearest centre; not all points lie within a target
-            near_indices = np.flatnonzero(
-                np.einsum("qi,qi->q", offsets, offsets) < (_SEARCH_RADII * radius / spacing) ** 2
+            relative_sample_positions = (sample_points - centre) / lattice_spacing
+            # Offset from the nearest centre; not all points lie within a target.
+            relative_sample_positions -= np.rint(relative_sample_positions)
+            sample_indices_inside = np.flatnonzero(
+                np.einsum("qi,qi->q", relative_sample_positions, relative_sample_positions)
+                < (_SEARCH_RADII * radius / lattice_spacing) ** 2
             )
-            samples, sample_cells, fractions_of_samples = (
-                samples[near_indices],
-                sample_cells[near_indices],
-                fractions_of_samples[near_indices],
+            sample_points, sample_cells, fractions_of_samples = (
+                sample_points[sample_indices_inside],
+                sample_cells[sample_indices_inside],
+                fractions_of_samples[sample_indices_inside],
             )
-        pairs = tree.sparse_distance_matrix(KDTree(samples), radius, output_type="ndarray")
-        entry_groups.append((fractions_of_samples[pairs["j"]], sample_cells[pairs["j"]], pairs["i"]))
+        target_sample_pairs = lattice_tree.sparse_distance_matrix(KDTree(sample_points), radius, output_type="ndarray")
+        entry_groups.append(
+            (
+                fractions_of_samples[target_sample_pairs["j"]],
+                sample_cells[target_sample_pairs["j"]],
+                target_sample_pairs["i"],
+            )
+        )
     overlap_fractions, cells, targets = (
         np.concatenate(group_arrays) for group_arrays in zip(*entry_groups, strict=True)
     )
-    coverage = scipy.sparse.coo_array((overlap_fractions, (cells, targets)), shape=(mesh.num_cells, len(grid))).tocsc()
+    coverage_matrix = scipy.sparse.coo_array(
+        (overlap_fractions, (cells, targets)), shape=(mesh.num_cells, len(target_lattice))
+    ).tocsc()
     targets_inside = np.flatnonzero(
-        coverage.T @ cell_measures > _MIN_INSIDE_FRACTION * _ball_measure(radius, mesh.dimension)
+        coverage_matrix.T @ cell_measures > _MIN_INSIDE_FRACTION * _ball_measure(radius, mesh.dimension)
     )
     if targets_inside.size == 0:
         raise ValueError(
             f"target_radius: no {'disc' if mesh.dimension == 2 else 'ball'} of {1e3 * radius:.3g} mm radius fits into "
             "this body; give a smaller one, or more targets."
         )
-    return grid[targets_inside], coverage[:, targets_inside]
+    return target_lattice[targets_inside], coverage_matrix[:, targets_inside]
 
 
 def _hexagonal_lattice(lower_corner, upper_corner, centre, spacing: float) -> np.ndarray:
     """Points (k, 2) of a hexagonal grid with a point at `centre` that covers the box from `lower_corner` to
     `upper_corner`."""
-    steps = spacing * np.array([1, np.sqrt(0.75)])
-    (first_column, bottom), (last_column, top) = (
-        np.floor((lower_corner - centre) / steps) - 1,
-        np.ceil((upper_corner - centre) / steps) + 1,
+    lattice_steps = spacing * np.array([1, np.sqrt(0.75)])
+    (first_column, first_row), (last_column, last_row) = (
+        np.floor((lower_corner - centre) / lattice_steps) - 1,
+        np.ceil((upper_corner - centre) / lattice_steps) + 1,
     )
-    row, column = np.meshgrid(np.arange(bottom, top + 1), np.arange(first_column, last_column + 1), indexing="ij")
-    return centre + steps * np.stack([column + row % 2 / 2, row], axis=-1).reshape(-1, 2)
+    row, column = np.meshgrid(
+        np.arange(first_row, last_row + 1), np.arange(first_column, last_column + 1), indexing="ij"
+    )
+    return centre + lattice_steps * np.stack([column + row % 2 / 2, row], axis=-1).reshape(-1, 2)
 
 
 def _cubic_lattice(lower_corner, upper_corner, centre, spacing: float) -> np.ndarray:
@@ -210,8 +228,8 @@ def _cubic_lattice(lower_corner, upper_corner, centre, spacing: float) -> np.nda
         np.floor((lower_corner - centre) / spacing) - 1,
         np.ceil((upper_corner - centre) / spacing) + 1,
     )
-    steps = [np.arange(a, b + 1) for a, b in zip(first_indices, last_indices, strict=True)]
-    return centre + spacing * np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    axis_indices = [np.arange(a, b + 1) for a, b in zip(first_indices, last_indices, strict=True)]
+    return centre + spacing * np.stack(np.meshgrid(*axis_indices, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _sample_points(mesh: Mesh, spacing: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -229,30 +247,34 @@ def _sample_points(mesh: Mesh, spacing: float) -> Iterator[tuple[np.ndarray, np.
     )
     num_parts = np.maximum(np.ceil(longest_sides / spacing), 1).astype(int)
     for parts_per_side in np.unique(num_parts):
-        steps = np.stack(np.meshgrid(*[np.arange(parts_per_side)] * (num_corners - 1)), axis=-1).reshape(
+        simplex_indices = np.stack(np.meshgrid(*[np.arange(parts_per_side)] * (num_corners - 1)), axis=-1).reshape(
             -1, num_corners - 1
         )
-        steps = steps[steps.sum(axis=1) < parts_per_side]
-        barycentric = (
-            np.column_stack([steps, parts_per_side - 1 - steps.sum(axis=1)]) + 1 / num_corners
+        simplex_indices = simplex_indices[simplex_indices.sum(axis=1) < parts_per_side]
+        barycentric_coordinates = (
+            np.column_stack([simplex_indices, parts_per_side - 1 - simplex_indices.sum(axis=1)]) + 1 / num_corners
         ) / parts_per_side
         cell_indices = np.flatnonzero(num_parts == parts_per_side)
-        for cells in np.array_split(cell_indices, -(-cell_indices.size * len(steps) // _SAMPLES_AT_ONCE)):
-            samples = (barycentric @ corners[cells]).reshape(-1, corners.shape[2])
-            yield samples, np.repeat(cells, len(steps)), np.full(len(samples), 1 / len(steps))
+        for cells in np.array_split(cell_indices, -(-cell_indices.size * len(simplex_indices) // _SAMPLES_AT_ONCE)):
+            sample_points = (barycentric_coordinates @ corners[cells]).reshape(-1, corners.shape[2])
+            yield (
+                sample_points,
+                np.repeat(cells, len(simplex_indices)),
+                np.full(len(sample_points), 1 / len(simplex_indices)),
+            )
 
 
 def _desired_images(mesh: Mesh, positions, integrals, radius: float) -> scipy.sparse.csc_array:
     """Desired images X (m, K) of K targets: a smooth disc around each position, which falls to half its height at
     `radius`, with the integral `integrals` (K,) over the body."""
     cell_measures, cell_centres = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
-    pairs = KDTree(cell_centres).sparse_distance_matrix(
+    cell_target_pairs = KDTree(cell_centres).sparse_distance_matrix(
         KDTree(positions), (1 + _EDGE_HALF_WIDTH) * radius, output_type="ndarray"
     )
-    edge_positions = np.clip((pairs["v"] / radius - 1) / _EDGE_HALF_WIDTH, -1, 1)
-    heights = (1 - np.sin(0.5 * np.pi * edge_positions)) / 2
+    edge_positions = np.clip((cell_target_pairs["v"] / radius - 1) / _EDGE_HALF_WIDTH, -1, 1)
+    smoothed_heights = (1 - np.sin(0.5 * np.pi * edge_positions)) / 2
     discs = scipy.sparse.coo_array(
-        (heights, (pairs["i"], pairs["j"])), shape=(len(cell_centres), len(positions))
+        (smoothed_heights, (cell_target_pairs["i"], cell_target_pairs["j"])), shape=(len(cell_centres), len(positions))
     ).tocsc()
     disc_integrals = discs.T @ cell_measures
     if not (disc_integrals > 0.01 * _ball_measure(radius, mesh.dimension)).all():

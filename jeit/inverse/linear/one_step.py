@@ -100,23 +100,25 @@ class LinearReconstruction:
     ):
         """Create a linear reconstruction from two `factors`, images (m, r) and weights (r, M), whose product is the
         reconstruction matrix. The product is formed only if it is smaller than the factors."""
-        images, weights = factors
+        images, channel_weights = factors
         # Columns of two channels are proportional in every cell or in none, so a sample of the cells suffices.
         sampled_images = images[:: max(1, len(images) // _NUM_SAMPLED_CELLS)]
-        first_channels, second_channels, ratio = _find_proportional_channels(model, sampled_images @ weights)
-        combined_weights = (weights.T[first_channels] + ratio[:, None] * weights.T[second_channels]) / (1 + ratio**2)[
-            :, None
-        ]
-        rows, mixing = (
+        first_channels, second_channels, channel_ratios = _find_proportional_channels(
+            model, sampled_images @ channel_weights
+        )
+        combined_weights = (
+            channel_weights.T[first_channels] + channel_ratios[:, None] * channel_weights.T[second_channels]
+        ) / (1 + channel_ratios**2)[:, None]
+        image_factor, mixing_matrix = (
             (images.T, combined_weights)
             if len(first_channels) > images.shape[1]
             else (combined_weights @ images.T, None)
         )
-        channel_pairs = as_array(first_channels), as_array(second_channels), as_array(ratio)
-        num_measurements = weights.shape[1]
-        device_mixing = None if mixing is None else as_array(mixing)
+        channel_pairs = as_array(first_channels), as_array(second_channels), as_array(channel_ratios)
+        num_measurements = channel_weights.shape[1]
+        device_mixing = None if mixing_matrix is None else as_array(mixing_matrix)
         reconstruction_fields = (
-            as_array(rows),
+            as_array(image_factor),
             as_array(hyperparameter, float),
             num_measurements,
             rule,
@@ -149,17 +151,17 @@ class LinearReconstruction:
             )
             return cls(model.mesh, *traced_fields, matrix.shape[1], rule, method, choice)
         matrix = np.asarray(matrix)
-        first_channels, second_channels, ratio = _find_proportional_channels(model, matrix)
+        first_channels, second_channels, channel_ratios = _find_proportional_channels(model, matrix)
         # Both columns of reciprocal channels are replaced by a weighted mean: for small λ their rounding errors are
         # large and opposite.
-        summed_columns = matrix.T[first_channels] + ratio[:, None] * matrix.T[second_channels]
-        weights = summed_columns / (1 + ratio**2)[:, None]
+        summed_columns = matrix.T[first_channels] + channel_ratios[:, None] * matrix.T[second_channels]
+        pair_weights = summed_columns / (1 + channel_ratios**2)[:, None]
         return cls(
             model.mesh,
             as_array(first_channels),
             as_array(second_channels),
-            as_array(ratio),
-            as_array(weights),
+            as_array(channel_ratios),
+            as_array(pair_weights),
             as_array(hyperparameter, float),
             matrix.shape[1],
             rule,
@@ -178,11 +180,11 @@ class LinearReconstruction:
 
         Raises `ValueError` for the wrong number of channels, and for NaN or infinite voltages.
         """
-        shape = np.shape(difference)
-        if len(shape) not in (1, 2) or shape[-1] != self.num_measurements:
+        difference_shape = np.shape(difference)
+        if len(difference_shape) not in (1, 2) or difference_shape[-1] != self.num_measurements:
             raise ValueError(
-                f"difference has shape {shape}; this reconstruction takes ({self.num_measurements},) volts, or "
-                f"(frames, {self.num_measurements})."
+                f"difference has shape {difference_shape}; this reconstruction takes ({self.num_measurements},) volts, "
+                f"or (frames, {self.num_measurements})."
             )
         if not has_values(difference, self._numpy_arrays):
             return jax.jit(_image_product)(self._numpy_arrays, difference)
@@ -191,84 +193,91 @@ class LinearReconstruction:
             raise ValueError(f"difference is {voltages.dtype}; give numbers, in volts.")
         if not np.isfinite(voltages).all():
             raise ValueError("difference has NaN or infinite voltages; put zeros in masked channels.")
-        first_channels, second_channels, ratio, mixing, weights = self._numpy_arrays
-        combined_difference = _combine_channels(voltages, first_channels, second_channels, ratio, mixing)
+        first_channels, second_channels, channel_ratios, mixing_matrix, pair_weights = self._numpy_arrays
+        combined_difference = _combine_channels(
+            voltages, first_channels, second_channels, channel_ratios, mixing_matrix
+        )
         return (
-            on_device(combined_difference @ weights) if is_forked() else product_for_jax(combined_difference, weights)
+            on_device(combined_difference @ pair_weights)
+            if is_forked()
+            else product_for_jax(combined_difference, pair_weights)
         )
 
     def image_noise(self, noise: Float[Array | np.ndarray, " M"]) -> Float[np.ndarray, " m"]:
         """Standard deviation (m,) of the image in every cell, S/m (2-D: S), due to independent errors of the channels
         with the standard deviations `noise` (M,), volts. Raises `ValueError` for the wrong number of channels."""
-        deviations = np.asarray(noise)
-        if deviations.shape != (self.num_measurements,):
-            raise ValueError(f"noise has shape {deviations.shape}; give a voltage for each of {self.num_measurements}.")
-        first_channels, second_channels, ratio, mixing, weights = self._numpy_arrays
-        combined_noise = np.hypot(deviations[first_channels], ratio * deviations[second_channels])
-        variance = np.zeros(weights.shape[1])
-        for start in range(0, len(combined_noise), _ROWS_AT_ONCE):
-            rows = slice(start, start + _ROWS_AT_ONCE)
-            gain = weights[rows] if mixing is None else mixing[rows] @ weights
-            variance += combined_noise[rows] ** 2 @ np.abs(gain) ** 2
+        noise_deviations = np.asarray(noise)
+        if noise_deviations.shape != (self.num_measurements,):
+            raise ValueError(
+                f"noise has shape {noise_deviations.shape}; give a voltage for each of {self.num_measurements}."
+            )
+        first_channels, second_channels, channel_ratios, mixing_matrix, pair_weights = self._numpy_arrays
+        combined_noise = np.hypot(noise_deviations[first_channels], channel_ratios * noise_deviations[second_channels])
+        variance = np.zeros(pair_weights.shape[1])
+        for first_row in range(0, len(combined_noise), _ROWS_AT_ONCE):
+            row_slice = slice(first_row, first_row + _ROWS_AT_ONCE)
+            gain_rows = pair_weights[row_slice] if mixing_matrix is None else mixing_matrix[row_slice] @ pair_weights
+            variance += combined_noise[row_slice] ** 2 @ np.abs(gain_rows) ** 2
         return np.sqrt(variance)
 
     @functools.cached_property
     def _numpy_arrays(self) -> tuple[Any, ...]:
         """Arrays used by `image`, converted to NumPy only once, because a conversion takes as long as the product."""
-        arrays = (self.first, self.second, self.ratio, self.mixing, self.weights)
-        return on_host(arrays) if has_values(arrays) else arrays
+        factor_arrays = (self.first, self.second, self.ratio, self.mixing, self.weights)
+        return on_host(factor_arrays) if has_values(factor_arrays) else factor_arrays
 
 
 @values_at_once
 def _full_matrix(reconstruction: LinearReconstruction) -> Inexact[Array, "m M"]:
-    weights = (
+    pair_weights = (
         reconstruction.weights if reconstruction.mixing is None else reconstruction.mixing @ reconstruction.weights
     )
     full_matrix = sum_into(
-        (reconstruction.num_measurements, weights.shape[1]),
+        (reconstruction.num_measurements, pair_weights.shape[1]),
         reconstruction.second,
-        reconstruction.ratio[:, None] * weights,
+        reconstruction.ratio[:, None] * pair_weights,
     )
-    return add_into(full_matrix, reconstruction.first, weights).T
+    return add_into(full_matrix, reconstruction.first, pair_weights).T
 
 
-def _image_product(arrays, difference) -> Any:
-    *channels, weights = arrays
-    return _combine_channels(difference, *channels) @ weights
+def _image_product(factor_arrays, difference) -> Any:
+    *channel_arrays, pair_weights = factor_arrays
+    return _combine_channels(difference, *channel_arrays) @ pair_weights
 
 
-def _combine_channels(difference, first_channels, second_channels, ratio, mixing) -> Any:
-    combined_difference = difference[..., first_channels] + ratio * difference[..., second_channels]
-    return combined_difference if mixing is None else combined_difference @ mixing
+def _combine_channels(difference, first_channels, second_channels, channel_ratios, mixing_matrix) -> Any:
+    combined_difference = difference[..., first_channels] + channel_ratios * difference[..., second_channels]
+    return combined_difference if mixing_matrix is None else combined_difference @ mixing_matrix
 
 
 def _find_proportional_channels(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Channels `first_channels` and `second_channels` that are added before the product with the matrix, and the
-    `ratio` of their columns. The pairs are reciprocal channels with proportional columns; every other channel is used
+    `column_ratios`. The pairs are reciprocal channels with proportional columns; every other channel is used
     alone, with ratio 0."""
     column_norms = np.linalg.norm(matrix, axis=0)
-    is_single = column_norms > 0
-    pairs, _ = model.protocol.reciprocal_pairs()
-    pairs = np.asarray(pairs).reshape(-1, 2)
-    first_channels, second_channels = pairs[(column_norms[pairs] > 0).all(axis=1)].T
-    ratio = (
+    is_unpaired_channel = column_norms > 0
+    reciprocal_pairs, _ = model.protocol.reciprocal_pairs()
+    reciprocal_pairs = np.asarray(reciprocal_pairs).reshape(-1, 2)
+    first_channels, second_channels = reciprocal_pairs[(column_norms[reciprocal_pairs] > 0).all(axis=1)].T
+    column_ratios = (
         np.einsum("ij,ij->j", matrix[:, first_channels].conj(), matrix[:, second_channels]).real
         / column_norms[first_channels] ** 2
     )
     is_proportional = (
-        np.abs(matrix[:, second_channels] - ratio * matrix[:, first_channels]).max(axis=0) < 1e-9 * np.abs(matrix).max()
+        np.abs(matrix[:, second_channels] - column_ratios * matrix[:, first_channels]).max(axis=0)
+        < 1e-9 * np.abs(matrix).max()
     )
-    first_channels, second_channels, ratio = (
+    first_channels, second_channels, column_ratios = (
         first_channels[is_proportional],
         second_channels[is_proportional],
-        ratio[is_proportional],
+        column_ratios[is_proportional],
     )
-    is_single[first_channels] = is_single[second_channels] = False
-    single_channels = np.flatnonzero(is_single)
+    is_unpaired_channel[first_channels] = is_unpaired_channel[second_channels] = False
+    unpaired_channels = np.flatnonzero(is_unpaired_channel)
     return (
-        np.concatenate([first_channels, single_channels]),
-        np.concatenate([second_channels, single_channels]),
-        np.concatenate([ratio, np.zeros(len(single_channels))]),
+        np.concatenate([first_channels, unpaired_channels]),
+        np.concatenate([second_channels, unpaired_channels]),
+        np.concatenate([column_ratios, np.zeros(len(unpaired_channels))]),
     )
 
 
@@ -315,21 +324,21 @@ def one_step(
     ```
     """
     linearisation = Linearisation.create(model, conductivity, prior=prior, noise=noise, mask=mask)
-    data = None if difference is None else linearisation.whiten(difference)
-    choice = choose(linearisation.spectrum, hyperparameter, data, model.mesh)
+    whitened_data = None if difference is None else linearisation.whiten(difference)
+    choice = choose(linearisation.spectrum, hyperparameter, whitened_data, model.mesh)
     if has_values(choice) and not (np.isfinite(choice.hyperparameter) and choice.hyperparameter > 0):
         raise ValueError(
             f"hyperparameter: the rule '{choice.rule}' finds none, for numbers overflow; are noise and conductivity in "
             "volts and S/m (2-D: S)?"
         )
-    method = f"one-step, {type(linearisation.prior).__name__} prior"
-    result_fields = choice.hyperparameter, choice.rule, method, choice
+    method_name = f"one-step, {type(linearisation.prior).__name__} prior"
+    result_fields = choice.hyperparameter, choice.rule, method_name, choice
     if isinstance(linearisation.spectrum, Spectrum) and has_values(choice.hyperparameter):
-        factors = linearisation.factors(choice.hyperparameter)
+        reconstruction_factors = linearisation.factors(choice.hyperparameter)
         del (
             linearisation
         )  # frees memory, because the problem and the factors of a large body do not fit in memory together
-        return LinearReconstruction.of_factors(model, factors, *result_fields)
+        return LinearReconstruction.of_factors(model, reconstruction_factors, *result_fields)
     return LinearReconstruction.create(model, linearisation.matrix(choice.hyperparameter), *result_fields)
 
 
@@ -367,16 +376,16 @@ def back_projection(
     ```
     """
     check_model(model)
-    remedy = (
+    advice_to_user = (
         "work it out once outside: its image() is what JAX transforms; or take one_step, which can be differentiated"
     )
-    check_has_values("model or conductivity", (model, conductivity), "its bands are drawn from", remedy)
+    check_has_values("model or conductivity", (model, conductivity), "its bands are drawn from", advice_to_user)
     protocol = model.protocol
-    is_used = np.ones(protocol.num_measurements, bool) if mask is None else np.asarray(mask, bool)
-    if is_used.shape != (protocol.num_measurements,) or not is_used.any():
+    is_used_channel = np.ones(protocol.num_measurements, bool) if mask is None else np.asarray(mask, bool)
+    if is_used_channel.shape != (protocol.num_measurements,) or not is_used_channel.any():
         raise ValueError(f"mask must be ({protocol.num_measurements},) booleans with at least one True.")
-    measurement = np.asarray(protocol.measurement)
-    if (np.count_nonzero(measurement, axis=1) != 2).any():
+    measurement_patterns = np.asarray(protocol.measurement)
+    if (np.count_nonzero(measurement_patterns, axis=1) != 2).any():
         raise ValueError(
             f"Back-projection needs measurements between two electrodes each; protocol '{protocol.name}' has others. "
             "Use one_step, which takes any protocol."
@@ -386,27 +395,39 @@ def back_projection(
     cells = np.asarray(model.mesh.cells)
     cell_potentials = node_potentials[:, cells].mean(axis=2)  # (S, m)
     electrode_potentials = np.asarray(protocol.drive @ model.transfer_impedance(conductivity))  # (S, L)
-    first_electrodes, second_electrodes = (measurement > 0).argmax(axis=1), (measurement < 0).argmax(axis=1)
-    drive, pair = np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)
+    first_electrodes, second_electrodes = (
+        (measurement_patterns > 0).argmax(axis=1),
+        (measurement_patterns < 0).argmax(axis=1),
+    )
+    drive, electrode_pair = np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)
     band_limits = np.stack(
-        [electrode_potentials[drive, first_electrodes[pair]], electrode_potentials[drive, second_electrodes[pair]]]
+        [
+            electrode_potentials[drive, first_electrodes[electrode_pair]],
+            electrode_potentials[drive, second_electrodes[electrode_pair]],
+        ]
     )
     is_in_band = (cell_potentials[drive] >= band_limits.min(axis=0)[:, None]) & (
         cell_potentials[drive] < band_limits.max(axis=0)[:, None]
     )
-    is_in_band = (is_in_band & is_used[:, None]).T.astype(float)  # (m, M)
+    is_in_band = (is_in_band & is_used_channel[:, None]).T.astype(float)  # (m, M)
     num_bands = np.maximum(is_in_band.sum(axis=1), 1)
     # Scale: a uniform relative change δ of conductivity changes every voltage by the relative amount -δ.
-    scale = np.broadcast_to(np.asarray(conductivity, float), (model.mesh.num_cells,))
-    projection = -(scale / num_bands)[:, None] * is_in_band / np.where(is_used & (voltages != 0), voltages, np.inf)
+    cell_conductivity = np.broadcast_to(np.asarray(conductivity, float), (model.mesh.num_cells,))
+    projection = (
+        -(cell_conductivity / num_bands)[:, None]
+        * is_in_band
+        / np.where(is_used_channel & (voltages != 0), voltages, np.inf)
+    )
     if not filtered:
         return LinearReconstruction.create(model, projection, np.nan, "none", "back-projection")
-    used_channels = np.flatnonzero(is_used)
+    used_channels = np.flatnonzero(is_used_channel)
     projected_jacobian = jacobian[used_channels] @ projection[:, used_channels]
-    damping = (hyperparameter * np.linalg.norm(projected_jacobian, 2)) ** 2
-    matrix = np.zeros_like(projection)
+    damping_term = (hyperparameter * np.linalg.norm(projected_jacobian, 2)) ** 2
+    reconstruction_matrix = np.zeros_like(projection)
     filter_matrix = np.linalg.solve(
-        projected_jacobian.T @ projected_jacobian + damping * np.eye(len(used_channels)), projected_jacobian.T
+        projected_jacobian.T @ projected_jacobian + damping_term * np.eye(len(used_channels)), projected_jacobian.T
     )
-    matrix[:, used_channels] = projection[:, used_channels] @ filter_matrix
-    return LinearReconstruction.create(model, matrix, hyperparameter, "given", "filtered back-projection")
+    reconstruction_matrix[:, used_channels] = projection[:, used_channels] @ filter_matrix
+    return LinearReconstruction.create(
+        model, reconstruction_matrix, hyperparameter, "given", "filtered back-projection"
+    )

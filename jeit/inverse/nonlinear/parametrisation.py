@@ -199,10 +199,10 @@ class Scale(AbstractUnknown):
 
 
 def _check_deviation(name: str, deviation, num_values: int) -> Float[Array, " k"]:
-    values = np.asarray(deviation, float)
-    if values.shape not in ((), (num_values,)) or not (np.isfinite(values) & (values > 0)).all():
+    deviations = np.asarray(deviation, float)
+    if deviations.shape not in ((), (num_values,)) or not (np.isfinite(deviations) & (deviations > 0)).all():
         raise ValueError(f"{name}: deviation must be positive, one number or {num_values}; it is {deviation}.")
-    return jnp.broadcast_to(jnp.asarray(values), (num_values,))
+    return jnp.broadcast_to(jnp.asarray(deviations), (num_values,))
 
 
 # Minimum of the lower bound on the conductivity, relative to the mean background, for the linear link.
@@ -321,15 +321,15 @@ class Bounded(AbstractLink):
 
     def slope(self, estimate):
         """Derivative dσ/dx of the logistic function, which is largest halfway between the bounds."""
-        fraction = _logistic(estimate)
-        return (self.upper - self.lower) * fraction * (1 - fraction)
+        fraction_of_range = _logistic(estimate)
+        return (self.upper - self.lower) * fraction_of_range * (1 - fraction_of_range)
 
     def estimate(self, conductivity):
         """Estimate x, the logit of (σ - lower) / (upper - lower). Raises `ValueError` for σ outside the bounds."""
         _check_inside(conductivity, self.lower, self.upper)
-        fraction = (conductivity - self.lower) / (self.upper - self.lower)
-        xp = namespace(fraction)
-        return xp.log(fraction) - xp.log1p(-fraction)
+        fraction_of_range = (conductivity - self.lower) / (self.upper - self.lower)
+        xp = namespace(fraction_of_range)
+        return xp.log(fraction_of_range) - xp.log1p(-fraction_of_range)
 
     def ends(self, lower, upper, reference):
         """Not available, because the link has bounds of its own. Raises `ValueError`."""
@@ -343,11 +343,11 @@ def _logistic(estimate):
 def _check_inside(conductivity, lower_bound, upper_bound) -> None:
     if not has_values(conductivity, lower_bound, upper_bound):
         return
-    values = np.asarray(conductivity)
-    if not ((values > lower_bound) & (values < upper_bound)).all():
+    conductivities = np.asarray(conductivity)
+    if not ((conductivities > lower_bound) & (conductivities < upper_bound)).all():
         raise ValueError(
-            f"conductivity must lie between {lower_bound:g} and {upper_bound:g}; it goes from {values.min():.3g} to "
-            f"{values.max():.3g}."
+            f"conductivity must lie between {lower_bound:g} and {upper_bound:g}; it goes from "
+            f"{conductivities.min():.3g} to {conductivities.max():.3g}."
         )
 
 
@@ -435,16 +435,16 @@ class Parametrisation(Module):
         Raises `ValueError` if the link does not allow bounds or the background lies outside them.
         """
         lower_bound, upper_bound = (0.0, np.inf) if self.bounds is None else self.bounds
-        reference = self.link.estimate(background)
+        reference_estimate = self.link.estimate(background)
         if has_values(self.bounds):
             lower_bound, upper_bound = float(lower_bound), float(upper_bound)
-        scaled_bounds = self.link.ends(lower_bound, upper_bound, reference)
+        scaled_bounds = self.link.ends(lower_bound, upper_bound, reference_estimate)
         if (
-            has_values(reference, scaled_bounds)
-            and not ((reference >= scaled_bounds[0]) & (reference <= scaled_bounds[1])).all()
+            has_values(reference_estimate, scaled_bounds)
+            and not ((reference_estimate >= scaled_bounds[0]) & (reference_estimate <= scaled_bounds[1])).all()
         ):
             raise ValueError(f"background must lie between the bounds, {lower_bound:g} and {upper_bound:g}.")
         infinite_bounds = jnp.full(sum(unknown.size for unknown in self.unknowns), jnp.inf)
-        return jnp.concatenate([scaled_bounds[0] - reference, -infinite_bounds]), jnp.concatenate(
-            [scaled_bounds[1] - reference, infinite_bounds]
+        return jnp.concatenate([scaled_bounds[0] - reference_estimate, -infinite_bounds]), jnp.concatenate(
+            [scaled_bounds[1] - reference_estimate, infinite_bounds]
         )

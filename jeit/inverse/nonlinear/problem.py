@@ -60,26 +60,27 @@ def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"]
         )
     if voltages.dtype.kind not in "biuf":
         raise ValueError(f"voltages are {voltages.dtype}; give real numbers, in volts.")
-    shape = (model.protocol.num_measurements,)
-    measured = voltages.astype(float)
-    is_used = np.ones(shape, bool) if mask is None else np.asarray(mask)
-    if measured.shape != shape or is_used.shape != shape or is_used.dtype != bool:
+    frame_shape = (model.protocol.num_measurements,)
+    measured_voltages = voltages.astype(float)
+    is_used_channel = np.ones(frame_shape, bool) if mask is None else np.asarray(mask)
+    if measured_voltages.shape != frame_shape or is_used_channel.shape != frame_shape or is_used_channel.dtype != bool:
         raise ValueError(
-            f"voltages has shape {measured.shape} and mask {is_used.shape} of {is_used.dtype}; protocol "
-            f"'{model.protocol.name}' has {shape[0]} channels, and the mask must be booleans."
+            f"voltages has shape {measured_voltages.shape} and mask {is_used_channel.shape} of "
+            f"{is_used_channel.dtype}; protocol '{model.protocol.name}' has {frame_shape[0]} channels, and the mask "
+            "must be booleans."
         )
-    if not is_used.any():
+    if not is_used_channel.any():
         raise ValueError("mask: every channel is left out, so there is nothing to reconstruct from.")
-    if not has_values(measured):
-        return jnp.where(is_used, measured, 0), is_used
-    values = np.asarray(measured)[is_used]
-    if not np.isfinite(values).all():
+    if not has_values(measured_voltages):
+        return jnp.where(is_used_channel, measured_voltages, 0), is_used_channel
+    used_voltages = np.asarray(measured_voltages)[is_used_channel]
+    if not np.isfinite(used_voltages).all():
         raise ValueError(
-            f"voltages: NaN or infinite in {(~np.isfinite(values)).sum()} of the channels in use; mask them."
+            f"voltages: NaN or infinite in {(~np.isfinite(used_voltages)).sum()} of the channels in use; mask them."
         )
-    if not values.any():
+    if not used_voltages.any():
         raise ValueError("voltages: all channels in use read zero; was the current source on?")
-    return host.where(is_used, measured, 0), is_used
+    return host.where(is_used_channel, measured_voltages, 0), is_used_channel
 
 
 def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
@@ -91,8 +92,8 @@ def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
             f"background must be one real conductivity, or one for each of the {model.mesh.num_cells} cells; it is "
             f"{background.dtype} of shape {background.shape}."
         )
-    values = np.asarray(background) if has_values(background) else np.ones(())
-    if (invalid_values := values[~((values > 0) & np.isfinite(values))]).size:
+    background_values = np.asarray(background) if has_values(background) else np.ones(())
+    if (invalid_values := background_values[~((background_values > 0) & np.isfinite(background_values))]).size:
         raise ValueError(
             f"background must be positive and finite everywhere, S/m (2-D: S); {describe(invalid_values[0])} is not."
         )
@@ -109,14 +110,17 @@ def check_noise(noise, measured: Float[Array, " M"], is_used: np.ndarray) -> Flo
             "for each channel."
         )
     xp = namespace(standard_deviation, measured)
-    deviation = (
+    noise_deviation = (
         relative_noise(measured, xp.asarray(is_used))
         if noise is None
         else xp.broadcast_to(standard_deviation, measured.shape)
     )
-    if has_values(deviation) and not (np.isfinite(deviation)[is_used] & (np.asarray(deviation)[is_used] > 0)).all():
+    if (
+        has_values(noise_deviation)
+        and not (np.isfinite(noise_deviation)[is_used] & (np.asarray(noise_deviation)[is_used] > 0)).all()
+    ):
         raise ValueError("noise must be positive and finite for every channel in use.")
-    return xp.where(is_used, deviation, 1)
+    return xp.where(is_used, noise_deviation, 1)
 
 
 def _convert_to_floats(values):
@@ -153,18 +157,18 @@ def independent_data(
     """
     used_indices = np.flatnonzero(is_used)
     model_of_used_channels = model if is_used.all() else model.with_protocol(model.protocol.subset(used_indices))
-    channels = IndependentChannels.create(model_of_used_channels.protocol)
+    independent_channels = IndependentChannels.create(model_of_used_channels.protocol)
     independent_model = model_of_used_channels
     if has_values(model_of_used_channels.protocol):
         independent_model = model_of_used_channels.with_protocol(
-            model_of_used_channels.protocol.subset(np.asarray(channels.index))
+            model_of_used_channels.protocol.subset(np.asarray(independent_channels.index))
         )
     # For a solid body, compiled programs would hold several copies of the Jacobian.
     if at_once and (model.at_once or model.mesh.dimension == 3) and has_values(independent_model):
-        independent_model, channels = on_host(
-            (independent_model, channels)
+        independent_model, independent_channels = on_host(
+            (independent_model, independent_channels)
         )  # so that everything computed from these is in NumPy
-    return independent_model, channels.weigh(deviation[used_indices]).combine(measured[used_indices])
+    return independent_model, independent_channels.weigh(deviation[used_indices]).combine(measured[used_indices])
 
 
 def keep_informed_shapes(inversion: Inversion, min_signal: float, persistence: float = 0.0) -> Inversion:
@@ -174,14 +178,17 @@ def keep_informed_shapes(inversion: Inversion, min_signal: float, persistence: f
     deviations of the noise. `persistence`: fraction of the last image that is expected in the next image; if it is not
     0, the prior variances are those before a frame in the steady state of the Kalman filter.
     """
-    squared_singular_values, scaled_right_vectors = (np.asarray(values) for values in _singular_values(inversion))
-    is_informed = squared_singular_values > max(min_signal**2, 1e-12 * squared_singular_values[-1])
-    scale = np.sqrt(
-        _expected_variance(squared_singular_values[is_informed], persistence) / squared_singular_values[is_informed]
+    squared_singular_values, scaled_right_vectors = (
+        np.asarray(singular_array) for singular_array in _singular_values(inversion)
     )
-    shape_combinations = scale[:, None] * scaled_right_vectors[is_informed]
-    shapes = host.asarray(expand_rows(on_host(inversion.basis), shape_combinations).T, np.float32)
-    informed_inversion = eqx.tree_at(lambda problem: problem.basis, inversion, DenseBasis(shapes))
+    is_informed_direction = squared_singular_values > max(min_signal**2, 1e-12 * squared_singular_values[-1])
+    scale_of_directions = np.sqrt(
+        _expected_variance(squared_singular_values[is_informed_direction], persistence)
+        / squared_singular_values[is_informed_direction]
+    )
+    shape_combinations = scale_of_directions[:, None] * scaled_right_vectors[is_informed_direction]
+    image_shapes = host.asarray(expand_rows(on_host(inversion.basis), shape_combinations).T, np.float32)
+    informed_inversion = eqx.tree_at(lambda problem: problem.basis, inversion, DenseBasis(image_shapes))
     return informed_inversion if namespace(inversion) is np else on_device(informed_inversion)
 
 
@@ -190,10 +197,12 @@ def _singular_values(inversion: Inversion):
     """Squared singular values of the whitened Jacobian at the background with respect to the image's coefficients, and
     its right singular vectors multiplied by the singular values."""
     xp = namespace(inversion)
-    start = xp.zeros(inversion.num_coefficients)
-    rows = inversion.data.whiten(inversion.linearise(start)[1])[:, : inversion.basis.num_coefficients]
-    squared_values, left_vectors = symmetric_eigen(rows @ rows.T)
-    return squared_values, left_vectors.T @ rows
+    zero_coefficients = xp.zeros(inversion.num_coefficients)
+    whitened_rows = inversion.data.whiten(inversion.linearise(zero_coefficients)[1])[
+        :, : inversion.basis.num_coefficients
+    ]
+    squared_values, left_vectors = symmetric_eigen(whitened_rows @ whitened_rows.T)
+    return squared_values, left_vectors.T @ whitened_rows
 
 
 def _expected_variance(strength, persistence: float):
@@ -249,8 +258,8 @@ class Inversion(Module):
 
     def with_applied_unknowns(self, model: ForwardModel, coefficients: Float[Array, " n"]) -> ForwardModel:
         """Copy of `model` changed by the estimated unknowns, such as contact impedances or electrode positions."""
-        for unknown, values in zip(self.unknowns, self.values(coefficients), strict=True):
-            model, _ = unknown.apply(model, self.reference, values)
+        for unknown, unknown_values in zip(self.unknowns, self.values(coefficients), strict=True):
+            model, _ = unknown.apply(model, self.reference, unknown_values)
         return model
 
     def values(self, coefficients: Float[Array, " n"]) -> tuple[Float[Array, " k"], ...]:
@@ -259,7 +268,7 @@ class Inversion(Module):
 
     def voltages(self, coefficients: Float[Array, " n"]) -> Float[Array, " r"]:
         """Predicted voltages of the independent channels, volts."""
-        return self._predict(*self._split_coefficients(coefficients))
+        return self._predict_voltages(*self._split_coefficients(coefficients))
 
     def residual(self, coefficients: Float[Array, " n"]) -> Float[Array, " r"]:
         """Residual w (v(σ) - ŷ), whose covariance is `data.covariance`."""
@@ -267,32 +276,37 @@ class Inversion(Module):
 
     def linearise(self, coefficients: Float[Array, " n"]) -> tuple[Float[Array, " r"], Float[Array, "r n"]]:
         """Residual (r,) of the data, and the Jacobian (r, n) of the residual with respect to the coefficients."""
-        shapes, values = self._split_coefficients(coefficients)
-        model, estimate = self._model_and_image(shapes, values)
+        image_coefficients, unknown_values = self._split_coefficients(coefficients)
+        model, estimate = self._model_and_image(image_coefficients, unknown_values)
         conductivity = self.link.conductivity(estimate)
         if namespace(model, conductivity, self.basis) is np:
             fields, impedance = evaluate(model, fields_and_impedance_of, conductivity)
-            voltages, slope = channel_voltages(model.protocol, impedance), self.link.slope(estimate)
-            blocks = jacobian_blocks(model.mesh, model.protocol, fields)
-            jacobian = self.basis.restrict_blocks((cells, block * slope[cells]) for cells, block in blocks)
+            voltages, link_slope = channel_voltages(model.protocol, impedance), self.link.slope(estimate)
+            blocks_of_jacobian = jacobian_blocks(model.mesh, model.protocol, fields)
+            jacobian = self.basis.restrict_blocks(
+                (cells, jacobian_block * link_slope[cells]) for cells, jacobian_block in blocks_of_jacobian
+            )
         else:
             voltages, jacobian = evaluate(model, voltages_and_jacobian_of, conductivity)
             jacobian = self.basis.restrict(jacobian * self.link.slope(estimate))
-        columns = [jacobian]
+        jacobian_columns = [jacobian]
         if self.unknowns:
-            jacobian_of_unknowns = jax.jacfwd(lambda values: self._predict(shapes, values))(values)
-            columns += [
-                block * unknown.deviation for block, unknown in zip(jacobian_of_unknowns, self.unknowns, strict=True)
+            jacobian_of_unknowns = jax.jacfwd(
+                lambda unknown_values: self._predict_voltages(image_coefficients, unknown_values)
+            )(unknown_values)
+            jacobian_columns += [
+                jacobian_block * unknown.deviation
+                for jacobian_block, unknown in zip(jacobian_of_unknowns, self.unknowns, strict=True)
             ]
-        weight, xp = self.data.weight, namespace(voltages, jacobian)
+        data_weight, xp = self.data.weight, namespace(voltages, jacobian)
         # A factorisation may succeed although some conductivities are negative; NaN causes a descent to reject the
         # point.
-        residual = xp.where((conductivity > 0).all(), weight * (voltages - self.data.voltages), xp.nan)
-        jacobian = xp.concatenate(columns, axis=1) if self.unknowns else jacobian
+        residual = xp.where((conductivity > 0).all(), data_weight * (voltages - self.data.voltages), xp.nan)
+        jacobian = xp.concatenate(jacobian_columns, axis=1) if self.unknowns else jacobian
         if xp is np:
-            jacobian *= weight[:, None]  # in place, to save the memory of a copy
+            jacobian *= data_weight[:, None]  # in place, to save the memory of a copy
             return residual, jacobian
-        return residual, weight[:, None] * jacobian
+        return residual, data_weight[:, None] * jacobian
 
     def cost(self, coefficients: Float[Array, " n"]) -> Float[Array, ""]:
         """Objective ½ rᵀ G r + penalty(c)."""
@@ -306,22 +320,22 @@ class Inversion(Module):
 
     def _split_coefficients(self, coefficients):
         """Split the coefficients into those of the image and the values of every unknown."""
-        values, first_index = [], self.basis.num_coefficients
+        unknown_values, first_index = [], self.basis.num_coefficients
         for unknown in self.unknowns:
-            values.append(unknown.deviation * coefficients[first_index : first_index + unknown.size])
+            unknown_values.append(unknown.deviation * coefficients[first_index : first_index + unknown.size])
             first_index += unknown.size
-        return coefficients[: self.basis.num_coefficients], tuple(values)
+        return coefficients[: self.basis.num_coefficients], tuple(unknown_values)
 
-    def _model_and_image(self, shapes, values) -> tuple[ForwardModel, Float[Array, " m"]]:
+    def _model_and_image(self, image_coefficients, unknown_values) -> tuple[ForwardModel, Float[Array, " m"]]:
         """Forward model with the estimated electrodes, contacts and scale; and the image x, such as log σ, from which
         the `link` computes conductivities."""
-        model, estimate = self.model, self.reference + self.basis.expand(shapes)
-        for unknown, value in zip(self.unknowns, values, strict=True):
-            model, estimate = unknown.apply(model, estimate, value)
+        model, estimate = self.model, self.reference + self.basis.expand(image_coefficients)
+        for unknown, unknown_value in zip(self.unknowns, unknown_values, strict=True):
+            model, estimate = unknown.apply(model, estimate, unknown_value)
         return model, estimate
 
-    def _predict(self, shapes, values):
-        model, estimate = self._model_and_image(shapes, values)
+    def _predict_voltages(self, image_coefficients, unknown_values):
+        model, estimate = self._model_and_image(image_coefficients, unknown_values)
         return evaluate(model, voltages_of, self.link.conductivity(estimate))
 
 
@@ -334,49 +348,57 @@ def as_solution(coefficients: Float[Array, " n"], inversion: Inversion, box: Any
         return as_minimum(coefficients, (inversion, None, None), _free_gradient, _preconditioner)
     gradient = jax.grad(inversion.cost)(coefficients)
     # -1 for a coefficient at the lower bound, 1 at the upper bound, 0 for a free coefficient.
-    tolerances = [_BOUND_TOLERANCE * jnp.maximum(1, jnp.abs(bound)) for bound in box]
-    active_bounds = 1 * ((coefficients >= box[1] - tolerances[1]) & (gradient < 0)) - (
-        (coefficients <= box[0] + tolerances[0]) & (gradient > 0)
+    bound_tolerances = [_BOUND_TOLERANCE * jnp.maximum(1, jnp.abs(bound_values)) for bound_values in box]
+    active_bounds = 1 * ((coefficients >= box[1] - bound_tolerances[1]) & (gradient < 0)) - (
+        (coefficients <= box[0] + bound_tolerances[0]) & (gradient > 0)
     )
-    point = as_minimum(
+    stationary_point = as_minimum(
         jnp.where(active_bounds == 0, coefficients, 0), (inversion, box, active_bounds), _free_gradient, _preconditioner
     )
-    return _replace_bound_components(point, box, active_bounds)
+    return _replace_bound_components(stationary_point, box, active_bounds)
 
 
-def _replace_bound_components(point, box, active_bounds):
-    """Coefficients that equal `point` where they are free and their bounds elsewhere."""
-    return point if box is None else jnp.where(active_bounds < 0, box[0], jnp.where(active_bounds > 0, box[1], point))
+def _replace_bound_components(stationary_point, coefficient_bounds, active_bounds):
+    """Coefficients that equal `stationary_point` where they are free and their bounds elsewhere."""
+    return (
+        stationary_point
+        if coefficient_bounds is None
+        else jnp.where(
+            active_bounds < 0,
+            coefficient_bounds[0],
+            jnp.where(active_bounds > 0, coefficient_bounds[1], stationary_point),
+        )
+    )
 
 
-def _free_gradient(point, problem):
+def _free_gradient(stationary_point, problem):
     """Gradient of the objective with respect to the free coefficients. For the other coefficients the function returns
-    `point`, so at a zero of this function their entries in `point` are zero; `_replace_bound_components` replaces them
-    by the bounds."""
-    inversion, box, active_bounds = problem
-    gradient = jax.grad(inversion.cost)(_replace_bound_components(point, box, active_bounds))
-    return gradient if box is None else jnp.where(active_bounds == 0, gradient, point)
+    `stationary_point`, so at a zero of this function their entries in it are zero; `_replace_bound_components` replaces
+    them by the bounds."""
+    inversion, coefficient_bounds, active_bounds = problem
+    gradient = jax.grad(inversion.cost)(_replace_bound_components(stationary_point, coefficient_bounds, active_bounds))
+    return gradient if coefficient_bounds is None else jnp.where(active_bounds == 0, gradient, stationary_point)
 
 
-def _preconditioner(point, problem):
+def _preconditioner(stationary_point, problem):
     """Function that multiplies a vector by the inverse of the Gauss-Newton matrix JᵀGJ + P of the free coefficients,
     where P is the penalty's Hessian. Woodbury's identity gives P⁻¹ - P⁻¹Jᵀ(JP⁻¹Jᵀ + G⁻¹)⁻¹JP⁻¹."""
-    inversion, box, active_bounds = problem
-    coefficients = _replace_bound_components(point, box, active_bounds)
-    is_free = jnp.ones(point.shape, bool) if box is None else active_bounds == 0
-    jacobian = jnp.where(is_free, inversion.linearise(coefficients)[1], 0)
-    covariance_product = inversion.penalty.inverse_hessian(coefficients, is_free, jacobian.T)
+    inversion, coefficient_bounds, active_bounds = problem
+    coefficients = _replace_bound_components(stationary_point, coefficient_bounds, active_bounds)
+    is_free_coefficient = jnp.ones(stationary_point.shape, bool) if coefficient_bounds is None else active_bounds == 0
+    jacobian = jnp.where(is_free_coefficient, inversion.linearise(coefficients)[1], 0)
+    covariance_product = inversion.penalty.inverse_hessian(coefficients, is_free_coefficient, jacobian.T)
     data_covariance = jacobian @ covariance_product
     inverse_data_covariance = symmetric_inverse((data_covariance + data_covariance.T) / 2 + inversion.data.covariance)
 
-    def apply_preconditioner(vector):
+    def apply_preconditioner(gradient_vector):
         preconditioned_image = inversion.penalty.inverse_hessian(
-            coefficients, is_free, jnp.where(is_free, vector, 0)[:, None]
+            coefficients, is_free_coefficient, jnp.where(is_free_coefficient, gradient_vector, 0)[:, None]
         )[:, 0]
         return jnp.where(
-            is_free,
+            is_free_coefficient,
             preconditioned_image - covariance_product @ (inverse_data_covariance @ (jacobian @ preconditioned_image)),
-            vector,
+            gradient_vector,
         )
 
     return apply_preconditioner

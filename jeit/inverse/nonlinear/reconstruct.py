@@ -114,10 +114,10 @@ class Reconstruction(Module):
         `ContactImpedance`: (L,), ohm·m² (2-D: ohm·m); `ElectrodePosition`: displacement, metres; `Scale`: factor;
         `Background`: constant added to the image, on the link's scale.
         """
-        model, values = self.inversion.model, self.inversion.values(self.coefficients)
+        model, unknown_values = self.inversion.model, self.inversion.values(self.coefficients)
         return {
-            type(unknown).__name__: unknown.quantity(model, value)
-            for unknown, value in zip(self.inversion.unknowns, values, strict=True)
+            type(unknown).__name__: unknown.quantity(model, unknown_value)
+            for unknown, unknown_value in zip(self.inversion.unknowns, unknown_values, strict=True)
         }
 
 
@@ -173,73 +173,87 @@ def reconstruct(
     image.conductivity.max(), image.misfit
     ```
     """
-    measured, is_used = check_frame(model, voltages, mask)
+    measured_voltages, is_used_channel = check_frame(model, voltages, mask)
     prior = DEFAULT_PRIOR if prior is None else prior
     check_prior(prior)
     parametrisation = as_parametrisation(parametrisation)
     parametrisation.check_model(model)
     background = check_background(model, background)
-    deviation = check_noise(noise, measured, is_used)
+    noise_deviation = check_noise(noise, measured_voltages, is_used_channel)
     solver = _choose_solver(solver, prior, parametrisation)
-    box = parametrisation.box(background) if solver.keeps_bounds else None
-    _check_protocol(model, is_used)
+    coefficient_bounds = parametrisation.box(background) if solver.keeps_bounds else None
+    _check_protocol(model, is_used_channel)
     may_use_numpy = not (parametrisation.unknowns or solver.keeps_bounds or solver.needs_squares)
-    independent_model, data = independent_data(model, measured, is_used, deviation, at_once=may_use_numpy)
+    independent_model, independent_voltages = independent_data(
+        model, measured_voltages, is_used_channel, noise_deviation, at_once=may_use_numpy
+    )
     inversion, choice = pose_least_squares(
-        independent_model, data, background, prior, hyperparameter, parametrisation, per_cell=solver.keeps_bounds
+        independent_model,
+        independent_voltages,
+        background,
+        prior,
+        hyperparameter,
+        parametrisation,
+        per_cell=solver.keeps_bounds,
     )
     if parametrisation.informative and inversion.penalty.is_standard_normal:
-        remedy = "leave it out, and take all shapes"
-        check_has_values("informative: the problem", inversion, "shapes that the data support come from", remedy)
+        advice_to_user = "leave it out, and take all shapes"
+        check_has_values(
+            "informative: the problem", inversion, "shapes that the data support come from", advice_to_user
+        )
         inversion = keep_informed_shapes(inversion, parametrisation.informative)
     start_coefficients = (
         as_array(np.zeros(inversion.num_coefficients))
         if start is None
         else _start_coefficients(start, inversion, choice)
     )
-    solution = solver.minimise(inversion, start_coefficients, box)
-    coefficients, status, reason = solution.coefficients, solution.status, solution.reason
+    solver_solution = solver.minimise(inversion, start_coefficients, coefficient_bounds)
+    coefficients, status, reason_of_end = solver_solution.coefficients, solver_solution.status, solver_solution.reason
     fitted_model, conductivity = (
         inversion.with_applied_unknowns(model, coefficients),
         _conductivity(inversion, coefficients),
     )
-    predicted = evaluate(fitted_model, voltages_of, conductivity)
-    xp = jnp if not has_values(predicted, measured, deviation) else np
-    used_indices = np.flatnonzero(is_used)
-    normalised_residual = ((xp.asarray(predicted) - xp.asarray(measured)) / xp.asarray(deviation))[used_indices]
+    predicted_voltages = evaluate(fitted_model, voltages_of, conductivity)
+    xp = jnp if not has_values(predicted_voltages, measured_voltages, noise_deviation) else np
+    used_indices = np.flatnonzero(is_used_channel)
+    normalised_residual = (
+        (xp.asarray(predicted_voltages) - xp.asarray(measured_voltages)) / xp.asarray(noise_deviation)
+    )[used_indices]
     if xp is jnp or not isinstance(status, Status):
         is_invalid = ~(jnp.isfinite(conductivity).all() & jnp.isfinite(normalised_residual).all())
         status_number = status.number if isinstance(status, Status) else status
-        outcome = jnp.where(is_invalid, Status.FAILED.number, status_number)
+        final_status_number = jnp.where(is_invalid, Status.FAILED.number, status_number)
     elif not (np.isfinite(conductivity).all() and np.isfinite(normalised_residual).all()):
-        outcome = Status.FAILED.number
-        reason = "Conductivity or voltages are NaN; give better data, more noise or a greater λ."
+        final_status_number = Status.FAILED.number
+        reason_of_end = "Conductivity or voltages are NaN; give better data, more noise or a greater λ."
     else:
-        outcome = status.number
-        reason += (
+        final_status_number = status.number
+        reason_of_end += (
             ""
             if status == Status.CONVERGED
-            else _mismatch_reason(model, measured[used_indices], background, used_indices)
+            else _mismatch_reason(model, measured_voltages[used_indices], background, used_indices)
         )
     return Reconstruction(
         conductivity=conductivity,
-        voltages=predicted,
+        voltages=predicted_voltages,
         misfit=as_array(xp.sqrt(xp.mean(normalised_residual**2))),
-        costs=solution.costs + inversion.data.rest / 2,
+        costs=solver_solution.costs + inversion.data.rest / 2,
         coefficients=coefficients,
         inversion=on_device(inversion),
         model=fitted_model,
         choice=choice,
-        iterations=solution.iterations,
-        outcome=outcome,
-        reason=reason,
+        iterations=solver_solution.iterations,
+        outcome=final_status_number,
+        reason=reason_of_end,
     )
 
 
 def _check_protocol(model: ForwardModel, is_used) -> None:
     if not is_used.all():
-        remedy = "close over the model, and put into it what varies, such as model.with_electrodes(electrodes)"
-        check_has_values("model: its protocol", model.protocol, "to leave out the channels of a mask takes", remedy)
+        advice_to_user = "close over the model, and put into it what varies, such as model.with_electrodes(electrodes)"
+        check_has_values(
+            "model: its protocol", model.protocol, "to leave out the channels of a mask takes", advice_to_user
+        )
 
 
 def _default_solver(parametrisation: Parametrisation) -> AbstractSolver:
@@ -283,30 +297,32 @@ def pose_least_squares(
     `per_cell`: whether every coefficient must be the value of a cell, as bounds require. Raises `ValueError` for
     invalid or inconsistent arguments.
     """
-    mesh, link = model.mesh, parametrisation.link
-    reference, regions = link.estimate(background), parametrisation.regions_of(mesh)
+    mesh, conductivity_link = model.mesh, parametrisation.link
+    reference_estimate, regions = conductivity_link.estimate(background), parametrisation.regions_of(mesh)
     requested_hyperparameter = prior.default_hyperparameter if hyperparameter is None else hyperparameter
     is_rule_requested = isinstance(requested_hyperparameter, str) or callable(requested_hyperparameter)
     if prior.is_quadratic:
-        predicted, whitened_jacobian, whitening_data = _whitened_jacobian(
-            model, data, background, link.slope(reference)
+        predicted_voltages, whitened_jacobian, whitening_data = _whitened_jacobian(
+            model, data, background, conductivity_link.slope(reference_estimate)
         )
-        spectrum = difference = None
+        jacobian_spectrum = whitened_difference = None
         if is_rule_requested:
-            spectrum = Spectrum.create(
+            jacobian_spectrum = Spectrum.create(
                 whitened_jacobian, prior.covariance_product(mesh, whitened_jacobian), prior.null_space(mesh)
             )
-            difference = whitening_data.whiten(whitening_data.weight * (whitening_data.voltages - predicted))
-        choice = choose(spectrum, requested_hyperparameter, difference, mesh)
+            whitened_difference = whitening_data.whiten(
+                whitening_data.weight * (whitening_data.voltages - predicted_voltages)
+            )
+        choice = choose(jacobian_spectrum, requested_hyperparameter, whitened_difference, mesh)
     elif is_rule_requested:
         raise ValueError(f"hyperparameter: total variation takes a number, not the rule {requested_hyperparameter!r}.")
     else:
         whitened_jacobian, choice = None, choose(None, requested_hyperparameter, None)
-    weight = float(choice.hyperparameter) if has_values(choice.hyperparameter) else choice.hyperparameter
+    penalty_weight = float(choice.hyperparameter) if has_values(choice.hyperparameter) else choice.hyperparameter
     basis, penalty = prior.penalty(
-        mesh, reference, weight, jacobian=whitened_jacobian, regions=regions, per_cell=per_cell
+        mesh, reference_estimate, penalty_weight, jacobian=whitened_jacobian, regions=regions, per_cell=per_cell
     )
-    inversion = Inversion(model, data, link, reference, basis, penalty, parametrisation.unknowns)
+    inversion = Inversion(model, data, conductivity_link, reference_estimate, basis, penalty, parametrisation.unknowns)
     return inversion if namespace(model) is np else on_device(inversion), choice
 
 
@@ -319,26 +335,32 @@ def _whitened_jacobian(model: ForwardModel, data: Data, background, slope):
     host_data, slope = on_host((data, slope))
     fields, impedance = on_host(evaluate(model, fields_and_impedance_of, check_conductivity(model.mesh, background)))
     mesh, protocol = on_host((model.mesh, model.protocol))
-    weights = host_data.whiten(np.diag(host_data.weight))
-    whitened_jacobian: Any = np.empty((len(weights), mesh.num_cells))
-    for cells, block in jacobian_blocks(mesh, protocol, fields):
-        whitened_jacobian[:, cells] = weights @ (block * slope[cells])
+    whitening_matrix = host_data.whiten(np.diag(host_data.weight))
+    whitened_jacobian: Any = np.empty((len(whitening_matrix), mesh.num_cells))
+    for cells, jacobian_block in jacobian_blocks(mesh, protocol, fields):
+        whitened_jacobian[:, cells] = whitening_matrix @ (jacobian_block * slope[cells])
     return channel_voltages(protocol, impedance), whitened_jacobian, host_data
 
 
-def _start_coefficients(start, inversion: Inversion, choice: Choice) -> Float[Array, " n"]:
-    """Coefficients of the earlier reconstruction `start`, rescaled to the λ of `choice`. Raises `ValueError` if the
+def _start_coefficients(previous_reconstruction, inversion: Inversion, choice: Choice) -> Float[Array, " n"]:
+    """Coefficients of `previous_reconstruction`, rescaled to the λ of `choice`. Raises `ValueError` if the
     problem of the earlier reconstruction is of a different kind."""
-    if not isinstance(start, Reconstruction):
-        raise ValueError(f"start must be what reconstruct has returned, not {type(start).__name__}.")
-    if start.coefficients.shape != (inversion.num_coefficients,) or not _have_same_unknowns(start.inversion, inversion):
+    if not isinstance(previous_reconstruction, Reconstruction):
+        raise ValueError(f"start must be what reconstruct has returned, not {type(previous_reconstruction).__name__}.")
+    if previous_reconstruction.coefficients.shape != (inversion.num_coefficients,) or not _have_same_unknowns(
+        previous_reconstruction.inversion, inversion
+    ):
         raise ValueError(
-            f"start has {start.coefficients.size} coefficients of another kind of problem; this one has "
-            f"{inversion.num_coefficients}. Give a reconstruction of the same model, prior and link."
+            f"start has {previous_reconstruction.coefficients.size} coefficients of another kind of problem; this one "
+            f"has {inversion.num_coefficients}. Give a reconstruction of the same model, prior and link."
         )
     num_coefficients = inversion.basis.num_coefficients
-    scale = choice.hyperparameter / start.choice.hyperparameter if inversion.penalty.is_standard_normal else 1.0
-    return start.coefficients.at[:num_coefficients].multiply(scale)
+    hyperparameter_ratio = (
+        choice.hyperparameter / previous_reconstruction.choice.hyperparameter
+        if inversion.penalty.is_standard_normal
+        else 1.0
+    )
+    return previous_reconstruction.coefficients.at[:num_coefficients].multiply(hyperparameter_ratio)
 
 
 def _have_same_unknowns(first_inversion: Inversion, second_inversion: Inversion) -> bool:
@@ -347,7 +369,8 @@ def _have_same_unknowns(first_inversion: Inversion, second_inversion: Inversion)
 
     def component_types(inversion):
         return [
-            type(component) for component in (inversion.link, inversion.basis, inversion.penalty, *inversion.unknowns)
+            type(inversion_component)
+            for inversion_component in (inversion.link, inversion.basis, inversion.penalty, *inversion.unknowns)
         ]
 
     return component_types(first_inversion) == component_types(second_inversion)
@@ -356,10 +379,13 @@ def _have_same_unknowns(first_inversion: Inversion, second_inversion: Inversion)
 def _mismatch_reason(model: ForwardModel, measured, background, used_indices) -> str:
     """Sentence on wrong units or polarity if measured voltages and those of the background differ in size or sign."""
     background_voltages = np.asarray(model.voltages(background))[used_indices]
-    ratio = float(np.asarray(measured) @ background_voltages / (background_voltages @ background_voltages))
-    if 0.1 < ratio < 10:
+    voltage_ratio = float(np.asarray(measured) @ background_voltages / (background_voltages @ background_voltages))
+    if 0.1 < voltage_ratio < 10:
         return ""
-    return f" The voltages are {ratio:.2g} times those of the background; are they in volts, and their signs right?"
+    return (
+        f" The voltages are {voltage_ratio:.2g} times those of the background; are they in volts, and their signs "
+        "right?"
+    )
 
 
 @numpy_or_compiled

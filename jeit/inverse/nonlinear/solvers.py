@@ -256,7 +256,7 @@ class LeastSquares(AbstractSolver):
         status, iterations = ended(solution.result), int(solution.stats["num_steps"])
         if status == Status.STEP_LIMIT and _is_within_rounding(inversion, solution.value):
             return Solution(solution.value, iterations, costs, Status.CONVERGED, _ROUNDED_REASON)
-        return Solution(solution.value, iterations, costs, status, _reason(status, iterations))
+        return Solution(solution.value, iterations, costs, status, _reason_of_end(status, iterations))
 
 
 class OneStep(AbstractSolver):
@@ -293,7 +293,7 @@ SOLVERS: dict[str, type[AbstractSolver]] = {
 
 def frame_solvers() -> tuple[str, ...]:
     """Names of the solvers that image a frame in a bounded time, for an `Imager`."""
-    return tuple(name for name, kind in SOLVERS.items() if kind.for_frames is not AbstractSolver.for_frames)
+    return tuple(name for name, method in SOLVERS.items() if method.for_frames is not AbstractSolver.for_frames)
 
 
 def as_solver(
@@ -301,15 +301,15 @@ def as_solver(
 ) -> AbstractSolver:
     """Convert a name in `SOLVERS` or a least-squares solver of optimistix to a solver; solvers are returned unchanged.
     Raises `ValueError` for anything else; the message lists the solvers for `frames` or for `reconstruct`."""
-    names = frame_solvers() if frames else tuple(name for name, kind in SOLVERS.items() if not kind().is_linear)
+    names = frame_solvers() if frames else tuple(name for name, method in SOLVERS.items() if not method().is_linear)
     if isinstance(solver, str):
         if solver not in SOLVERS:
             check_name("solver", solver, names)
         return SOLVERS[solver]()
     if isinstance(solver, optx.AbstractLeastSquaresSolver):
         return LeastSquares(solver)
-    requirement = f"one of jeit.inverse.nonlinear, such as GaussNewton(), a name ({', '.join(names)}), or optimistix's"
-    check_kind("solver", solver, AbstractSolver, f"{requirement} least squares")
+    solver_hint = f"one of jeit.inverse.nonlinear, such as GaussNewton(), a name ({', '.join(names)}), or optimistix's"
+    check_kind("solver", solver, AbstractSolver, f"{solver_hint} least squares")
     return solver
 
 
@@ -321,7 +321,7 @@ def counted_iterations(iterations: int, shortened: int = 0) -> str:
     return f"{iteration_count} and {counted(shortened, 'step')} that led too far"
 
 
-def _reason(status: Status, iterations: int, shortened: int = 0) -> str:
+def _reason_of_end(status: Status, iterations: int, shortened: int = 0) -> str:
     return _REASON_BY_STATUS[status].format(counted_iterations(iterations, shortened))
 
 
@@ -361,8 +361,8 @@ def _create_descent(max_steps: int, rtol: float, damping: float = 0.0) -> Descen
 def _run_descent(descent: Descent, inversion: Inversion, start) -> Solution:
     if inversion.is_solvable_in_numpy:
         start, problem = on_host((start, inversion))
-        point, state = descent.at_once(expand, start, problem, descent.history)
-        point = as_array(point)
+        minimum, state = descent.at_once(expand, start, problem, descent.history)
+        minimum = as_array(minimum)
         status = Status.CONVERGED if state.converged else Status.STALLED if state.is_stuck else Status.STEP_LIMIT
     elif not has_values(inversion, start):
         problem, frozen_start = undifferentiated((inversion, start))
@@ -371,11 +371,11 @@ def _run_descent(descent: Descent, inversion: Inversion, start) -> Solution:
         return _traced_solution(inversion, start, solution.value, iterations, ended_number(solution.result))
     else:
         solution = _least_squares(inversion, start, descent, descent.history, {"expand": expand})
-        point, state, status = solution.value, solution.state, ended(solution.result)
+        minimum, state, status = solution.value, solution.state, ended(solution.result)
     num_accepted_steps = int(state.num_accepted)
     iterations = max(num_accepted_steps - 1, 0)
-    reason = _reason(status, iterations, int(state.num_steps) - 1 - iterations)
-    return Solution(point, iterations, as_array(np.asarray(state.history)[:num_accepted_steps]), status, reason)
+    reason = _reason_of_end(status, iterations, int(state.num_steps) - 1 - iterations)
+    return Solution(minimum, iterations, as_array(np.asarray(state.history)[:num_accepted_steps]), status, reason)
 
 
 def _traced_solution(inversion: Inversion, start, coefficients, iterations, status, box=None) -> Solution:
@@ -388,21 +388,23 @@ def _traced_solution(inversion: Inversion, start, coefficients, iterations, stat
 
 def _minimise_in_box(minimise, inversion: Inversion, start, box, max_steps: int, tolerance: float) -> Solution:
     start = jnp.clip(start, *box)
-    lower, upper = box
+    lower_bounds, upper_bounds = box
     if not has_values(inversion, start, box):
-        problem, frozen_start, *bounds = undifferentiated((inversion, start, lower, upper))
+        problem, frozen_start, *frozen_bounds = undifferentiated((inversion, start, lower_bounds, upper_bounds))
         minimum = minimise_within_bounds(
-            problem, frozen_start, bounds[0], bounds[1], minimise, int(max_steps), float(tolerance)
+            problem, frozen_start, frozen_bounds[0], frozen_bounds[1], minimise, int(max_steps), float(tolerance)
         )
         status = jnp.where(minimum.converged, Status.CONVERGED.number, Status.STEP_LIMIT.number)
         return _traced_solution(inversion, start, minimum.x, minimum.steps, status, box)
-    minimum = minimise_within_bounds(inversion, start, lower, upper, minimise, int(max_steps), float(tolerance))
+    minimum = minimise_within_bounds(
+        inversion, start, lower_bounds, upper_bounds, minimise, int(max_steps), float(tolerance)
+    )
     costs = _costs_at(inversion, start, minimum.x)
     if minimum.converged:
         reason = "No step between the bounds would change the image much."
         return Solution(minimum.x, int(minimum.steps), costs, Status.CONVERGED, reason)
     iterations = int(minimum.steps)
-    return Solution(minimum.x, iterations, costs, Status.STEP_LIMIT, _reason(Status.STEP_LIMIT, iterations))
+    return Solution(minimum.x, iterations, costs, Status.STEP_LIMIT, _reason_of_end(Status.STEP_LIMIT, iterations))
 
 
 @eqx.filter_jit
@@ -423,26 +425,26 @@ def minimise_within_bounds(
     """
     # Coefficients are scaled to similar curvature, because the number of steps depends on the conditioning.
     _, jacobian = inversion.linearise(start)
-    scale = jax.lax.rsqrt(jnp.sum(jacobian**2, axis=0) + inversion.penalty.diagonal(start))
+    coefficient_scale = jax.lax.rsqrt(jnp.sum(jacobian**2, axis=0) + inversion.penalty.diagonal(start))
     start_cost = inversion.cost(start)
-    minimum = minimise(
-        lambda scaled_coefficients: inversion.cost(scale * scaled_coefficients) / start_cost,
-        start / scale,
-        lower_bounds / scale,
-        upper_bounds / scale,
+    scaled_minimum = minimise(
+        lambda scaled_coefficients: inversion.cost(coefficient_scale * scaled_coefficients) / start_cost,
+        start / coefficient_scale,
+        lower_bounds / coefficient_scale,
+        upper_bounds / coefficient_scale,
         max_steps=max_steps,
         tolerance=tolerance,
     )
-    return BoundedMinimum(scale * minimum.x, minimum.steps, minimum.converged)
+    return BoundedMinimum(coefficient_scale * scaled_minimum.x, scaled_minimum.steps, scaled_minimum.converged)
 
 
 @eqx.filter_jit
 def _is_within_rounding(inversion: Inversion, coefficients):
     """Whether a Gauss-Newton step would lower the objective by no more than its rounding error. Solvers that accept
     steps by the decrease of the objective then stall before they reach very small tolerances."""
-    cost, step = inversion.quadratic_model(coefficients)
-    _, slope, curvature = step(0.0)
-    return abs(slope + 0.5 * curvature) <= _ROUNDING_FACTOR * jnp.finfo(cost.dtype).eps * cost
+    cost, model_step = inversion.quadratic_model(coefficients)
+    _, cost_slope, cost_curvature = model_step(0.0)
+    return abs(cost_slope + 0.5 * cost_curvature) <= _ROUNDING_FACTOR * jnp.finfo(cost.dtype).eps * cost
 
 
 def _costs_at(inversion: Inversion, *points: Float[Array, " n"]) -> Float[Array, " p"]:

@@ -42,10 +42,10 @@ class AbstractBasis(Module):
         """Product with S, as a new NumPy array (M, n), of rows (M, m) that are passed as blocks of consecutive
         cells."""
         cell_slices, column_blocks = zip(*blocks, strict=True)
-        rows: Any = np.empty((len(column_blocks[0]), cell_slices[-1].stop), column_blocks[0].dtype)
-        for block_cells, block in zip(cell_slices, column_blocks, strict=True):
-            rows[:, block_cells] = block
-        return np.array(self.restrict(rows))
+        restricted_rows: Any = np.empty((len(column_blocks[0]), cell_slices[-1].stop), column_blocks[0].dtype)
+        for block_cells, column_block in zip(cell_slices, column_blocks, strict=True):
+            restricted_rows[:, block_cells] = column_block
+        return np.array(self.restrict(restricted_rows))
 
     @abc.abstractmethod
     def variance(self) -> Float[Array, " m"]:
@@ -81,12 +81,12 @@ class DiagonalBasis(AbstractBasis):
 
     def restrict_blocks(self, blocks):
         """Rows times S: each column multiplied by the prior standard deviation of its cell."""
-        products: list[np.ndarray] = []
-        for cells, block in blocks:
-            if not products:
-                products.append(np.empty((len(block), len(self.deviation)), block.dtype))
-            np.multiply(block, self.deviation[cells], out=products[0][:, cells])
-        return products[0]
+        scaled_blocks: list[np.ndarray] = []
+        for cells, column_block in blocks:
+            if not scaled_blocks:
+                scaled_blocks.append(np.empty((len(column_block), len(self.deviation)), column_block.dtype))
+            np.multiply(column_block, self.deviation[cells], out=scaled_blocks[0][:, cells])
+        return scaled_blocks[0]
 
     def variance(self):
         """Variance of the cells: squared prior standard deviations."""
@@ -137,8 +137,10 @@ class DenseBasis(AbstractBasis):
 
     def restrict_blocks(self, blocks):
         """Product of rows with the shapes, summed over blocks of cells."""
-        total = sum(block.astype(self.shapes.dtype) @ self.shapes[cells] for cells, block in blocks)
-        return np.asarray(total, float)
+        restricted_rows = sum(
+            column_block.astype(self.shapes.dtype) @ self.shapes[cells] for cells, column_block in blocks
+        )
+        return np.asarray(restricted_rows, float)
 
     def variance(self):
         """Variance of the cells: sum of the squared shapes, plus the variance left out."""
@@ -149,8 +151,8 @@ class DenseBasis(AbstractBasis):
     def scaled(self, factor):
         """Basis with the shapes multiplied by `factor`."""
         number_type = self.shapes.dtype
-        left_out = None if self.left_out is None else self.left_out * factor**2
-        return DenseBasis((self.shapes * factor).astype(number_type), left_out)
+        scaled_left_out = None if self.left_out is None else self.left_out * factor**2
+        return DenseBasis((self.shapes * factor).astype(number_type), scaled_left_out)
 
     def pooled(self, regions):
         """Basis of the shapes averaged over every region."""
@@ -179,24 +181,30 @@ class NodalBasis(AbstractBasis):
     def restrict(self, rows):
         """Rows times S: each column is distributed in equal parts over the nodes of its cell."""
         corner_values = rows.T / self.cells.shape[1]
-        shape = self.number, len(rows)
-        corner_sums = [sum_into(shape, self.cells[:, corner], corner_values) for corner in range(self.cells.shape[1])]
+        nodal_shape = self.number, len(rows)
+        corner_sums = [
+            sum_into(nodal_shape, self.cells[:, corner], corner_values) for corner in range(self.cells.shape[1])
+        ]
         return functools.reduce(operator.add, corner_sums).T
 
     def restrict_blocks(self, blocks):
         """Rows times S, for rows that are passed as blocks of cells."""
-        total: Any = np.zeros(0)
+        restricted_rows: Any = np.zeros(0)
         nodes_per_cell = self.cells.shape[1]
-        for cells, block in blocks:
-            total = total if total.size else np.zeros((self.number, len(block)), block.dtype)
+        for cells, column_block in blocks:
+            restricted_rows = (
+                restricted_rows
+                if restricted_rows.size
+                else np.zeros((self.number, len(column_block)), column_block.dtype)
+            )
             nodes, corner_nodes = np.unique(np.asarray(self.cells[cells]), return_inverse=True)
             row_starts = np.arange(0, corner_nodes.size + 1, nodes_per_cell)
-            shape = len(row_starts) - 1, len(nodes)
+            matrix_shape = len(row_starts) - 1, len(nodes)
             mean_matrix = scipy.sparse.csr_array(
-                (np.full(corner_nodes.size, 1 / nodes_per_cell), corner_nodes.ravel(), row_starts), shape=shape
+                (np.full(corner_nodes.size, 1 / nodes_per_cell), corner_nodes.ravel(), row_starts), shape=matrix_shape
             )
-            total[nodes] += mean_matrix.T @ block.T
-        return np.ascontiguousarray(total.T)
+            restricted_rows[nodes] += mean_matrix.T @ column_block.T
+        return np.ascontiguousarray(restricted_rows.T)
 
     def variance(self):
         """Variance of the cells, where each cell has the mean of independent nodal values of unit variance."""
@@ -230,19 +238,19 @@ class Regions(Module):
         largest.
         """
         label = np.asarray(label)
-        number = int(label.max(initial=-1)) + 1
-        if label.shape != (mesh.num_cells,) or label.dtype.kind not in "iu" or number == 0 or label.min() < -1:
+        num_regions = int(label.max(initial=-1)) + 1
+        if label.shape != (mesh.num_cells,) or label.dtype.kind not in "iu" or num_regions == 0 or label.min() < -1:
             raise ValueError(
                 f"regions must be integers, one for each of the {mesh.num_cells} cells: from 0, or -1 for cells held "
                 f"at the background; got {label.dtype} of shape {label.shape}."
             )
-        if number > len(label):
-            raise ValueError(f"regions: the label {number - 1} is more than there are cells; use all from 0.")
-        empty_regions = np.setdiff1d(np.arange(number), label)
+        if num_regions > len(label):
+            raise ValueError(f"regions: the label {num_regions - 1} is more than there are cells; use all from 0.")
+        empty_regions = np.setdiff1d(np.arange(num_regions), label)
         if empty_regions.size:
-            raise ValueError(f"regions: no cell has the label {empty_regions[0]}; use all from 0 to {number - 1}.")
+            raise ValueError(f"regions: no cell has the label {empty_regions[0]}; use all from 0 to {num_regions - 1}.")
         return cls(
-            host.array(label), host.asarray(measures(mesh)), number
+            host.array(label), host.asarray(measures(mesh)), num_regions
         )  # copied, so that the user's array can change
 
     def total(self, values: Float[Array, "m *k"]) -> Float[Array, "p *k"]:
@@ -254,14 +262,14 @@ class Regions(Module):
         """Mean of the cells' values over each region, weighted by area (3-D: volume)."""
         xp = namespace(self, values)
         region_measures = self.spread(self.total(self.measure))  # zero in cells that are fixed at the background
-        weight = xp.where(self.label < 0, 0, self.measure / xp.where(self.label < 0, 1, region_measures))
-        return self.total(values * xp.expand_dims(weight, tuple(range(1, values.ndim))))
+        cell_weights = xp.where(self.label < 0, 0, self.measure / xp.where(self.label < 0, 1, region_measures))
+        return self.total(values * xp.expand_dims(cell_weights, tuple(range(1, values.ndim))))
 
     def spread(self, values: Float[Array, "p *k"]) -> Float[Array, "m *k"]:
         """Give each cell the value of its region; zero in cells that are fixed at the background."""
         xp = namespace(self, values)
-        is_fixed = xp.expand_dims(self.label < 0, tuple(range(1, values.ndim)))
-        return xp.where(is_fixed, 0, values[xp.maximum(self.label, 0)])
+        is_fixed_cell = xp.expand_dims(self.label < 0, tuple(range(1, values.ndim)))
+        return xp.where(is_fixed_cell, 0, values[xp.maximum(self.label, 0)])
 
 
 def pixels(mesh: Mesh, shape: tuple[int, int]) -> Int[np.ndarray, " m"]:

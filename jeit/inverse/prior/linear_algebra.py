@@ -67,9 +67,9 @@ class NodalSystem(NamedTuple):
         pattern = SparsityPattern.from_elements([cells], size=mesh.num_points)
         fronts = find_fronts(pattern, np.asarray(mesh.points))
         row_starts = np.arange(0, cells.size + 1, nodes_per_cell)
-        shape = mesh.num_cells, mesh.num_points
+        matrix_shape = mesh.num_cells, mesh.num_points
         mean_matrix = scipy.sparse.csr_array(
-            (np.full(cells.size, 1 / nodes_per_cell), cells.ravel(), row_starts), shape=shape
+            (np.full(cells.size, 1 / nodes_per_cell), cells.ravel(), row_starts), shape=matrix_shape
         )
         return cls(mesh, on_host(pattern), fronts, mean_matrix)
 
@@ -79,15 +79,15 @@ class NodalSystem(NamedTuple):
         """Assemble a matrix from the element matrices `elements` (m, k, k) and add `diagonal` (n,). Returns the entries
         (e,) in the pattern's order."""
         element_matrices: Any = elements
-        values = np.array(self.pattern.assemble(element_matrices))
-        values[: self.pattern.size] += diagonal
-        return values
+        matrix_values = np.array(self.pattern.assemble(element_matrices))
+        matrix_values[: self.pattern.size] += diagonal
+        return matrix_values
 
     def inverse(self, values: Any) -> Solve:
         """Factorise the matrix A whose entries in the pattern's order are `values`, and return a function that solves A
         X = B for columns B (n, k)."""
-        factor = factorise_fronts(self.fronts, values)
-        return lambda columns: apply_to_columns(factor.solve, columns, len(columns))
+        front_factor = factorise_fronts(self.fronts, values)
+        return lambda right_sides: apply_to_columns(front_factor.solve, right_sides, len(right_sides))
 
 
 class FactorisedMatrix(NamedTuple):
@@ -102,14 +102,15 @@ def factorise_matrix(plan: FactorisationPlan, fronts: Fronts, values: Any) -> Fa
     """Factorise the matrix whose entries in the pattern's order are `values`: in NumPy, with the order `fronts`, or
     inside `jax.jit`, `jax.grad` and `jax.vmap`, with the compiled `plan`."""
     if not isinstance(values, np.ndarray):
-        factor = factorise(plan, values)
+        plan_factor = factorise(plan, values)
         return FactorisedMatrix(
-            lambda columns: solve(plan, factor, columns), lambda columns: half_solve(plan, factor, columns)
+            lambda right_sides: solve(plan, plan_factor, right_sides),
+            lambda right_sides: half_solve(plan, plan_factor, right_sides),
         )
     host_factor = factorise_fronts(fronts, values)
     return FactorisedMatrix(
-        lambda columns: apply_to_columns(host_factor.solve, columns, len(columns)),
-        lambda columns: apply_to_columns(host_factor.half_solve, columns, len(columns)),
+        lambda right_sides: apply_to_columns(host_factor.solve, right_sides, len(right_sides)),
+        lambda right_sides: apply_to_columns(host_factor.half_solve, right_sides, len(right_sides)),
     )
 
 
@@ -126,14 +127,14 @@ def apply_to_columns(
     """Apply `function` to blocks of `chunk_size` columns of a NumPy array (n, k), in parallel on all cores; returns
     (rows, k). `function` may itself call `apply_to_columns` with all its columns."""
     num_columns = columns.shape[1]
-    result = np.empty((rows, num_columns), columns.dtype)
+    result_columns = np.empty((rows, num_columns), columns.dtype)
 
-    def apply_to_block(start: int) -> None:
-        block = np.ascontiguousarray(columns[:, start : start + chunk_size])
-        result[:, start : start + chunk_size] = function(block)
+    def apply_to_block(first_column: int) -> None:
+        column_block = np.ascontiguousarray(columns[:, first_column : first_column + chunk_size])
+        result_columns[:, first_column : first_column + chunk_size] = function(column_block)
 
     on_cores(apply_to_block, range(0, num_columns, chunk_size))
-    return result
+    return result_columns
 
 
 # Diagonal entries of at least this fraction of the largest entry count as equal to it, as occurs in symmetric meshes.
@@ -151,16 +152,16 @@ def pivoted_cholesky(
     """
     residual_diagonal = np.array(diagonal, float)
     allowed_residual = tolerance * residual_diagonal.sum()
-    shapes = np.zeros((min(max_rank, residual_diagonal.size), residual_diagonal.size))
-    for rank in range(shapes.shape[0]):
+    cholesky_rows = np.zeros((min(max_rank, residual_diagonal.size), residual_diagonal.size))
+    for row_index in range(cholesky_rows.shape[0]):
         if residual_diagonal.sum() <= allowed_residual:
-            return shapes[:rank].T
+            return cholesky_rows[:row_index].T
         pivot_index = int(np.argmax(residual_diagonal >= _EQUAL_DIAGONAL_FRACTION * residual_diagonal.max()))
-        row = column(pivot_index) - shapes[:rank, pivot_index] @ shapes[:rank]
-        shapes[rank] = row / np.sqrt(residual_diagonal[pivot_index])
-        residual_diagonal = np.maximum(residual_diagonal - shapes[rank] ** 2, 0)
+        row = column(pivot_index) - cholesky_rows[:row_index, pivot_index] @ cholesky_rows[:row_index]
+        cholesky_rows[row_index] = row / np.sqrt(residual_diagonal[pivot_index])
+        residual_diagonal = np.maximum(residual_diagonal - cholesky_rows[row_index] ** 2, 0)
         residual_diagonal[pivot_index] = 0
-    return shapes.T
+    return cholesky_rows.T
 
 
 def traced_pivoted_cholesky(scaled: Float[Array, "m d"], *, tolerance: float, max_rank: int) -> Float[Array, "m k"]:
@@ -171,41 +172,48 @@ def traced_pivoted_cholesky(scaled: Float[Array, "m d"], *, tolerance: float, ma
     the pivots change.
     """
     num_columns = min(max_rank, len(scaled))
-    pivots, rank = _pivots(jax.lax.stop_gradient(scaled), tolerance, num_columns)
-    is_within_rank = jnp.arange(num_columns) < rank
-    pivot_points = scaled[pivots]
-    columns = jnp.where(is_within_rank, jnp.exp(-_squared_distances(scaled, pivot_points)), 0)
+    pivot_indices, num_pivots = _select_pivots(jax.lax.stop_gradient(scaled), tolerance, num_columns)
+    is_within_rank = jnp.arange(num_columns) < num_pivots
+    pivot_points = scaled[pivot_indices]
+    pivot_columns = jnp.where(is_within_rank, jnp.exp(-_squared_distances(scaled, pivot_points)), 0)
     pivot_covariance = jnp.exp(-_squared_distances(pivot_points, pivot_points))
     lower_factor = jnp.linalg.cholesky(
         jnp.where(is_within_rank & is_within_rank[:, None], pivot_covariance, jnp.eye(num_columns))
     )
-    return jax.scipy.linalg.solve_triangular(lower_factor, columns.T, lower=True).T
+    return jax.scipy.linalg.solve_triangular(lower_factor, pivot_columns.T, lower=True).T
 
 
 def _squared_distances(points, other_points):
     return ((points[:, None] - other_points) ** 2).sum(axis=-1)
 
 
-def _pivots(scaled, tolerance: float, max_rank: int):
+def _select_pivots(scaled, tolerance: float, max_rank: int):
     """Indices (max_rank,) of the pivots of the Cholesky factorisation, and the number of pivots with which the
     tolerance is reached."""
     allowed_residual = tolerance * len(scaled)
 
-    def is_incomplete(state):
-        rank, _, _, residual_diagonal = state
-        return (rank < max_rank) & (residual_diagonal.sum() > allowed_residual)
+    def is_incomplete(pivoting_state):
+        num_pivots, _, _, residual_diagonal = pivoting_state
+        return (num_pivots < max_rank) & (residual_diagonal.sum() > allowed_residual)
 
-    def add_pivot(state):
-        rank, pivots, shapes, residual_diagonal = state
+    def add_pivot(pivoting_state):
+        num_pivots, pivot_indices, cholesky_rows, residual_diagonal = pivoting_state
         pivot_index = jnp.argmax(residual_diagonal >= _EQUAL_DIAGONAL_FRACTION * residual_diagonal.max())
-        row = jnp.exp(-((scaled - scaled[pivot_index]) ** 2).sum(axis=1)) - shapes[:, pivot_index] @ shapes
+        row = (
+            jnp.exp(-((scaled - scaled[pivot_index]) ** 2).sum(axis=1)) - cholesky_rows[:, pivot_index] @ cholesky_rows
+        )
         row = row / jnp.sqrt(residual_diagonal[pivot_index])
         residual_diagonal = jnp.maximum(residual_diagonal - row**2, 0).at[pivot_index].set(0)
-        return rank + 1, pivots.at[rank].set(pivot_index), shapes.at[rank].set(row), residual_diagonal
+        return (
+            num_pivots + 1,
+            pivot_indices.at[num_pivots].set(pivot_index),
+            cholesky_rows.at[num_pivots].set(row),
+            residual_diagonal,
+        )
 
     initial_state = 0, jnp.zeros(max_rank, int), jnp.zeros((max_rank, len(scaled))), jnp.ones(len(scaled))
-    rank, pivots, _, _ = jax.lax.while_loop(is_incomplete, add_pivot, initial_state)
-    return pivots, rank
+    num_pivots, pivot_indices, _, _ = jax.lax.while_loop(is_incomplete, add_pivot, initial_state)
+    return pivot_indices, num_pivots
 
 
 # Grid points per correlation length.
@@ -226,18 +234,21 @@ class GriddedGaussian:
     """
 
     def __init__(self, positions: Float[np.ndarray, "m d"], length: float):
-        spacing = length / _GRID_POINTS_PER_LENGTH
-        lower_corner = positions.min(axis=0) - 1.5 * spacing
-        self._shape = tuple(int(count) for count in np.ceil((positions.max(axis=0) - lower_corner) / spacing) + 2)
-        grid_indices = [np.arange(count) for count in self._shape]
+        grid_spacing = length / _GRID_POINTS_PER_LENGTH
+        lower_corner = positions.min(axis=0) - 1.5 * grid_spacing
+        self._shape = tuple(
+            int(num_axis_points)
+            for num_axis_points in np.ceil((positions.max(axis=0) - lower_corner) / grid_spacing) + 2
+        )
+        grid_indices = [np.arange(num_axis_points) for num_axis_points in self._shape]
         self._axis_covariances = [
             np.exp(-((indices[:, None] - indices) ** 2) / (2 * _GRID_POINTS_PER_LENGTH**2)) for indices in grid_indices
         ]
-        grid_positions = (positions - lower_corner) / spacing
-        self._interpolation = _cubic_interpolation(grid_positions, self._shape)
-        weights, nodes = _cubic_weights(grid_positions), np.arange(_NUM_INTERPOLATION_POINTS)
+        grid_positions = (positions - lower_corner) / grid_spacing
+        self._interpolation_matrix = _cubic_interpolation(grid_positions, self._shape)
+        cubic_weights, nodes = _cubic_weights(grid_positions), np.arange(_NUM_INTERPOLATION_POINTS)
         grid_covariance = np.exp(-((nodes[:, None] - nodes) ** 2) / (2 * _GRID_POINTS_PER_LENGTH**2))
-        self.variance = np.prod(np.einsum("mdi,ij,mdj->md", weights, grid_covariance, weights), axis=1)
+        self.variance = np.prod(np.einsum("mdi,ij,mdj->md", cubic_weights, grid_covariance, cubic_weights), axis=1)
 
     @staticmethod
     def is_efficient(positions: Float[np.ndarray, "m d"], length: float) -> bool:
@@ -248,20 +259,22 @@ class GriddedGaussian:
     def product(self, columns: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
         """Product of the approximated covariance Γ with `columns`."""
 
-        def product_of_block(block: Float[np.ndarray, "m c"]) -> Float[np.ndarray, "m c"]:
-            grid = (self._interpolation.T @ block).reshape(*self._shape, -1)
+        def product_of_block(column_block: Float[np.ndarray, "m c"]) -> Float[np.ndarray, "m c"]:
+            grid_values = (self._interpolation_matrix.T @ column_block).reshape(*self._shape, -1)
             for axis, axis_covariance in enumerate(self._axis_covariances):
-                grid = np.moveaxis(np.tensordot(axis_covariance, grid, axes=(1, axis)), 0, axis)
-            return self._interpolation @ grid.reshape(int(np.prod(self._shape)), -1)
+                grid_values = np.moveaxis(np.tensordot(axis_covariance, grid_values, axes=(1, axis)), 0, axis)
+            return self._interpolation_matrix @ grid_values.reshape(int(np.prod(self._shape)), -1)
 
         return apply_to_columns(product_of_block, columns, len(columns), _COLUMNS_AT_ONCE)
 
 
 def _cubic_weights(positions: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d 4"]:
     """Weights of cubic Lagrange interpolation from the two grid points on either side, along every axis."""
-    offset = positions - np.floor(positions) + 1
+    offset_from_node = positions - np.floor(positions) + 1
     nodes = np.arange(_NUM_INTERPOLATION_POINTS)
-    return np.stack([np.prod([(offset - j) / (i - j) for j in nodes if j != i], axis=0) for i in nodes], axis=-1)
+    return np.stack(
+        [np.prod([(offset_from_node - j) / (i - j) for j in nodes if j != i], axis=0) for i in nodes], axis=-1
+    )
 
 
 def _cubic_interpolation(positions: Float[np.ndarray, "m d"], shape: tuple[int, ...]) -> scipy.sparse.csr_array:
@@ -272,13 +285,13 @@ def _cubic_interpolation(positions: Float[np.ndarray, "m d"], shape: tuple[int, 
         np.arange(_NUM_INTERPOLATION_POINTS),
         _cubic_weights(positions),
     )
-    weight, grid_indices = np.ones((len(positions), 1)), np.zeros((len(positions), 1), int)
+    product_weights, grid_indices = np.ones((len(positions), 1)), np.zeros((len(positions), 1), int)
     for axis, axis_size in enumerate(shape):
-        weight = (weight[:, :, None] * axis_weights[:, axis, None, :]).reshape(len(positions), -1)
+        product_weights = (product_weights[:, :, None] * axis_weights[:, axis, None, :]).reshape(len(positions), -1)
         grid_indices = (
             grid_indices[:, :, None] * axis_size + (first_nodes[:, axis, None] + nodes)[:, None, :]
         ).reshape(len(positions), -1)
-    row_starts = np.arange(0, weight.size + 1, weight.shape[1])
+    row_starts = np.arange(0, product_weights.size + 1, product_weights.shape[1])
     return scipy.sparse.csr_array(
-        (weight.ravel(), grid_indices.ravel(), row_starts), shape=(len(positions), int(np.prod(shape)))
+        (product_weights.ravel(), grid_indices.ravel(), row_starts), shape=(len(positions), int(np.prod(shape)))
     )

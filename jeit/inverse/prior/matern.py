@@ -66,11 +66,13 @@ class Matern(AbstractPrior):
 
     def covariance_product(self, mesh, jacobian):
         """Product Γ Jᵀ, computed by two sparse solves."""
-        field = self._field(mesh, jacobian)
-        columns: Any = np.asarray(on_host(jacobian)).T
-        if np.iscomplexobj(columns):
-            return host.asarray(field.product(columns.real) + 1j * field.product(columns.imag))
-        return host.asarray(field.product(columns))
+        matern_field = self._field(mesh, jacobian)
+        jacobian_columns: Any = np.asarray(on_host(jacobian)).T
+        if np.iscomplexobj(jacobian_columns):
+            return host.asarray(
+                matern_field.product(jacobian_columns.real) + 1j * matern_field.product(jacobian_columns.imag)
+            )
+        return host.asarray(matern_field.product(jacobian_columns))
 
     def precision(self, mesh, jacobian):
         """Not available for this prior. Raises `ValueError`."""
@@ -85,13 +87,13 @@ class Matern(AbstractPrior):
 
     def informed_basis(self, mesh, jacobian):
         """Basis of the shapes of this prior that the data resolve (`informed_shapes`)."""
-        field = self._field(mesh, jacobian)
-        return informed_shapes(np.asarray(jacobian), field.product, field.variance())
+        matern_field = self._field(mesh, jacobian)
+        return informed_shapes(np.asarray(jacobian), matern_field.product, matern_field.variance())
 
     def _field(self, mesh: Mesh, jacobian) -> "_MaternField":
-        remedy = "take Gaussian(length), which can be differentiated"
+        advice_to_user = "take Gaussian(length), which can be differentiated"
         check_has_values(
-            "model, or the prior's length", (mesh, jacobian, self.length), "a Matérn field is made", remedy
+            "model, or the prior's length", (mesh, jacobian, self.length), "a Matérn field is made", advice_to_user
         )
         return _MaternField.create(mesh, float(self.length))
 
@@ -121,14 +123,14 @@ class _MaternField(NamedTuple):
         mass = np.bincount(mesh.cells.ravel(), np.repeat(cell_measures / nodes_per_cell, nodes_per_cell), num_nodes)
         wall_measures = np.asarray(facet_measures(mesh)) / mesh.dimension
         wall_node_measures = np.bincount(mesh.facets.ravel(), np.repeat(wall_measures, mesh.dimension), num_nodes)
-        solve = system.inverse(
+        solve_system = system.inverse(
             system.assemble(
                 stiffness, inverse_length**2 * mass + inverse_length / _ROBIN_COEFFICIENT * wall_node_measures
             )
         )
-        fields = _covariance_factor(solve, mass)
-        scale = 1 / np.sqrt(np.einsum("nk,nk->n", fields, fields))
-        return cls(system.means, solve, mass, scale, scale[:, None] * fields)
+        fields = _covariance_factor(solve_system, mass)
+        inverse_field_deviation = 1 / np.sqrt(np.einsum("nk,nk->n", fields, fields))
+        return cls(system.means, solve_system, mass, inverse_field_deviation, inverse_field_deviation[:, None] * fields)
 
     def variance(self) -> Float[np.ndarray, " m"]:
         """Variance of the field in every cell."""

@@ -135,12 +135,14 @@ class QuadraticForm(AbstractPenalty):
         if self.is_diagonal:
             return jnp.concatenate([image_columns / self.value[:, None], unknown_columns])
         is_free_cell = free[: self.size]
-        entries = jnp.where(is_free_cell[self.row] & is_free_cell[self.column], self.value, 0)
-        dense = jnp.zeros((self.size, self.size)).at[self.row, self.column].add(entries)
-        scale = jnp.max(jnp.abs(self.value))
-        dense = dense + jnp.diag(jnp.where(is_free_cell, _DIAGONAL_SHIFT * scale, scale))
-        solved = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(dense), image_columns)
-        return jnp.concatenate([jnp.where(is_free_cell[:, None], solved, 0), unknown_columns])
+        free_entries = jnp.where(is_free_cell[self.row] & is_free_cell[self.column], self.value, 0)
+        dense_hessian = jnp.zeros((self.size, self.size)).at[self.row, self.column].add(free_entries)
+        largest_entry = jnp.max(jnp.abs(self.value))
+        dense_hessian = dense_hessian + jnp.diag(
+            jnp.where(is_free_cell, _DIAGONAL_SHIFT * largest_entry, largest_entry)
+        )
+        solved_columns = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(dense_hessian), image_columns)
+        return jnp.concatenate([jnp.where(is_free_cell[:, None], solved_columns, 0), unknown_columns])
 
     def model(self, residual, jacobian, coefficients, data):
         """Not available: the bounded solvers use gradients, not quadratic models. Raises `ValueError`."""
@@ -199,17 +201,20 @@ class SparsePrecisionNormal(AbstractNormal):
 
     def covariance_product(self, columns):
         """Q⁻¹ times `columns`, by sparse solves."""
-        size = self.plan.size
-        image_columns = solve_columns(self.plan, self.factor, columns[:size])
-        return namespace(columns, image_columns).concatenate([image_columns, columns[size:]])
+        num_image_coefficients = self.plan.size
+        image_columns = solve_columns(self.plan, self.factor, columns[:num_image_coefficients])
+        return namespace(columns, image_columns).concatenate([image_columns, columns[num_image_coefficients:]])
 
     def variance(self, basis):
         """Variance of the cells, from those entries of Q⁻¹ that lie in the sparsity pattern of Q."""
-        entries = inverse_entries(self.plan, self.factor)
+        covariance_entries = inverse_entries(self.plan, self.factor)
         if isinstance(basis, DiagonalBasis):
-            return basis.deviation**2 * entries[: self.plan.size]
+            return basis.deviation**2 * covariance_entries[: self.plan.size]
         assert isinstance(basis, NodalBasis)
-        block_entries, (row, column) = self.pattern.entries_between(entries), np.tril_indices(basis.cells.shape[1])
+        block_entries, (row, column) = (
+            self.pattern.entries_between(covariance_entries),
+            np.tril_indices(basis.cells.shape[1]),
+        )
         return host.where(row == column, 1.0, 2.0) @ block_entries / basis.cells.shape[1] ** 2
 
     def num_draws(self, num_coefficients):

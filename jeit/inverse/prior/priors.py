@@ -135,8 +135,8 @@ class AbstractPrior(Module):
 
     def entries(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> tuple[Any, Any, Any]:
         """Rows, columns and values of the k nonzero entries of the precision matrix Q, (k,) each."""
-        matrix = scipy.sparse.coo_array(self.precision(mesh, jacobian))
-        return matrix.row, matrix.col, matrix.data
+        precision_matrix = scipy.sparse.coo_array(self.precision(mesh, jacobian))
+        return precision_matrix.row, precision_matrix.col, precision_matrix.data
 
     @abc.abstractmethod
     def basis(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> AbstractBasis:
@@ -231,21 +231,23 @@ class Laplace(AbstractPrior):
         check_cells(mesh)
         if mesh.dimension == 3 and mesh.num_cells > _LARGE_MESH_CELLS and has_values(mesh, jacobian):
             return host.asarray(_node_covariance_product(mesh, np.asarray(jacobian).T, 0.0))
-        pairs, _ = interior_facets(mesh)
-        pattern, plan = on_host(cell_factorisation(mesh, [pairs, np.zeros((1, 1), int)]))
-        link_matrices = host.broadcast_to(np.array([[2.0, -2.0], [-2.0, 2.0]]), (len(pairs), 2, 2))
-        factor = factorise(plan, pattern.assemble(link_matrices, np.full((1, 1, 1), 2.0)))
-        columns = on_host(jacobian).T
-        if not np.iscomplexobj(columns):
-            return solve(plan, factor, columns)
-        return solve(plan, factor, columns.real) + 1j * solve(plan, factor, columns.imag)
+        cell_pairs, _ = interior_facets(mesh)
+        pattern, elimination_plan = on_host(cell_factorisation(mesh, [cell_pairs, np.zeros((1, 1), int)]))
+        link_matrices = host.broadcast_to(np.array([[2.0, -2.0], [-2.0, 2.0]]), (len(cell_pairs), 2, 2))
+        precision_factor = factorise(elimination_plan, pattern.assemble(link_matrices, np.full((1, 1, 1), 2.0)))
+        jacobian_columns = on_host(jacobian).T
+        if not np.iscomplexobj(jacobian_columns):
+            return solve(elimination_plan, precision_factor, jacobian_columns)
+        return solve(elimination_plan, precision_factor, jacobian_columns.real) + 1j * solve(
+            elimination_plan, precision_factor, jacobian_columns.imag
+        )
 
     def precision(self, mesh, jacobian):
         """Precision matrix Q, twice the graph Laplacian."""
         check_cells(mesh)
-        pairs, _ = interior_facets(mesh)
+        cell_pairs, _ = interior_facets(mesh)
         num_cells = mesh.num_cells
-        adjacency = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), shape=(num_cells, num_cells))
+        adjacency = scipy.sparse.coo_array((np.ones(len(cell_pairs)), cell_pairs.T), shape=(num_cells, num_cells))
         adjacency_matrix = (adjacency + adjacency.T).tocsr()
         return (
             2 * (scipy.sparse.diags_array(np.asarray(adjacency_matrix.sum(axis=1)).ravel()) - adjacency_matrix).tocsr()
@@ -305,9 +307,9 @@ class Gaussian(AbstractPrior):
         ):
             return host.asarray(GriddedGaussian(centres, float(self.length)).product(np.asarray(jacobian).T))
         scaled_centres = np.asarray(scaled_centres)
-        rows = np.split(scaled_centres, np.arange(_ROWS_AT_ONCE, len(scaled_centres), _ROWS_AT_ONCE))
+        centre_blocks = np.split(scaled_centres, np.arange(_ROWS_AT_ONCE, len(scaled_centres), _ROWS_AT_ONCE))
         return host.concatenate(
-            [np.exp(-cdist(row, scaled_centres, "sqeuclidean")) @ np.asarray(jacobian).T for row in rows]
+            [np.exp(-cdist(row, scaled_centres, "sqeuclidean")) @ np.asarray(jacobian).T for row in centre_blocks]
         )
 
     def basis(self, mesh, jacobian):
@@ -340,8 +342,8 @@ class Gaussian(AbstractPrior):
         centres = np.asarray(centroids(mesh))
         if not GriddedGaussian.is_efficient(centres, float(self.length)):
             return self.basis(mesh, jacobian)
-        grid = GriddedGaussian(centres, float(self.length))
-        return informed_shapes(np.asarray(jacobian), grid.product, grid.variance)
+        gridded_covariance = GriddedGaussian(centres, float(self.length))
+        return informed_shapes(np.asarray(jacobian), gridded_covariance.product, gridded_covariance.variance)
 
     def precision(self, mesh, jacobian):
         """Not available: the inverse of a Gaussian covariance is dense and ill-conditioned. Raises `ValueError`."""
@@ -362,15 +364,17 @@ def informed_shapes(
     `covariance`: function that multiplies an array by Γ; `variance`: diagonal of Γ, if known. Shapes are stored in
     single precision, which changes an image by a relative 1e-6.
     """
-    product = np.asarray(covariance(jacobian.T))
-    data_covariance = jacobian @ product
-    eigenvalues, vectors = np.linalg.eigh((data_covariance + data_covariance.T) / 2)
-    is_informed = eigenvalues > _MIN_SQUARED_SIGNAL * eigenvalues[-1]
-    shapes = (product @ (vectors[:, is_informed] / np.sqrt(eigenvalues[is_informed]))).astype(np.float32)
+    covariance_product = np.asarray(covariance(jacobian.T))
+    data_covariance = jacobian @ covariance_product
+    eigenvalues, data_eigenvectors = np.linalg.eigh((data_covariance + data_covariance.T) / 2)
+    is_informed_direction = eigenvalues > _MIN_SQUARED_SIGNAL * eigenvalues[-1]
+    image_shapes = (
+        covariance_product @ (data_eigenvectors[:, is_informed_direction] / np.sqrt(eigenvalues[is_informed_direction]))
+    ).astype(np.float32)
     if variance is None:
-        return DenseBasis(host.asarray(shapes))
-    shape_variance = np.einsum("mn,mn->m", shapes, shapes)
-    return DenseBasis(host.asarray(shapes), host.asarray(np.maximum(variance - shape_variance, 0)))
+        return DenseBasis(host.asarray(image_shapes))
+    shape_variance = np.einsum("mn,mn->m", image_shapes, image_shapes)
+    return DenseBasis(host.asarray(image_shapes), host.asarray(np.maximum(variance - shape_variance, 0)))
 
 
 def _node_covariance_product(
@@ -380,14 +384,16 @@ def _node_covariance_product(
     averaged over cells. `degrees_of_freedom` is added to the Laplacian's diagonal; if `degrees_of_freedom` is 0, the
     value of node 0 is set to zero."""
     system = NodalSystem.create(mesh)
-    neighbours = system.pattern.to_scipy(np.ones(system.pattern.num_entries))
-    diagonal = 2 * (np.asarray(neighbours.sum(axis=1)).ravel() - 1) + degrees_of_freedom
+    neighbour_matrix = system.pattern.to_scipy(np.ones(system.pattern.num_entries))
+    diagonal = 2 * (np.asarray(neighbour_matrix.sum(axis=1)).ravel() - 1) + degrees_of_freedom
     if not degrees_of_freedom:
         diagonal[0] += 2
-    values = np.full(system.pattern.num_entries, -2.0)
-    values[: len(diagonal)] = diagonal
-    mean_matrix, solve_system = system.means, system.inverse(values)
-    return apply_to_columns(lambda block: mean_matrix @ solve_system(mean_matrix.T @ block), columns, mesh.num_cells)
+    matrix_values = np.full(system.pattern.num_entries, -2.0)
+    matrix_values[: len(diagonal)] = diagonal
+    mean_matrix, solve_system = system.means, system.inverse(matrix_values)
+    return apply_to_columns(
+        lambda column_block: mean_matrix @ solve_system(mean_matrix.T @ column_block), columns, mesh.num_cells
+    )
 
 
 @jax.jit
@@ -396,20 +402,20 @@ def _traced_product(scaled_centres, jacobian):
     memory."""
 
     @jax.checkpoint
-    def covariance_rows(block):
-        return jnp.exp(-((block[:, None] - scaled_centres) ** 2).sum(axis=-1)) @ jacobian.T
+    def covariance_rows(centre_block):
+        return jnp.exp(-((centre_block[:, None] - scaled_centres) ** 2).sum(axis=-1)) @ jacobian.T
 
     num_padding_rows = -len(scaled_centres) % _ROWS_AT_ONCE
-    blocks = jnp.pad(scaled_centres, ((0, num_padding_rows), (0, 0))).reshape(
+    centre_blocks = jnp.pad(scaled_centres, ((0, num_padding_rows), (0, 0))).reshape(
         -1, _ROWS_AT_ONCE, scaled_centres.shape[1]
     )
-    return jax.lax.map(covariance_rows, blocks).reshape(-1, len(jacobian))[: len(scaled_centres)]
+    return jax.lax.map(covariance_rows, centre_blocks).reshape(-1, len(jacobian))[: len(scaled_centres)]
 
 
 def check_cells(mesh: Mesh) -> None:
     """Raise `ValueError` if the mesh's cells are traced, because the prior must know which cells are neighbours."""
-    remedy = "close over the mesh, and put into it what varies: eqx.tree_at(lambda m: m.points, mesh, points)"
-    check_has_values("mesh: its cells", mesh.cells, "the prior's neighbours are found from", remedy)
+    advice_to_user = "close over the mesh, and put into it what varies: eqx.tree_at(lambda m: m.points, mesh, points)"
+    check_has_values("mesh: its cells", mesh.cells, "the prior's neighbours are found from", advice_to_user)
 
 
 def cell_factorisation(mesh: Mesh, groups) -> tuple[SparsityPattern, FactorisationPlan]:

@@ -72,15 +72,15 @@ class NodalTotalVariation(AbstractPenalty):
         """Create the nodal basis and the penalty for a mesh and a `reference` per cell; `pull` is relative to the
         hyperparameter."""
         mesh = on_host(mesh)
-        cells, size = np.asarray(mesh.cells), mesh.num_points
-        pattern = SparsityPattern.from_elements([cells], size=size)
-        points = np.asarray(mesh.points)
-        volume, body_size = np.asarray(measures(mesh)), np.ptp(points, axis=0).max()
+        cells, num_nodes = np.asarray(mesh.cells), mesh.num_points
+        pattern = SparsityPattern.from_elements([cells], size=num_nodes)
+        mesh_points = np.asarray(mesh.points)
+        volume, body_size = np.asarray(measures(mesh)), np.ptp(mesh_points, axis=0).max()
         node_shares = np.repeat(volume[:, None] / cells.shape[1], cells.shape[1], axis=1)
-        node_volumes = np.bincount(cells.ravel(), node_shares.ravel(), size)
+        node_volumes = np.bincount(cells.ravel(), node_shares.ravel(), num_nodes)
         xp = namespace(reference)
-        nodal_reference = sum_into((size,), cells, xp.asarray(reference)[:, None] * node_shares) / node_volumes
-        energy = cls(
+        nodal_reference = sum_into((num_nodes,), cells, xp.asarray(reference)[:, None] * node_shares) / node_volumes
+        penalty_energy = cls(
             cells=host.asarray(cells),
             slope=host.asarray(np.asarray(gradients(mesh))),
             weight=hyperparameter * host.asarray(volume / body_size ** (mesh.dimension - 1)),
@@ -88,10 +88,10 @@ class NodalTotalVariation(AbstractPenalty):
             pull=hyperparameter * host.asarray(pull * node_volumes / node_volumes.sum()),
             reference=nodal_reference,
             pattern=pattern,
-            plan=analyse(pattern, points),
-            fronts=find_fronts(pattern, points),
+            plan=analyse(pattern, mesh_points),
+            fronts=find_fronts(pattern, mesh_points),
         )
-        return NodalBasis(energy.cells, size), energy
+        return NodalBasis(penalty_energy.cells, num_nodes), penalty_energy
 
     @property
     def descent_tolerance(self) -> float:
@@ -102,8 +102,8 @@ class NodalTotalVariation(AbstractPenalty):
     def cost(self, coefficients):
         """Value of the penalty at c."""
         image, unknowns = self._split_coefficients(coefficients)
-        edges = (self.weight * self._smoothed_height(image)).sum()
-        return edges + 0.5 * (self.pull * image**2).sum() + 0.5 * unknowns @ unknowns
+        edge_cost = (self.weight * self._smoothed_height(image)).sum()
+        return edge_cost + 0.5 * (self.pull * image**2).sum() + 0.5 * unknowns @ unknowns
 
     def diagonal(self, coefficients):
         """Diagonal of the quadratic form that touches the energy at c."""
@@ -117,83 +117,93 @@ class NodalTotalVariation(AbstractPenalty):
         """Approximate inverse of the energy's Hessian, times columns. The stiffness is the second derivative of the
         energy along the gradient, which tends to zero where the gradient is large."""
         image, _ = self._split_coefficients(coefficients)
-        size = self.pull.shape[0]
-        is_free_node = free[:size]
-        curvature = self.weight * self.steepness**2 / self._smoothed_height(image) ** 3
+        num_nodes = self.pull.shape[0]
+        is_free_node = free[:num_nodes]
+        cell_curvature = self.weight * self.steepness**2 / self._smoothed_height(image) ** 3
         has_free_corner = gather(is_free_node, self.cells)
-        elements = self._elements(curvature) * (has_free_corner[:, :, None] & has_free_corner[:, None, :])
-        factor = factorise(self.plan, self._matrix(elements, jnp.where(is_free_node, self.pull, 1)))
-        image_columns = solve(self.plan, factor, columns[:size])
-        return jnp.concatenate([image_columns, columns[size:]])
+        element_matrices = self._element_matrices(cell_curvature) * (
+            has_free_corner[:, :, None] & has_free_corner[:, None, :]
+        )
+        hessian_factor = factorise(
+            self.plan, self._assembled_matrix(element_matrices, jnp.where(is_free_node, self.pull, 1))
+        )
+        image_columns = solve(self.plan, hessian_factor, columns[:num_nodes])
+        return jnp.concatenate([image_columns, columns[num_nodes:]])
 
     def normal(self, coefficients):
         """Normal distribution whose precision is the quadratic form that touches the energy at c, as in
         `TotalVariationPenalty.normal`."""
         image, _ = self._split_coefficients(coefficients)
-        values = self._matrix(self._elements(self.weight / self._smoothed_height(image)), self.pull)
-        return SparsePrecisionNormal(self.pattern, self.plan, factorise(self.plan, values))
+        matrix_values = self._assembled_matrix(
+            self._element_matrices(self.weight / self._smoothed_height(image)), self.pull
+        )
+        return SparsePrecisionNormal(self.pattern, self.plan, factorise(self.plan, matrix_values))
 
     def model(self, residual, jacobian, coefficients, data):
         """Objective at c and the function that computes a step, as in `TotalVariationPenalty.model`."""
         image, unknowns = self._split_coefficients(coefficients)
         weighted_residual = data.precision @ residual
-        cost = 0.5 * residual @ weighted_residual + self.cost(coefficients)
+        objective_value = 0.5 * residual @ weighted_residual + self.cost(coefficients)
         stiffness = self.weight / self._smoothed_height(image)
-        size = image.shape[0]
+        num_nodes = image.shape[0]
 
-        def step(damping):
+        def damped_step(damping):
             xp = namespace(self, jacobian)
-            flux = stiffness[:, None] * self._gradient(self.reference + image)
-            gradient = self.pull * image + self._divergence(flux)
-            factor = factorise_matrix(self.plan, self.fronts, self._matrix(self._elements(stiffness), self.pull))
-            columns = xp.concatenate([jacobian[:, :size].T, gradient[:, None]], axis=1)
+            gradient_flux = stiffness[:, None] * self._image_gradient(self.reference + image)
+            gradient = self.pull * image + self._divergence(gradient_flux)
+            hessian_factor = factorise_matrix(
+                self.plan, self.fronts, self._assembled_matrix(self._element_matrices(stiffness), self.pull)
+            )
+            right_sides = xp.concatenate([jacobian[:, :num_nodes].T, gradient[:, None]], axis=1)
             # Products of columns by way of Q⁻¹ are formed from half solves; the step requires one more full solve.
-            half_solution = factor.half_solve(columns)
-            products = half_solution.T @ half_solution
-            unknown_columns = jacobian[:, size:]
-            data_covariance = (products[:-1, :-1] + unknown_columns @ unknown_columns.T) / (1 + damping)
-            descent = (products[:-1, -1] + unknown_columns @ unknowns) / (1 + damping)
-            dual_residual = solve_definite(data_covariance + data.covariance, residual - descent)
-            image_direction = factor.solve((gradient + dual_residual @ jacobian[:, :size])[:, None])[:, 0]
-            direction = -xp.concatenate([image_direction, unknowns + dual_residual @ unknown_columns]) / (1 + damping)
-            data_change = jacobian @ direction
-            image_change, unknown_change = self._split_coefficients(direction)
-            slope = weighted_residual @ data_change + gradient @ image_change + unknowns @ unknown_change
-            penalty_curvature = (stiffness * (self._gradient(image_change) ** 2).sum(axis=1)).sum()
+            half_solution = hessian_factor.half_solve(right_sides)
+            solution_products = half_solution.T @ half_solution
+            unknown_columns = jacobian[:, num_nodes:]
+            data_covariance = (solution_products[:-1, :-1] + unknown_columns @ unknown_columns.T) / (1 + damping)
+            predicted_residual = (solution_products[:-1, -1] + unknown_columns @ unknowns) / (1 + damping)
+            dual_residual = solve_definite(data_covariance + data.covariance, residual - predicted_residual)
+            image_direction = hessian_factor.solve((gradient + dual_residual @ jacobian[:, :num_nodes])[:, None])[:, 0]
+            step_direction = -xp.concatenate([image_direction, unknowns + dual_residual @ unknown_columns]) / (
+                1 + damping
+            )
+            data_change = jacobian @ step_direction
+            image_change, unknown_change = self._split_coefficients(step_direction)
+            cost_slope = weighted_residual @ data_change + gradient @ image_change + unknowns @ unknown_change
+            penalty_curvature = (stiffness * (self._image_gradient(image_change) ** 2).sum(axis=1)).sum()
             penalty_curvature = (
                 penalty_curvature + (self.pull * image_change**2).sum() + unknown_change @ unknown_change
             )
-            return direction, slope, data_change @ data.precision @ data_change + penalty_curvature
+            return step_direction, cost_slope, data_change @ data.precision @ data_change + penalty_curvature
 
-        return cost, step
+        return objective_value, damped_step
 
-    def _elements(self, stiffness):
+    def _element_matrices(self, stiffness):
         """Element matrices (m, k, k) of the quadratic form Σ stiffness |∇x|²."""
         return namespace(self, stiffness).einsum("mid,mjd,m->mij", self.slope, self.slope, stiffness)
 
-    def _matrix(self, elements, diagonal):
+    def _assembled_matrix(self, elements, diagonal):
         """Entries of the matrix assembled from `elements`, plus `diagonal`."""
-        values = self.pattern.assemble(elements)
-        xp = namespace(self, values)
-        return values + xp.concatenate([diagonal, xp.zeros(len(values) - len(diagonal))])
+        matrix_values = self.pattern.assemble(elements)
+        xp = namespace(self, matrix_values)
+        return matrix_values + xp.concatenate([diagonal, xp.zeros(len(matrix_values) - len(diagonal))])
 
-    def _gradient(self, image):
+    def _image_gradient(self, image):
         """Gradient (m, d) of a nodal image in every cell, 1/m."""
         return (self.slope * gather(image, self.cells)[:, :, None]).sum(axis=1)
 
     def _divergence(self, flux):
-        """Adjoint of `_gradient`, applied to a `flux` in every cell."""
+        """Adjoint of `_image_gradient`, applied to a `flux` in every cell."""
         return sum_into(self.pull.shape, self.cells, (self.slope * flux[:, None]).sum(axis=-1))
 
     def _split_coefficients(self, coefficients):
         """Coefficients of the image, and coefficients of further unknowns."""
-        size = self.pull.shape[0]
-        return coefficients[:size], coefficients[size:]
+        num_nodes = self.pull.shape[0]
+        return coefficients[:num_nodes], coefficients[num_nodes:]
 
     def _smoothed_height(self, image):
         """Smoothed gradient √(|∇x|² + steepness²) of an image x per cell."""
-        squared = (self._gradient(self.reference + image) ** 2).sum(axis=1)
-        return namespace(self, image).sqrt(squared + self.steepness**2)
+        squared_gradient = (self._image_gradient(self.reference + image) ** 2).sum(axis=1)
+        return namespace(self, image).sqrt(squared_gradient + self.steepness**2)
 
 
 # Weight of the deviation from the background relative to λ. This term determines the image where the data do not.
@@ -258,26 +268,26 @@ class TotalVariation(AbstractPrior):
         check_cells(mesh)
         if mesh.dimension == 3 and not per_cell and has_values(mesh):
             return NodalTotalVariation.create(mesh, reference, hyperparameter, self.smoothing, _BACKGROUND_WEIGHT)
-        pairs, nodes = interior_facets(mesh)
-        points = on_host(mesh.points)
-        xp = namespace(points, hyperparameter, self.smoothing)
-        corners = points[nodes]
-        body_size = (points.max(axis=0) - points.min(axis=0)).max()
+        cell_pairs, nodes = interior_facets(mesh)
+        mesh_points = on_host(mesh.points)
+        xp = namespace(mesh_points, hyperparameter, self.smoothing)
+        corners = mesh_points[nodes]
+        body_size = (mesh_points.max(axis=0) - mesh_points.min(axis=0)).max()
         if mesh.dimension == 2:
             facet_sizes = xp.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
         else:
             normals = xp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
             facet_sizes = xp.linalg.norm(normals, axis=1) / 2
-        pattern, plan = cell_factorisation(mesh, [pairs, np.arange(mesh.num_cells)[:, None]])
+        pattern, elimination_plan = cell_factorisation(mesh, [cell_pairs, np.arange(mesh.num_cells)[:, None]])
         cell_measures = on_host(measures(mesh))
         penalty = TotalVariationPenalty(
-            pairs=host.asarray(pairs),
+            pairs=host.asarray(cell_pairs),
             weight=hyperparameter * facet_sizes / body_size ** (mesh.dimension - 1),
             level=hyperparameter * _BACKGROUND_WEIGHT * cell_measures / cell_measures.sum(),
             smoothing=xp.asarray(self.smoothing),
             reference=reference,
             pattern=pattern,
-            plan=plan,
+            plan=elimination_plan,
             between_bounds=per_cell,
         )
         return DiagonalBasis(host.ones(mesh.num_cells)), penalty
@@ -318,8 +328,8 @@ class TotalVariationPenalty(AbstractPenalty):
     def cost(self, coefficients):
         """Value of the penalty at c."""
         image, unknowns = self._split_coefficients(coefficients)
-        edges = (self.weight * self._smoothed_height(image)).sum()
-        return edges + 0.5 * (self.level * image**2).sum() + 0.5 * unknowns @ unknowns
+        edge_cost = (self.weight * self._smoothed_height(image)).sum()
+        return edge_cost + 0.5 * (self.level * image**2).sum() + 0.5 * unknowns @ unknowns
 
     def diagonal(self, coefficients):
         """Diagonal of the quadratic form that touches the energy at c."""
@@ -333,20 +343,23 @@ class TotalVariationPenalty(AbstractPenalty):
         times the weights in the touching quadratic form and tend to zero across large jumps."""
         image, _ = self._split_coefficients(coefficients)
         is_free_cell = free[: self.level.shape[0]]
-        curvature = self.weight * self.smoothing**2 / self._smoothed_height(image) ** 3
+        facet_curvature = self.weight * self.smoothing**2 / self._smoothed_height(image) ** 3
         facet_is_free = is_free_cell[self.pairs[:, 0]], is_free_cell[self.pairs[:, 1]]
-        diagonal_entries, coupling = (
-            [jnp.where(is_free, curvature, 0) for is_free in facet_is_free],
-            jnp.where(facet_is_free[0] & facet_is_free[1], -curvature, 0),
+        diagonal_entries, coupling_entries = (
+            [jnp.where(is_free_side, facet_curvature, 0) for is_free_side in facet_is_free],
+            jnp.where(facet_is_free[0] & facet_is_free[1], -facet_curvature, 0),
         )
         facet_matrices = jnp.stack(
-            [jnp.stack([diagonal_entries[0], coupling], axis=-1), jnp.stack([coupling, diagonal_entries[1]], axis=-1)],
+            [
+                jnp.stack([diagonal_entries[0], coupling_entries], axis=-1),
+                jnp.stack([coupling_entries, diagonal_entries[1]], axis=-1),
+            ],
             axis=-2,
         )
-        level = jnp.where(is_free_cell, self.level, 1)
-        factor = factorise(self.plan, self.pattern.assemble(facet_matrices, level[:, None, None]))
+        cell_level = jnp.where(is_free_cell, self.level, 1)
+        hessian_factor = factorise(self.plan, self.pattern.assemble(facet_matrices, cell_level[:, None, None]))
         image_columns, unknown_columns = columns[: len(is_free_cell)], columns[len(is_free_cell) :]
-        return jnp.concatenate([solve(self.plan, factor, image_columns), unknown_columns])
+        return jnp.concatenate([solve(self.plan, hessian_factor, image_columns), unknown_columns])
 
     def normal(self, coefficients):
         """Normal distribution whose precision is the quadratic form that touches the energy at c; None with bounds.
@@ -355,7 +368,7 @@ class TotalVariationPenalty(AbstractPenalty):
             return None
         image, _ = self._split_coefficients(coefficients)
         return SparsePrecisionNormal(
-            self.pattern, self.plan, self._factorise(self.weight / self._smoothed_height(image))
+            self.pattern, self.plan, self._factorise_hessian(self.weight / self._smoothed_height(image))
         )
 
     def model(self, residual, jacobian, coefficients, data):
@@ -368,37 +381,41 @@ class TotalVariationPenalty(AbstractPenalty):
         """
         image, unknowns = self._split_coefficients(coefficients)
         weighted_residual = data.precision @ residual
-        cost = 0.5 * residual @ weighted_residual + self.cost(coefficients)
+        objective_value = 0.5 * residual @ weighted_residual + self.cost(coefficients)
         stiffness = self.weight / self._smoothed_height(image)
 
-        def step(damping):
+        def damped_step(damping):
             xp = namespace(self, jacobian)
-            flux = stiffness * self._jump_across_facets(self.reference + image)
+            jump_flux = stiffness * self._jump_across_facets(self.reference + image)
             gradient = self.level * image
-            gradient = gradient + self._divergence(flux)
-            size = image.shape[0]
-            solutions = self._solve(stiffness, xp.concatenate([jacobian[:, :size].T, gradient[:, None]], axis=1))
-            product = xp.concatenate([solutions[:, :-1], jacobian[:, size:].T]) / (1 + damping)
-            descent = xp.concatenate([solutions[:, -1], unknowns]) / (1 + damping)
-            dual_residual = solve_definite(jacobian @ product + data.covariance, residual - jacobian @ descent)
-            direction = -descent - product @ dual_residual
-            data_change = jacobian @ direction
-            image_change, unknown_change = self._split_coefficients(direction)
-            slope = weighted_residual @ data_change + gradient @ image_change + unknowns @ unknown_change
+            gradient = gradient + self._divergence(jump_flux)
+            num_cells = image.shape[0]
+            hessian_solutions = self._solve_hessian(
+                stiffness, xp.concatenate([jacobian[:, :num_cells].T, gradient[:, None]], axis=1)
+            )
+            covariance_product = xp.concatenate([hessian_solutions[:, :-1], jacobian[:, num_cells:].T]) / (1 + damping)
+            image_descent = xp.concatenate([hessian_solutions[:, -1], unknowns]) / (1 + damping)
+            dual_residual = solve_definite(
+                jacobian @ covariance_product + data.covariance, residual - jacobian @ image_descent
+            )
+            step_direction = -image_descent - covariance_product @ dual_residual
+            data_change = jacobian @ step_direction
+            image_change, unknown_change = self._split_coefficients(step_direction)
+            cost_slope = weighted_residual @ data_change + gradient @ image_change + unknowns @ unknown_change
             penalty_curvature = (
                 (stiffness * self._jump_across_facets(image_change) ** 2).sum()
                 + (self.level * image_change**2).sum()
                 + unknown_change @ unknown_change
             )
-            return direction, slope, data_change @ data.precision @ data_change + penalty_curvature
+            return step_direction, cost_slope, data_change @ data.precision @ data_change + penalty_curvature
 
-        return cost, step
+        return objective_value, damped_step
 
-    def _solve(self, stiffness, columns):
+    def _solve_hessian(self, stiffness, columns):
         """Q⁻¹ times `columns`, where Q is the touching quadratic form with weights `stiffness` of the squared jumps."""
-        return solve(self.plan, self._factorise(stiffness), columns)
+        return solve(self.plan, self._factorise_hessian(stiffness), columns)
 
-    def _factorise(self, stiffness) -> Factor:
+    def _factorise_hessian(self, stiffness) -> Factor:
         """Factorise the touching quadratic form Q with weights `stiffness` of the squared jumps."""
         facet_matrices = stiffness[:, None, None] * np.array([[1.0, -1.0], [-1.0, 1.0]])
         return factorise(self.plan, self.pattern.assemble(facet_matrices, self.level[:, None, None]))
@@ -410,8 +427,8 @@ class TotalVariationPenalty(AbstractPenalty):
 
     def _split_coefficients(self, coefficients):
         """Coefficients of the image, and coefficients of further unknowns."""
-        size = self.level.shape[0]
-        return coefficients[:size], coefficients[size:]
+        num_cells = self.level.shape[0]
+        return coefficients[:num_cells], coefficients[num_cells:]
 
     def _jump_across_facets(self, image):
         """Difference of the image across each facet."""

@@ -22,7 +22,7 @@ _MESH_LOG_CONTRAST_DEVIATION = {2: 0.03, 3: 0.1}
 
 def contrast_deviations(problem: ShapeProblem, fitted: ShapeFit, free_fit: ShapeFit | None = None) -> list[float]:
     """Standard deviations of the contrasts of bodies, in log σ, including `unmodelled_deviations`."""
-    return np.hypot(_contrasts(problem, fitted)[1], unmodelled_deviations(problem, fitted, free_fit)).tolist()
+    return np.hypot(_body_contrasts(problem, fitted)[1], unmodelled_deviations(problem, fitted, free_fit)).tolist()
 
 
 def unmodelled_deviations(
@@ -40,18 +40,20 @@ def unmodelled_deviations(
         and problem.negative_log_evidence(free_fit) - free_fit.bodies.odds
         < problem.negative_log_evidence(fitted) - fitted.bodies.odds + _UNDECIDED_LOG_EVIDENCE_DIFFERENCE
     ):
-        contrast, deviation = _contrasts(problem, fitted)
-        contrast_of_free_fit, deviation_of_free_fit = _contrasts(problem, free_fit)
-        variance += np.maximum((np.abs(contrast_of_free_fit - contrast) + deviation_of_free_fit) ** 2 - deviation**2, 0)
+        fitted_contrast, deviation_of_fit = _body_contrasts(problem, fitted)
+        contrast_of_free_fit, deviation_of_free_fit = _body_contrasts(problem, free_fit)
+        variance += np.maximum(
+            (np.abs(contrast_of_free_fit - fitted_contrast) + deviation_of_free_fit) ** 2 - deviation_of_fit**2, 0
+        )
     return np.sqrt(variance)
 
 
-def _contrasts(problem: ShapeProblem, fitted: ShapeFit) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+def _body_contrasts(problem: ShapeProblem, fitted: ShapeFit) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Contrasts of the bodies of a fit in log σ, and their standard deviations from Laplace's approximation."""
     bodies = fitted.bodies
-    contrasts = [bodies.contrast(k, row) for k, row in enumerate(bodies.rows(fitted.coefficients))]
-    contrast, slope = np.array(contrasts).reshape(-1, 2).T
-    return contrast, bodies.rows(problem.deviations(fitted))[:, bodies.dimension + 1] * slope
+    contrasts_and_slopes = [bodies.contrast(k, body_row) for k, body_row in enumerate(bodies.rows(fitted.coefficients))]
+    body_contrasts, contrast_slope = np.array(contrasts_and_slopes).reshape(-1, 2).T
+    return body_contrasts, bodies.rows(problem.deviations(fitted))[:, bodies.dimension + 1] * contrast_slope
 
 
 def alternatives(problem: ShapeProblem, fitted: ShapeFit) -> list[tuple[Ellipsoid | None, float]]:
@@ -63,7 +65,7 @@ def alternatives(problem: ShapeProblem, fitted: ShapeFit) -> list[tuple[Ellipsoi
         return [(None, np.nan)] * num_bodies
     max_surprise = problem.negative_log_evidence(fitted) - bodies.odds + _UNDECIDED_LOG_EVIDENCE_DIFFERENCE
 
-    def alternative(k: int) -> tuple[Ellipsoid | None, float]:
+    def alternative_of_body(k: int) -> tuple[Ellipsoid | None, float]:
         if bodies.is_kind_certain[k]:
             return None, np.nan
         other_fit = problem.fit(*bodies.with_other_kind([k], fitted.coefficients), _MAX_FIT_STEPS, _COARSE_TOLERANCE)
@@ -71,4 +73,4 @@ def alternatives(problem: ShapeProblem, fitted: ShapeFit) -> list[tuple[Ellipsoi
             return None, np.nan
         return other_fit.bodies.body(k, other_fit.coefficients), contrast_deviations(problem, other_fit)[k]
 
-    return results_of_parts(bodies, alternative, range(num_bodies))
+    return results_of_parts(bodies, alternative_of_body, range(num_bodies))

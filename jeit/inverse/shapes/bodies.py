@@ -53,14 +53,14 @@ class BodyPrior(abc.ABC):
     apart: float = 1e3
 
     def __post_init__(self):
-        for name, value in self._numbers.items():
-            if not (is_number(value) and value > 0):
-                raise ValueError(f"{name} must be a positive number; it is {describe(value)}.")
+        for name, parameter_value in self._numeric_parameters.items():
+            if not (is_number(parameter_value) and parameter_value > 0):
+                raise ValueError(f"{name} must be a positive number; it is {describe(parameter_value)}.")
         if self.modes != int(self.modes):
             raise ValueError(f"modes must be a whole number from 1; it is {describe(self.modes)}.")
 
     @property
-    def _numbers(self) -> dict[str, Any]:
+    def _numeric_parameters(self) -> dict[str, Any]:
         """Fields of the prior whose values must be positive, by name."""
         return vars(self)
 
@@ -134,7 +134,11 @@ def polarisation(contrast, axes: int):
 def results_of_parts(bodies: Bodies, function: Callable[[Any], Any], parts: Sequence[Any]) -> list[Any]:
     """Results of a `function` that fits `bodies`, for each of its `parts`: on several cores in a solid. The arrays of a
     sheet are so small that several threads would mostly wait for each other in Python."""
-    return results_on_cores(function, parts) if bodies.dimension == 3 else [function(part) for part in parts]
+    return (
+        results_on_cores(function, parts)
+        if bodies.dimension == 3
+        else [function(argument_part) for argument_part in parts]
+    )
 
 
 class BodyImage(NamedTuple):
@@ -225,13 +229,17 @@ class Bodies(abc.ABC):
     def centroid_slope(self, k: int, coefficients, deviations: Float[np.ndarray, " q"]) -> Float[np.ndarray, "d q"]:
         """Derivatives of the centroid of body k with respect to its q coefficients, metres, by finite differences over
         a part of the coefficients' standard `deviations`."""
-        slopes = []
-        for index, deviation in enumerate(deviations):
-            step = np.zeros(len(coefficients))
-            step[1 + k * self.prior.size + index] = _CENTROID_DIFFERENCE_STEP * deviation
-            ends = [self.body(k, coefficients + direction * step).centroid for direction in (-1, 1)]
-            slopes.append((ends[1] - ends[0]) / (2 * _CENTROID_DIFFERENCE_STEP * deviation))
-        return np.stack(slopes, axis=1)
+        coefficient_slopes = []
+        for index, coefficient_deviation in enumerate(deviations):
+            coefficient_step = np.zeros(len(coefficients))
+            coefficient_step[1 + k * self.prior.size + index] = _CENTROID_DIFFERENCE_STEP * coefficient_deviation
+            shifted_centroids = [
+                self.body(k, coefficients + step_sign * coefficient_step).centroid for step_sign in (-1, 1)
+            ]
+            coefficient_slopes.append(
+                (shifted_centroids[1] - shifted_centroids[0]) / (2 * _CENTROID_DIFFERENCE_STEP * coefficient_deviation)
+            )
+        return np.stack(coefficient_slopes, axis=1)
 
     @property
     def dimension(self) -> int:
@@ -246,33 +254,35 @@ class Bodies(abc.ABC):
     def first(self) -> Int[np.ndarray, " k"]:
         """For each body, index of the body whose contrast coefficient applies: the body itself, or the first body of
         its material."""
-        order, owner = np.arange(len(self.sign)), np.arange(len(self.sign))
-        for group in (self.same_material & (self.sign == sign) for sign in (-1, 1)):
-            owner[group] = order[group].min(initial=len(order))
-        return owner
+        body_indices, first_of_material = np.arange(len(self.sign)), np.arange(len(self.sign))
+        for has_same_sign in (self.same_material & (self.sign == sign) for sign in (-1, 1)):
+            first_of_material[has_same_sign] = body_indices[has_same_sign].min(initial=len(body_indices))
+        return first_of_material
 
     def rows(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, "k q"]:
         """Coefficients of every body, one row per body, with shared contrast coefficients filled in."""
-        rows = coefficients[1:].reshape(len(self.sign), self.prior.size).copy()
-        rows[:, self.dimension + 1] = rows[self.first, self.dimension + 1]
-        return rows
+        coefficient_rows = coefficients[1:].reshape(len(self.sign), self.prior.size).copy()
+        coefficient_rows[:, self.dimension + 1] = coefficient_rows[self.first, self.dimension + 1]
+        return coefficient_rows
 
     def by_coefficients(self, row_derivatives: Float[np.ndarray, "r n"]) -> Float[np.ndarray, "r n"]:
         """Convert derivatives with respect to the drift and the coefficients returned by `rows` to derivatives with
         respect to the coefficients, in which bodies of the same material share a contrast coefficient."""
-        row_derivatives, order = row_derivatives.copy(), np.arange(len(self.sign))
-        contrast_columns = 1 + order * self.prior.size + self.dimension + 1
-        for k in order[self.first != order]:
+        row_derivatives, body_indices = row_derivatives.copy(), np.arange(len(self.sign))
+        contrast_columns = 1 + body_indices * self.prior.size + self.dimension + 1
+        for k in body_indices[self.first != body_indices]:
             row_derivatives[:, contrast_columns[self.first[k]]] += row_derivatives[:, contrast_columns[k]]
             row_derivatives[:, contrast_columns[k]] = 0
         return row_derivatives
 
     def of_radii(self, radii) -> Float[np.ndarray, " n"]:
         """Coefficients of disks or balls with these `radii` in metres at the starting centres."""
-        rows = np.zeros((len(self.sign), self.prior.size))
-        relative = np.log(np.asarray(radii, float) / (self.prior.radius * self.span)) / self.prior.radius_spread
-        rows[:, self.dimension] = np.clip(relative, -2, 2)
-        return np.append(0, rows)
+        coefficient_rows = np.zeros((len(self.sign), self.prior.size))
+        relative_log_radii = (
+            np.log(np.asarray(radii, float) / (self.prior.radius * self.span)) / self.prior.radius_spread
+        )
+        coefficient_rows[:, self.dimension] = np.clip(relative_log_radii, -2, 2)
+        return np.append(0, coefficient_rows)
 
     def centre(self, k: int, row: Float[np.ndarray, " q"]) -> Float[np.ndarray, " d"]:
         """Centre of body k in metres."""
@@ -300,64 +310,70 @@ class Bodies(abc.ABC):
 
     def without(self, k: int, coefficients) -> tuple[Self, Float[np.ndarray, " n"]]:
         """All bodies except body k, and their coefficients."""
-        others = self.subset(np.delete(np.arange(len(self.sign)), k))
-        return others, np.append(coefficients[0], np.delete(self.rows(coefficients), k, axis=0))
+        other_bodies = self.subset(np.delete(np.arange(len(self.sign)), k))
+        return other_bodies, np.append(coefficients[0], np.delete(self.rows(coefficients), k, axis=0))
 
     def split(self, k: int, coefficients, number: int) -> tuple[Self, Float[np.ndarray, " n"]]:
         """Replace body k by two round bodies of half its area or volume each, side by side along axis `number`.
 
         Returns the bodies, the two new bodies last, and the coefficients of all bodies.
         """
-        others, remaining = self.without(k, coefficients)
+        other_bodies, remaining_coefficients = self.without(k, coefficients)
         row, dimension = self.rows(coefficients)[k], self.dimension
         row_of_half = np.zeros(self.prior.size)
         row_of_half[dimension : dimension + 2] = row[dimension : dimension + 2]
         row_of_half[dimension] -= np.log(2) / dimension / self.prior.radius_spread
-        offset = np.exp(self.log_radius(row_of_half)) * self.axis(k, row, number)
+        centre_offset = np.exp(self.log_radius(row_of_half)) * self.axis(k, row, number)
         if dimension == 3:
-            offset = offset * 2 ** (-1 / 3)  # somewhat farther out than the centroids of the two halves
+            centre_offset = centre_offset * 2 ** (-1 / 3)  # somewhat farther out than the centroids of the two halves
         centre = self.centre(k, row)
-        start = np.concatenate([others.start, [centre + offset, centre - offset]])
+        start_centres = np.concatenate([other_bodies.start, [centre + centre_offset, centre - centre_offset]])
         other_fields = {
-            name: np.append(getattr(others, name), [getattr(self, name)[k]] * 2) for name in _FIELDS_PER_BODY
+            name: np.append(getattr(other_bodies, name), [getattr(self, name)[k]] * 2) for name in _FIELDS_PER_BODY
         }
         other_fields["is_kind_certain"][-2:] = False
-        return replace(self, start=start, **other_fields), np.concatenate([remaining, row_of_half, row_of_half])
+        return replace(self, start=start_centres, **other_fields), np.concatenate(
+            [remaining_coefficients, row_of_half, row_of_half]
+        )
 
     def with_modes(self, modes: int, coefficients) -> tuple[Self, Float[np.ndarray, " n"]]:
         """The bodies with a different number of modes of their form, and their coefficients; the coefficients of added
         modes are zero."""
         new_bodies = replace(self, prior=replace(self.prior, modes=modes))
-        rows = np.zeros((len(self.sign), new_bodies.prior.size))
+        coefficient_rows = np.zeros((len(self.sign), new_bodies.prior.size))
         num_shared = min(new_bodies.prior.size, self.prior.size)
-        rows[:, :num_shared] = self.rows(coefficients)[:, :num_shared]
-        return new_bodies, np.append(coefficients[0], rows)
+        coefficient_rows[:, :num_shared] = self.rows(coefficients)[:, :num_shared]
+        return new_bodies, np.append(coefficients[0], coefficient_rows)
 
     def image(self, coefficients) -> BodyImage:
         """Compute the image log σ/σ₀ per cell, the overlaps of the bodies, and the derivatives of image and overlaps
         with respect to the coefficients."""
         num_cells, dimension = len(self.weight), self.dimension
-        rows = self.rows(coefficients)
-        coverages = [self.coverage(k, row) for k, row in enumerate(rows)]
-        drift, all_cells = np.full((num_cells, 1), self.prior.drift), None
-        image = coefficients[0] * drift[:, 0]
-        slopes: list[tuple[Any, Any]] = [(all_cells, drift)]
+        coefficient_rows = self.rows(coefficients)
+        coverages = [self.coverage(k, row) for k, row in enumerate(coefficient_rows)]
+        drift_slope, all_cells = np.full((num_cells, 1), self.prior.drift), None
+        image = coefficients[0] * drift_slope[:, 0]
+        image_slopes: list[tuple[Any, Any]] = [(all_cells, drift_slope)]
         cell_shares = np.zeros((len(coverages), num_cells))
-        for k, (cells, share, slope) in enumerate(coverages):
-            contrast, contrast_slope = (self.sign[k] * value for value in self.contrast(k, rows[k]))
-            body_image, share_slope, mixture_slope = self.mixed_log_conductivity(share, contrast)
+        for k, (cells, cell_share, coverage_slope) in enumerate(coverages):
+            signed_contrast, contrast_slope = (
+                self.sign[k] * contrast_value for contrast_value in self.contrast(k, coefficient_rows[k])
+            )
+            body_image, share_slope, mixture_slope = self.mixed_log_conductivity(cell_share, signed_contrast)
             image[cells] += body_image
-            body_slope = share_slope[:, None] * slope
+            body_slope = share_slope[:, None] * coverage_slope
             body_slope[:, dimension + 1] = mixture_slope * contrast_slope
-            slopes.append((cells, body_slope))
-            cell_shares[k, cells] = share
-        overlap, overlap_slope = [], []
+            image_slopes.append((cells, body_slope))
+            cell_shares[k, cells] = cell_share
+        pair_overlaps, pair_overlap_slopes = [], []
         weighted_shares = self.weight * cell_shares
         for j, k in itertools.combinations(range(len(coverages)), 2):
             row_slopes = np.zeros((len(coverages), self.prior.size))
             for body, other_body in ((j, k), (k, j)):
-                cells, _, slope = coverages[body]
-                row_slopes[body] = weighted_shares[other_body, cells] @ slope
-            overlap.append(weighted_shares[j] @ cell_shares[k])
-            overlap_slope.append(np.append(0, row_slopes))
-        return BodyImage(image, slopes, np.array(overlap), np.reshape(overlap_slope, (-1, len(coefficients))))
+                cells, _, coverage_slope = coverages[body]
+                row_slopes[body] = weighted_shares[other_body, cells] @ coverage_slope
+            pair_overlaps.append(weighted_shares[j] @ cell_shares[k])
+            pair_overlap_slopes.append(np.append(0, row_slopes))
+        return BodyImage(
+            image, image_slopes, np.array(pair_overlaps), np.reshape(pair_overlap_slopes, (-1, len(coefficients)))
+        )

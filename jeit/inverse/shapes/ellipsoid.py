@@ -93,8 +93,8 @@ class EllipsoidPrior(BodyPrior):
         check_name("kinds", self.kinds, KINDS)
 
     @property
-    def _numbers(self):
-        return {name: value for name, value in vars(self).items() if name != "kinds"}
+    def _numeric_parameters(self):
+        return {name: parameter_value for name, parameter_value in vars(self).items() if name != "kinds"}
 
     @property
     def is_of_one_kind(self) -> bool:
@@ -109,14 +109,14 @@ class EllipsoidPrior(BodyPrior):
     def deviation(self, span: float) -> Float[np.ndarray, " q"]:
         """Prior standard deviations of a body's parameters, 1 for the contrast; `span`: longest side of the domain,
         metres."""
-        deviations = [self.place * span] * 3 + [self.radius_spread, 1.0]
-        return np.concatenate([deviations, np.full(self.size - 5, self.roughness)])
+        coefficient_deviations = [self.place * span] * 3 + [self.radius_spread, 1.0]
+        return np.concatenate([coefficient_deviations, np.full(self.size - 5, self.roughness)])
 
     def contrast_of(self, coefficient: float, other: bool) -> tuple[float, float]:
         """Contrast of a body in log σ, without its sign, and its derivative with respect to the `coefficient`; the same
         for both kinds."""
-        contrast = self.contrast * np.exp(self.contrast_spread * coefficient)
-        return contrast, self.contrast_spread * contrast
+        body_contrast = self.contrast * np.exp(self.contrast_spread * coefficient)
+        return body_contrast, self.contrast_spread * body_contrast
 
 
 class Ellipsoid(Module):
@@ -166,11 +166,11 @@ class Ellipsoid(Module):
 
     def with_quantities(self, known: Quantities) -> Ellipsoid:
         """Copy of the body with the quantities `known`; volume and contrast become the medians."""
-        scale = (known.measure / max(self.volume, MIN_POSITIVE_VALUE)) ** (1 / self.bounded_axes)
+        length_ratio = (known.measure / max(self.volume, MIN_POSITIVE_VALUE)) ** (1 / self.bounded_axes)
         is_upright = self.column & (np.abs(self.axes[:, 2]) > 0.5 * np.linalg.norm(self.axes, axis=1))
         return replace(
             self,
-            axes=self.axes * np.where(is_upright, 1.0, scale)[:, None],
+            axes=self.axes * np.where(is_upright, 1.0, length_ratio)[:, None],
             volume=known.measure,
             contrast=float(np.abs(np.log1p(known.change))),
             quantities=known,
@@ -204,11 +204,13 @@ class Ellipsoids(Bodies):
         points, volume = np.asarray(mesh.points), np.asarray(measures(mesh))
         samples = points.T[:, np.asarray(mesh.cells)] @ _BARYCENTRIC_SAMPLES.T
         start, total = np.reshape(np.asarray(start, float), (-1, 3)), float(volume.sum())
-        sign, false = np.asarray(sign, float), np.zeros(len(start), bool)
+        sign, all_false = np.asarray(sign, float), np.zeros(len(start), bool)
         nans = np.full(len(start), np.nan)
         span, ends = float(np.ptp(points, axis=0).max()), (float(points[:, 2].min()), float(points[:, 2].max()))
         width = _RELATIVE_BLUR_WIDTH * np.cbrt(volume)
-        return cls(prior, volume / total, span, start, sign, false, false, false, nans, samples, width, total, ends)
+        return cls(
+            prior, volume / total, span, start, sign, all_false, all_false, all_false, nans, samples, width, total, ends
+        )
 
     def bounded_axes(self, k: int) -> int:
         """Number of axes along which body k is bounded: 2 for a column, else 3."""
@@ -232,36 +234,38 @@ class Ellipsoids(Bodies):
     def with_other_kind(self, indices, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
         """Change the bodies of `indices` from ellipsoid to column or back, at the same volume. Stretches that the new
         kind does not have are set to zero. Returns all bodies and their coefficients."""
-        rows, is_column = self.rows(coefficients), self.is_other_kind.copy()
+        body_rows, is_column = self.rows(coefficients), self.is_other_kind.copy()
         for k in indices:
             volume = max(self.body(k, coefficients).volume, 1e-6 * self.total) / np.pi
             radius = np.cbrt(3 / 4 * volume) if is_column[k] else np.sqrt(volume / (self.ends[1] - self.ends[0]))
-            rows[k, 3] = np.log(radius / (self.prior.radius * self.span)) / self.prior.radius_spread
-            rows[k, 2], is_column[k] = 0, not is_column[k]
-            rows[k, 5:] *= _IS_COLUMN_STRETCH[: self.prior.size - 5]
-        return replace(self, is_other_kind=is_column), np.append(coefficients[0], rows)
+            body_rows[k, 3] = np.log(radius / (self.prior.radius * self.span)) / self.prior.radius_spread
+            body_rows[k, 2], is_column[k] = 0, not is_column[k]
+            body_rows[k, 5:] *= _IS_COLUMN_STRETCH[: self.prior.size - 5]
+        return replace(self, is_other_kind=is_column), np.append(coefficients[0], body_rows)
 
     def of_one_material(self, sign: int, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
         """Assign one material to all bodies of a `sign`, with the mean of their contrast coefficients and with radii
         changed so that the strengths stay the same. Returns all bodies and their coefficients."""
-        rows, members, column = self.rows(coefficients), np.flatnonzero(self.sign == sign), self.dimension + 1
-        old_coefficients = rows[:, column].copy()
-        rows[members, column] = old_coefficients[members].mean()
-        for k in members.tolist():
+        body_rows, body_indices, column = self.rows(coefficients), np.flatnonzero(self.sign == sign), self.dimension + 1
+        old_coefficients = body_rows[:, column].copy()
+        body_rows[body_indices, column] = old_coefficients[body_indices].mean()
+        for k in body_indices.tolist():
             new_strength, old_strength = (
                 polarisation(sign * self.prior.contrast_of(coefficient, False)[0], self.bounded_axes(k))
-                for coefficient in (rows[k, column], old_coefficients[k])
+                for coefficient in (body_rows[k, column], old_coefficients[k])
             )
-            rows[k, 3] += np.log(old_strength / new_strength) / self.bounded_axes(k) / self.prior.radius_spread
-        return replace(self, same_material=self.same_material | (self.sign == sign)), np.append(coefficients[0], rows)
+            body_rows[k, 3] += np.log(old_strength / new_strength) / self.bounded_axes(k) / self.prior.radius_spread
+        return replace(self, same_material=self.same_material | (self.sign == sign)), np.append(
+            coefficients[0], body_rows
+        )
 
     def mixed_log_conductivity(self, share, contrast):
         """log(1 + share (exp(p contrast) - 1)) / p, the power mean of body and bath: harmonic (p = -1) for a conductive
         body, p = 1/2 for a resistive one. Also its derivatives with respect to `share` and `contrast`."""
-        power = _POWER_MEAN_EXPONENTS[1 if contrast > 0 else -1]
-        rise = np.expm1(power * contrast)
+        exponent = _POWER_MEAN_EXPONENTS[1 if contrast > 0 else -1]
+        rise = np.expm1(exponent * contrast)
         power_mean = 1 + share * rise
-        return np.log(power_mean) / power, rise / (power * power_mean), share * (1 + rise) / power_mean
+        return np.log(power_mean) / exponent, rise / (exponent * power_mean), share * (1 + rise) / power_mean
 
     def display_image(self, coefficients) -> Float[np.ndarray, " m"]:
         """Image log σ/σ₀ (m,) of the bodies, for display. Partly covered cells have the geometric mean of body and
@@ -269,8 +273,8 @@ class Ellipsoids(Bodies):
         instead."""
         image = np.full(len(self.weight), coefficients[0] * self.prior.drift)
         for k, row in enumerate(self.rows(coefficients)):
-            cells, share, _ = self.coverage(k, row)
-            image[cells] += share * self.sign[k] * self.contrast(k, row)[0]
+            cells, cell_shares, _ = self.coverage(k, row)
+            image[cells] += cell_shares * self.sign[k] * self.contrast(k, row)[0]
         return image
 
     def on(self, mesh: Mesh) -> Ellipsoids:
@@ -284,15 +288,16 @@ class Ellipsoids(Bodies):
         surface of a body, infinite elsewhere."""
         max_lengths = np.full(len(corners), np.inf)
         for k, row in enumerate(self.rows(coefficients)):
-            matrix, offset = self._shape_matrix(k, row), (corners - self.centre(k, row)) * self._axes_of(k)
-            shortest_axis = self._min_axis(matrix)
-            distance = np.linalg.norm(offset, axis=2)
-            scaled_distance = np.linalg.norm(offset @ np.linalg.inv(matrix), axis=2)
-            distance_outside = distance - distance / np.maximum(scaled_distance, 1e-9)
-            nearest, farthest = distance_outside.min(axis=1), distance_outside.max(axis=1)
-            encloses = distance.min(axis=1) < farthest - nearest  # the corners surround a body smaller than a cell
-            is_near_surface = ((nearest < _RELATIVE_REFINEMENT_DISTANCE * shortest_axis) | encloses) & (
-                farthest > -_RELATIVE_REFINEMENT_DISTANCE * shortest_axis
+            shape_matrix, corner_offset = self._shape_matrix(k, row), (corners - self.centre(k, row)) * self._axes_of(k)
+            shortest_axis = self._min_axis(shape_matrix)
+            centre_distance = np.linalg.norm(corner_offset, axis=2)
+            scaled_distance = np.linalg.norm(corner_offset @ np.linalg.inv(shape_matrix), axis=2)
+            distance_outside = centre_distance - centre_distance / np.maximum(scaled_distance, 1e-9)
+            min_distance, max_distance = distance_outside.min(axis=1), distance_outside.max(axis=1)
+            # The corners surround a body smaller than a cell.
+            encloses_body = centre_distance.min(axis=1) < max_distance - min_distance
+            is_near_surface = ((min_distance < _RELATIVE_REFINEMENT_DISTANCE * shortest_axis) | encloses_body) & (
+                max_distance > -_RELATIVE_REFINEMENT_DISTANCE * shortest_axis
             )
             max_lengths[is_near_surface] = np.minimum(max_lengths[is_near_surface], edge * shortest_axis)
         return max_lengths
@@ -305,11 +310,11 @@ class Ellipsoids(Bodies):
         for k, (row, new_row) in enumerate(
             zip(self.rows(coefficients), other_bodies.rows(new_coefficients), strict=True)
         ):
-            shift = np.linalg.norm((self.centre(k, row) - other_bodies.centre(k, new_row)) * self._axes_of(k))
-            matrix = self._shape_matrix(k, row)
-            if shift + np.linalg.norm(
-                matrix - self._shape_matrix(k, new_row), 2
-            ) > 2 * _RELATIVE_REFINEMENT_DISTANCE * self._min_axis(matrix):
+            centre_shift = np.linalg.norm((self.centre(k, row) - other_bodies.centre(k, new_row)) * self._axes_of(k))
+            shape_matrix = self._shape_matrix(k, row)
+            if centre_shift + np.linalg.norm(
+                shape_matrix - self._shape_matrix(k, new_row), 2
+            ) > 2 * _RELATIVE_REFINEMENT_DISTANCE * self._min_axis(shape_matrix):
                 return True
         return False
 
@@ -331,20 +336,22 @@ class Ellipsoids(Bodies):
     def axis(self, k: int, row, number: int):
         """Unit vector along axis `number` of body k, counted from the longest; for a column, along an axis of its
         cross-section."""
-        matrix = self._shape_matrix(k, row) * self._axes_of(k)
-        return np.linalg.eigh(matrix)[1][:, 2 - number]
+        shape_matrix = self._shape_matrix(k, row) * self._axes_of(k)
+        return np.linalg.eigh(shape_matrix)[1][:, 2 - number]
 
     def body(self, k: int, coefficients, rise: float = np.nan) -> Ellipsoid:
         """Body k as an `Ellipsoid`, with volume and centroid of the part inside the domain."""
         row = self.rows(coefficients)[k]
-        cells, share, _ = self.coverage(k, row)
-        fractions = share * self.weight[cells]
-        centre, volume = self.centre(k, row), float(fractions.sum()) * self.total
-        centroid = self.points[:, cells].mean(axis=2) @ fractions / fractions.sum() if volume > 0 else centre
-        matrix, is_column = self._shape_matrix(k, row), bool(self.is_other_kind[k])
+        cells, cell_shares, _ = self.coverage(k, row)
+        volume_fractions = cell_shares * self.weight[cells]
+        centre, volume = self.centre(k, row), float(volume_fractions.sum()) * self.total
+        centroid = (
+            self.points[:, cells].mean(axis=2) @ volume_fractions / volume_fractions.sum() if volume > 0 else centre
+        )
+        shape_matrix, is_column = self._shape_matrix(k, row), bool(self.is_other_kind[k])
         if is_column:
-            matrix[2, 2], centre[2] = (self.ends[1] - self.ends[0]) / 2, sum(self.ends) / 2
-        half_lengths, direction = np.linalg.eigh(matrix)
+            shape_matrix[2, 2], centre[2] = (self.ends[1] - self.ends[0]) / 2, sum(self.ends) / 2
+        half_lengths, direction = np.linalg.eigh(shape_matrix)
         contrast, axes = float(self.contrast(k, row)[0]), (half_lengths * direction).T[::-1]
         shares_material = int((self.first == self.first[k]).sum()) > 1
         return Ellipsoid(
@@ -354,13 +361,13 @@ class Ellipsoids(Bodies):
     def centroid_slope(self, k: int, coefficients, deviations) -> Float[np.ndarray, "3 q"]:
         """Derivatives of the centroid of body k with respect to its q coefficients, metres."""
         row = self.rows(coefficients)[k]
-        cells, share, slope = self.coverage(k, row)
-        centre, weight = self.points[:, cells].mean(axis=2), self.weight[cells]
-        fractions = share * weight
-        if not fractions.sum() > 0:  # the body has left the domain: its centroid is its centre
+        cells, cell_shares, share_slope = self.coverage(k, row)
+        centre, cell_weight = self.points[:, cells].mean(axis=2), self.weight[cells]
+        volume_fractions = cell_shares * cell_weight
+        if not volume_fractions.sum() > 0:  # the body has left the domain: its centroid is its centre
             return np.eye(3, len(row)) * self.prior.place * self.span
-        centroid = centre @ fractions / fractions.sum()
-        return (centre - centroid[:, None]) @ (weight[:, None] * slope) / fractions.sum()
+        centroid = centre @ volume_fractions / volume_fractions.sum()
+        return (centre - centroid[:, None]) @ (cell_weight[:, None] * share_slope) / volume_fractions.sum()
 
     def coverage(self, k: int, row) -> CellCoverage:
         """Coverage of cells by body k, whose coefficients are `row`."""
@@ -369,62 +376,71 @@ class Ellipsoids(Bodies):
         centre, radius = self.centre(k, row), np.exp(min(self.log_radius(row), np.log(10 * self.span)))
         axes = self._axes_of(k)
         # Depth of one point of every cell below the surface, along the ray from the centre.
-        offset = (self.points[:, :, 0] - centre[:, None]) * axes[:, None]
-        distance = np.maximum(_lengths(offset), 1e-9 * self.span)
-        depth = distance * (radius / np.maximum(_lengths(inverse_stretch @ offset), 1e-9 * self.span) - 1)
-        is_near_surface = np.abs(depth) < _MAX_BLUR_DISTANCE * self.width
-        cells, inner_cells = np.flatnonzero(is_near_surface), np.flatnonzero(~is_near_surface & (depth > 0))
-        offset = (self.points[:, cells] - centre[:, None, None]) * axes[:, None, None]
-        distance, width = _lengths(offset), self.width[cells, None]
-        if (is_at_centre := distance == 0).any():
-            offset[:, is_at_centre] = 1e-9 * self.span
-            distance = _lengths(offset)
-        round_offset = np.tensordot(inverse_stretch, offset, 1)
-        scaled_distance = _lengths(round_offset)
-        # On the ray from the centre, the surface is at the distance radius · distance / scaled_distance.
-        surface = radius * distance / scaled_distance
-        # The blur of a convex surface adds more volume than it removes. Moving the surface inwards by `excess`
+        centre_offset = (self.points[:, :, 0] - centre[:, None]) * axes[:, None]
+        centre_distance = np.maximum(_vector_lengths(centre_offset), 1e-9 * self.span)
+        surface_depth = centre_distance * (
+            radius / np.maximum(_vector_lengths(inverse_stretch @ centre_offset), 1e-9 * self.span) - 1
+        )
+        is_near_surface = np.abs(surface_depth) < _MAX_BLUR_DISTANCE * self.width
+        cells, inner_cells = np.flatnonzero(is_near_surface), np.flatnonzero(~is_near_surface & (surface_depth > 0))
+        centre_offset = (self.points[:, cells] - centre[:, None, None]) * axes[:, None, None]
+        centre_distance, blur_width = _vector_lengths(centre_offset), self.width[cells, None]
+        if (is_at_centre := centre_distance == 0).any():
+            centre_offset[:, is_at_centre] = 1e-9 * self.span
+            centre_distance = _vector_lengths(centre_offset)
+        round_offset = np.tensordot(inverse_stretch, centre_offset, 1)
+        scaled_distance = _vector_lengths(round_offset)
+        # On the ray from the centre, the surface is at the distance radius · centre_distance / scaled_distance.
+        surface = radius * centre_distance / scaled_distance
+        # The blur of a convex surface adds more volume than it removes. Moving the surface inwards by `excess_radius`
         # compensates for this.
-        excess = (np.pi * width) ** 2 * (axes.sum() - 1) / (6 * surface)
-        inside = 0.5 * (1 + np.tanh(0.5 * (surface - excess - distance) / width))
-        # d share / d(surface - excess - distance)
-        share_slope = inside * (1 - inside) / width / len(_BARYCENTRIC_SAMPLES)
-        growth = surface + excess  # d(surface - excess) / d log surface
-        round_offset_slope = -share_slope * growth / scaled_distance**2 * round_offset
-        offset_slope = share_slope * (growth - distance) / distance**2 * offset
+        excess_radius = (np.pi * blur_width) ** 2 * (axes.sum() - 1) / (6 * surface)
+        inside_share = 0.5 * (1 + np.tanh(0.5 * (surface - excess_radius - centre_distance) / blur_width))
+        # d share / d(surface - excess_radius - centre_distance)
+        share_slope = inside_share * (1 - inside_share) / blur_width / len(_BARYCENTRIC_SAMPLES)
+        radius_growth = surface + excess_radius  # d(surface - excess_radius) / d log surface
+        round_offset_slope = -share_slope * radius_growth / scaled_distance**2 * round_offset
+        offset_slope = share_slope * (radius_growth - centre_distance) / centre_distance**2 * centre_offset
         centre_slope = -(offset_slope.sum(axis=2) + inverse_stretch @ round_offset_slope.sum(axis=2)).T
-        outer_products = np.einsum("ics,jcs->cij", round_offset_slope, offset)
-        stretches = (self._stretch_slopes(log_stretch, direction) * self._mask(k)[:, None, None])[: self.prior.size - 5]
-        form_slope = outer_products.reshape(len(cells), 9) @ stretches.reshape(-1, 9).T
-        columns = [centre_slope, (share_slope * growth).sum(axis=1)[:, None], np.zeros((len(cells), 1)), form_slope]
+        outer_products = np.einsum("ics,jcs->cij", round_offset_slope, centre_offset)
+        stretch_slopes = (self._stretch_slopes(log_stretch, direction) * self._stretch_mask(k)[:, None, None])[
+            : self.prior.size - 5
+        ]
+        form_slope = outer_products.reshape(len(cells), 9) @ stretch_slopes.reshape(-1, 9).T
+        columns = [
+            centre_slope,
+            (share_slope * radius_growth).sum(axis=1)[:, None],
+            np.zeros((len(cells), 1)),
+            form_slope,
+        ]
         slopes = np.concatenate(columns, axis=1) * self.prior.deviation(self.span)
         return CellCoverage(
             np.concatenate([cells, inner_cells]),
-            np.concatenate([inside.mean(axis=1), np.ones(len(inner_cells))]),
+            np.concatenate([inside_share.mean(axis=1), np.ones(len(inner_cells))]),
             np.concatenate([slopes, np.zeros((len(inner_cells), slopes.shape[1]))]),
         )
 
-    def _mask(self, k: int) -> Float[np.ndarray, "5"]:
+    def _stretch_mask(self, k: int) -> Float[np.ndarray, "5"]:
         """Mask (5,) of the basis of S: 1 for the elements along which body k may be stretched, else 0."""
         return _IS_COLUMN_STRETCH if self.is_other_kind[k] else np.ones(5)
 
     def _stretch(self, k: int, row) -> Float[np.ndarray, "3 3"]:
         """Log stretch S (3, 3) of body k, a symmetric matrix."""
-        values = self.prior.roughness * row[5:] * self._mask(k)[: len(row) - 5]
-        return np.tensordot(values, _STRETCH_BASIS[: len(values)], 1) if len(values) else np.zeros((3, 3))
+        stretches = self.prior.roughness * row[5:] * self._stretch_mask(k)[: len(row) - 5]
+        return np.tensordot(stretches, _STRETCH_BASIS[: len(stretches)], 1) if len(stretches) else np.zeros((3, 3))
 
     @staticmethod
     def _stretch_slopes(log_stretch, direction) -> Float[np.ndarray, "5 3 3"]:
         """Derivatives of exp(-S) with respect to the coefficients of S in its basis."""
-        differences = log_stretch[:, None] - log_stretch
+        stretch_differences = log_stretch[:, None] - log_stretch
         mean_log_stretches = (log_stretch[:, None] + log_stretch) / 2
         # (exp(-a) - exp(-b)) / (a - b) = -exp(-(a + b) / 2) sinh(h) / h with h = (a - b) / 2.
-        half_differences = np.where(np.abs(differences) > 1e-12, differences / 2, 1)
-        quotients = -np.exp(-mean_log_stretches) * np.where(
-            np.abs(differences) > 1e-12, np.sinh(half_differences) / half_differences, 1
+        half_differences = np.where(np.abs(stretch_differences) > 1e-12, stretch_differences / 2, 1)
+        difference_quotients = -np.exp(-mean_log_stretches) * np.where(
+            np.abs(stretch_differences) > 1e-12, np.sinh(half_differences) / half_differences, 1
         )
-        return direction @ ((direction.T @ _STRETCH_BASIS @ direction) * quotients) @ direction.T
+        return direction @ ((direction.T @ _STRETCH_BASIS @ direction) * difference_quotients) @ direction.T
 
 
-def _lengths(vectors: Float[np.ndarray, "3 *n"]) -> Float[np.ndarray, "*n"]:
+def _vector_lengths(vectors: Float[np.ndarray, "3 *n"]) -> Float[np.ndarray, "*n"]:
     return np.sqrt(np.einsum("i...,i...->...", vectors, vectors))

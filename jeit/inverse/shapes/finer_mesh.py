@@ -68,37 +68,46 @@ def refine_at_surfaces(problem: ShapeProblem, fit: ShapeFit, edges: Sequence[flo
     assert isinstance(bodies, Ellipsoids)
     tagged_mesh, names = _tag_electrodes(model.mesh, model.electrodes)
     mesh, parent_cells, max_points = tagged_mesh, np.arange(tagged_mesh.num_cells), MAX_POINTS
-    for edge in edges:
-        refined = bisect_with_parents(mesh, partial(bodies.edges, fit.coefficients, edge), max_points)
-        if refined is None:
+    for relative_edge_length in edges:
+        refined_mesh_and_parents = bisect_with_parents(
+            mesh, partial(bodies.edges, fit.coefficients, relative_edge_length), max_points
+        )
+        if refined_mesh_and_parents is None:
             break
-        mesh, parent_cells = refined[0], parent_cells[refined[1]]
+        mesh, parent_cells = refined_mesh_and_parents[0], parent_cells[refined_mesh_and_parents[1]]
         max_points = int(_MAX_NODE_RATIO * tagged_mesh.num_points)
     refined_model = on_host(ForwardModel(mesh, _electrodes_on(mesh, model.electrodes, iter(names)), model.protocol))
     background = problem.background[parent_cells]
     voltage_change = (
         solved_fields(refined_model, background).voltages - solved_fields(model, problem.background).voltages
     )
-    data = eqx.tree_at(lambda data: data.voltages, problem.data, np.asarray(problem.data.voltages) + voltage_change)
-    return FinerModel(ShapeProblem(refined_model, data, background), bodies.on(mesh), parent_cells)
+    corrected_data = eqx.tree_at(
+        lambda corrected_data: corrected_data.voltages, problem.data, np.asarray(problem.data.voltages) + voltage_change
+    )
+    return FinerModel(ShapeProblem(refined_model, corrected_data, background), bodies.on(mesh), parent_cells)
 
 
 def _tag_electrodes(mesh: Mesh, electrodes: AbstractElectrodes) -> tuple[Mesh, list[str]]:
     """Add to the mesh one tag per electrode, which marks the facets that the electrode covers and is preserved by
     bisection. Returns the mesh and the names of the tags."""
-    parts = electrodes.parts if isinstance(electrodes, CombinedElectrodes) else (electrodes,)
+    electrode_groups = electrodes.parts if isinstance(electrodes, CombinedElectrodes) else (electrodes,)
     covered_facets = [
-        column for part in parts if isinstance(part, FacetElectrodes) for column in np.asarray(part.covers).T
+        column
+        for electrode_group in electrode_groups
+        if isinstance(electrode_group, FacetElectrodes)
+        for column in np.asarray(electrode_group.covers).T
     ]
-    tags: dict[str, Any] = {str(index): np.flatnonzero(column) for index, column in enumerate(covered_facets)}
-    return replace(mesh, tags=tags), list(tags)
+    facets_by_tag: dict[str, Any] = {str(index): np.flatnonzero(column) for index, column in enumerate(covered_facets)}
+    return replace(mesh, tags=facets_by_tag), list(facets_by_tag)
 
 
 def _electrodes_on(mesh: Mesh, electrodes: AbstractElectrodes, names) -> AbstractElectrodes:
     """Electrodes on a bisected mesh. Electrodes that cover facets are created from the tags `names`; all other
     electrodes are unchanged."""
     if isinstance(electrodes, CombinedElectrodes):
-        return CombinedElectrodes(*[_electrodes_on(mesh, part, names) for part in electrodes.parts])
+        return CombinedElectrodes(
+            *[_electrodes_on(mesh, electrode_group, names) for electrode_group in electrodes.parts]
+        )
     if isinstance(electrodes, FacetElectrodes):
         return plates(mesh, [next(names) for _ in range(electrodes.num_electrodes)], electrodes.contact_impedance)
     return electrodes

@@ -61,29 +61,45 @@ def remove_unsupported(
 
     `min_costs`: lower limit of the cost without each body, if known.
     """
-    doubtful, costs = list(doubtful), np.zeros(len(fitted.bodies.sign)) if min_costs is None else min_costs.copy()
+    doubtful, costs_without_body = (
+        list(doubtful),
+        np.zeros(len(fitted.bodies.sign)) if min_costs is None else min_costs.copy(),
+    )
     while True:
-        bodies, coefficients, cost, _ = fitted
+        bodies, coefficients, fitted_cost, _ = fitted
         # After a ghost is removed, leaving out a further body raises the cost at least as much as before, so costs
         # computed earlier are lower limits.
-        certain_cost = max(CERTAIN_OBJECTIVE_RATIO * cost, problem.negative_log_evidence(fitted) + MIN_EVIDENCE_GAIN)
-        uncertain = np.flatnonzero(costs <= certain_cost).tolist()
-        starts = [bodies.without(k, coefficients) for k in uncertain]
-        fits_without = results_of_parts(bodies, partial(_fit_without, problem, certain_cost), starts)
-        fits = dict(zip(uncertain, fits_without, strict=True))
-        costs[uncertain] = [fit.cost for fit in fits_without]
-        weakest = min(fits, key=lambda k: costs[k], default=None)
-        if weakest is None or (costs[weakest] >= least_rise * cost and _is_supported(problem, fits[weakest], fitted)):
-            return SearchResult(fitted, list(costs / cost), tuple(doubtful))
-        doubtful.append(bodies.body(weakest, coefficients, float(costs[weakest]) / cost))
-        costs = np.delete(costs, weakest)
-        fitted = problem.fit(fits[weakest].bodies, fits[weakest].coefficients, STEPS)
+        certain_cost = max(
+            CERTAIN_OBJECTIVE_RATIO * fitted_cost, problem.negative_log_evidence(fitted) + MIN_EVIDENCE_GAIN
+        )
+        uncertain_bodies = np.flatnonzero(costs_without_body <= certain_cost).tolist()
+        starts_without_body = [bodies.without(k, coefficients) for k in uncertain_bodies]
+        fits_without = results_of_parts(bodies, partial(_fit_without, problem, certain_cost), starts_without_body)
+        fit_without_body = dict(zip(uncertain_bodies, fits_without, strict=True))
+        costs_without_body[uncertain_bodies] = [trial_fit.cost for trial_fit in fits_without]
+        least_supported_body = min(fit_without_body, key=lambda k: costs_without_body[k], default=None)
+        if least_supported_body is None or (
+            costs_without_body[least_supported_body] >= least_rise * fitted_cost
+            and _is_supported(problem, fit_without_body[least_supported_body], fitted)
+        ):
+            return SearchResult(fitted, list(costs_without_body / fitted_cost), tuple(doubtful))
+        doubtful.append(
+            bodies.body(
+                least_supported_body, coefficients, float(costs_without_body[least_supported_body]) / fitted_cost
+            )
+        )
+        costs_without_body = np.delete(costs_without_body, least_supported_body)
+        fitted = problem.fit(
+            fit_without_body[least_supported_body].bodies, fit_without_body[least_supported_body].coefficients, STEPS
+        )
 
 
-def _fit_without(problem: ShapeProblem, certain_cost: float, start: tuple[Bodies, Float[np.ndarray, " n"]]) -> ShapeFit:
-    """Fit the remaining bodies from their coefficients `start`. The fit ends early if its cost remains far above
-    `certain_cost`, above which the omitted body certainly exists."""
-    first_fit = problem.fit(*start, _FIRST_REMOVAL_STEPS, 2 * COARSE_TOLERANCE)
+def _fit_without(
+    problem: ShapeProblem, certain_cost: float, start_of_fit: tuple[Bodies, Float[np.ndarray, " n"]]
+) -> ShapeFit:
+    """Fit the remaining bodies from their coefficients, `start_of_fit`. The fit ends early if its cost remains far
+    above `certain_cost`, above which the omitted body certainly exists."""
+    first_fit = problem.fit(*start_of_fit, _FIRST_REMOVAL_STEPS, 2 * COARSE_TOLERANCE)
     if first_fit.cost > _HOPELESS_OBJECTIVE_RATIO * certain_cost:
         return first_fit
     return problem.fit(first_fit.bodies, first_fit.coefficients, _REMOVAL_STEPS, 2 * COARSE_TOLERANCE)
@@ -92,16 +108,22 @@ def _fit_without(problem: ShapeProblem, certain_cost: float, start: tuple[Bodies
 def _split_bodies(problem: ShapeProblem, fitted: ShapeFit, least_rise: float) -> ShapeFit | None:
     """Fit the bodies with one body split in two; None if the data support no split. Each body adds parameters, so no
     split is tried if the whole cost is less than the gain of evidence that it needs."""
-    bodies, coefficients, cost, _ = fitted
-    if cost < MIN_EVIDENCE_GAIN:
+    bodies, coefficients, fitted_cost, _ = fitted
+    if fitted_cost < MIN_EVIDENCE_GAIN:
         return None
 
-    def trial(index: tuple[int, ...]) -> ShapeFit:
+    def fit_with_split(index: tuple[int, ...]) -> ShapeFit:
         return _trial_fit(problem, grow_bodies(problem, *bodies.split(index[0], coefficients, index[1]), _TRIAL_STEPS))
 
-    trials = results_of_parts(bodies, trial, list(np.ndindex(len(bodies.sign), bodies.num_splits)))
-    split = _best_fit(problem, fitted, trials)
-    return split if split and cost >= least_rise * split.cost and _is_supported(problem, fitted, split) else None
+    split_fits = results_of_parts(bodies, fit_with_split, list(np.ndindex(len(bodies.sign), bodies.num_splits)))
+    best_split_fit = _best_fit(problem, fitted, split_fits)
+    return (
+        best_split_fit
+        if best_split_fit
+        and fitted_cost >= least_rise * best_split_fit.cost
+        and _is_supported(problem, fitted, best_split_fit)
+        else None
+    )
 
 
 def alternative_fits(problem: ShapeProblem, result: SearchResult) -> tuple[SearchResult, ShapeFit | None]:
@@ -114,21 +136,23 @@ def alternative_fits(problem: ShapeProblem, result: SearchResult) -> tuple[Searc
     bodies = fitted.bodies
     can_change_kind = ~bodies.is_other_kind & ~bodies.is_kind_certain & (not bodies.prior.is_of_one_kind)
     indices = np.flatnonzero(can_change_kind)
-    groups = [[k] for k in indices] + [indices] * (len(indices) > 1)
-    trials = results_of_parts(
-        bodies, lambda group: _trial_fit(problem, bodies.with_other_kind(group, fitted.coefficients)), groups
+    body_groups = [[k] for k in indices] + [indices] * (len(indices) > 1)
+    kind_change_fits = results_of_parts(
+        bodies,
+        lambda body_group: _trial_fit(problem, bodies.with_other_kind(body_group, fitted.coefficients)),
+        body_groups,
     )
     is_kind_certain = bodies.is_kind_certain.copy()
-    for k, trial in zip(indices, trials, strict=False):
-        is_kind_certain[k] = trial.cost > _EXCLUDED_OBJECTIVE_RATIO * fitted.cost
+    for k, kind_change_fit in zip(indices, kind_change_fits, strict=False):
+        is_kind_certain[k] = kind_change_fit.cost > _EXCLUDED_OBJECTIVE_RATIO * fitted.cost
     result = result._replace(fit=fitted._replace(bodies=replace(bodies, is_kind_certain=is_kind_certain)))
-    change = _best_fit(problem, fitted, trials)
-    return result, change if change and _is_supported(problem, fitted, change) else None
+    best_changed_fit = _best_fit(problem, fitted, kind_change_fits)
+    return result, best_changed_fit if best_changed_fit and _is_supported(problem, fitted, best_changed_fit) else None
 
 
-def _trial_fit(problem: ShapeProblem, start: tuple[Bodies, Float[np.ndarray, " n"]]) -> ShapeFit:
-    """Make a few steps of the fit of bodies from their coefficients `start`."""
-    return problem.fit(*start, _TRIAL_STEPS, COARSE_TOLERANCE)
+def _trial_fit(problem: ShapeProblem, start_of_fit: tuple[Bodies, Float[np.ndarray, " n"]]) -> ShapeFit:
+    """Make a few steps of the fit of bodies from their coefficients, `start_of_fit`."""
+    return problem.fit(*start_of_fit, _TRIAL_STEPS, COARSE_TOLERANCE)
 
 
 def _best_fit(problem: ShapeProblem, fitted: ShapeFit, trial_fits: Sequence[ShapeFit]) -> ShapeFit | None:
@@ -136,15 +160,15 @@ def _best_fit(problem: ShapeProblem, fitted: ShapeFit, trial_fits: Sequence[Shap
     `CERTAIN_OBJECTIVE_RATIO` times that of `fitted` and that the data would support if their cost fell to zero. None if
     there are none."""
     possible_trials = [
-        trial
-        for trial in trial_fits
-        if trial.cost <= CERTAIN_OBJECTIVE_RATIO * fitted.cost
-        and problem.negative_log_evidence(trial) - trial.cost + MIN_EVIDENCE_GAIN
+        trial_fit
+        for trial_fit in trial_fits
+        if trial_fit.cost <= CERTAIN_OBJECTIVE_RATIO * fitted.cost
+        and problem.negative_log_evidence(trial_fit) - trial_fit.cost + MIN_EVIDENCE_GAIN
         <= problem.negative_log_evidence(fitted)
     ]
     if not possible_trials:
         return None
-    best_trial = min(possible_trials, key=lambda trial: trial.cost)
+    best_trial = min(possible_trials, key=lambda trial_fit: trial_fit.cost)
     return problem.fit(best_trial.bodies, best_trial.coefficients, STEPS)
 
 
@@ -159,13 +183,15 @@ def improve_fit(problem: ShapeProblem, result: SearchResult, least_rise: float) 
     bodies of these kinds would be less likely than the result of the first."""
     initial_fit, doubtful = result.fit, result.doubtful
     result, other_fit = alternative_fits(problem, result)
-    results = [] if other_fit is None else [_search_until_stable(problem, doubtful, other_fit, least_rise)]
+    search_results = [] if other_fit is None else [_search_until_stable(problem, doubtful, other_fit, least_rise)]
     least_surprise = problem.negative_log_evidence(initial_fit) - initial_fit.cost
-    if all(least_surprise <= problem.negative_log_evidence(found.fit) for found in results):
-        split = _split_bodies(problem, initial_fit, least_rise)
-        if split is not None:
-            results.append(_search_until_stable(problem, doubtful, split, least_rise))
-    return min(results or [result], key=lambda candidate: problem.negative_log_evidence(candidate.fit))
+    if all(least_surprise <= problem.negative_log_evidence(search_result.fit) for search_result in search_results):
+        split_fit = _split_bodies(problem, initial_fit, least_rise)
+        if split_fit is not None:
+            search_results.append(_search_until_stable(problem, doubtful, split_fit, least_rise))
+    return min(
+        search_results or [result], key=lambda candidate_result: problem.negative_log_evidence(candidate_result.fit)
+    )
 
 
 def _search_until_stable(

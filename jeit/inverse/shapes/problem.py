@@ -78,11 +78,11 @@ class OtherChanges:
         explain."""
         residual = self._residual(fit)
 
-        def surprise(level: float) -> float:
-            problem = self.problem_at(level)
+        def negative_log_evidence(candidate_level: float) -> float:
+            problem = self.problem_at(candidate_level)
             return 0.5 * float(residual @ problem.data.precision @ residual) + problem.half_log_determinant
 
-        return min(self.levels, key=surprise)
+        return min(self.levels, key=negative_log_evidence)
 
     def conductivity(self, level: float, fit: ShapeFit) -> Any:
         """Posterior mean of the part of the changes that is of conductivity, in log σ/σ₀ (m,), given the voltages that
@@ -123,12 +123,14 @@ class MovedElectrodes(OtherChanges):
         if not isinstance(model.electrodes, BoundaryElectrodes) or model.mesh.dimension != 2 or deviation == 0:
             return None
         fields, impedance = map(np.asarray, on_host(model.fields(bodies_problem.background)))
-        derivatives = PlacementSensitivity(model.mesh, model.electrodes)(fields, impedance)
+        impedance_derivatives = PlacementSensitivity(model.mesh, model.electrodes)(fields, impedance)
         num_contacts = model.electrodes.num_electrodes
-        deviations = np.repeat([deviation, _CONTACT_DEVIATION], [len(derivatives) - num_contacts, num_contacts])
-        changes = deviations[:, None, None] * derivatives
-        jacobian = np.asarray(bodies_problem.data.weight)[:, None] * _channels_of(model.protocol, changes)
-        return cls(jacobian, bodies_problem, _MOVED_ELECTRODE_LEVELS, changes)
+        parameter_deviations = np.repeat(
+            [deviation, _CONTACT_DEVIATION], [len(impedance_derivatives) - num_contacts, num_contacts]
+        )
+        impedance_changes = parameter_deviations[:, None, None] * impedance_derivatives
+        jacobian = np.asarray(bodies_problem.data.weight)[:, None] * _channels_of(model.protocol, impedance_changes)
+        return cls(jacobian, bodies_problem, _MOVED_ELECTRODE_LEVELS, impedance_changes)
 
     def voltages(self, level: float, fit: ShapeFit, protocol: Protocol) -> Float[np.ndarray, " M"]:
         """Posterior mean of the changes of the voltages (M,) of a `protocol`, volts, given the voltages that the bodies
@@ -174,8 +176,14 @@ class SmoothField(OtherChanges):
         zero_coefficients: Any = np.zeros_like(image.coefficients)
         _, weighted_jacobian = image.inversion.linearise(zero_coefficients)
         weight_ratio = np.asarray(bodies_problem.data.weight) / image.inversion.data.weight
-        scale = np.asarray(inversion.link.slope(inversion.reference)) / bodies_problem.background
-        return cls(weight_ratio[:, None] * weighted_jacobian, bodies_problem, _SMOOTH_FIELD_LEVELS, image, scale)
+        log_conductivity_slope = np.asarray(inversion.link.slope(inversion.reference)) / bodies_problem.background
+        return cls(
+            weight_ratio[:, None] * weighted_jacobian,
+            bodies_problem,
+            _SMOOTH_FIELD_LEVELS,
+            image,
+            log_conductivity_slope,
+        )
 
     def conductivity(self, level: float, fit: ShapeFit) -> Float[np.ndarray, " m"]:
         """Posterior mean (m,) of the smooth field, level · field in log σ/σ₀, given the voltages that the bodies of a
@@ -236,37 +244,43 @@ class ShapeProblem:
     def with_scaled_errors(self, factor: float) -> ShapeProblem:
         """Copy of the problem with all errors of the data multiplied by a `factor`."""
         new_matrices = (factor**2 * np.asarray(self.data.covariance), np.asarray(self.data.precision) / factor**2)
-        return replace(self, data=eqx.tree_at(lambda data: (data.covariance, data.precision), self.data, new_matrices))
+        return replace(
+            self,
+            data=eqx.tree_at(lambda shape_data: (shape_data.covariance, shape_data.precision), self.data, new_matrices),
+        )
 
     def with_errors(self, rows: Float[np.ndarray, "r q"]) -> ShapeProblem:
         """Copy of the problem with further errors of the data: `rows` (r, q) are the errors of the r weighted voltages
         per unit of each of q coefficients of unit variance."""
         covariance = np.asarray(self.data.covariance) + rows @ rows.T
         new_matrices = (covariance, np.linalg.inv(covariance))
-        return replace(self, data=eqx.tree_at(lambda data: (data.covariance, data.precision), self.data, new_matrices))
+        return replace(
+            self,
+            data=eqx.tree_at(lambda shape_data: (shape_data.covariance, shape_data.precision), self.data, new_matrices),
+        )
 
     def linearise(self, coefficients: Float[np.ndarray, " n"], bodies: Bodies) -> tuple[Any, Any, Any, Any]:
         """Residual (r + p,), a function that returns its Jacobian (r + p, n), its covariance and its precision
         (r + p, r + p), for r channels and p pairs of bodies."""
         check_not_abandoned()
-        image, slopes, overlap, overlap_slope = bodies.image(coefficients)
+        image, image_slopes, pair_overlaps, pair_overlap_slopes = bodies.image(coefficients)
         conductivity = self.background * np.exp(image)
         fields = self.recent_fields.at(self.model, conductivity)
-        weight = np.asarray(self.data.weight)
+        data_weight = np.asarray(self.data.weight)
         # The penalty on the overlap of bodies is an additional datum of unit variance for every pair of bodies.
-        overlap_weight, pair_identity = bodies.prior.apart, np.eye(len(overlap))
+        overlap_weight, pair_identity = bodies.prior.apart, np.eye(len(pair_overlaps))
 
         def jacobian():
-            cell_conductivities = [conductivity if cells is None else conductivity[cells] for cells, _ in slopes]
-            changes = [
-                ConductivityChange(cells, values[:, None] * slope)
-                for values, (cells, slope) in zip(cell_conductivities, slopes, strict=True)
+            cell_conductivities = [conductivity if cells is None else conductivity[cells] for cells, _ in image_slopes]
+            conductivity_changes = [
+                ConductivityChange(cells, cell_values[:, None] * image_slope)
+                for cell_values, (cells, image_slope) in zip(cell_conductivities, image_slopes, strict=True)
             ]
-            voltages = bodies.by_coefficients(fields.derivatives(changes))
-            return np.concatenate([weight[:, None] * voltages, overlap_weight * overlap_slope])
+            voltages = bodies.by_coefficients(fields.derivatives(conductivity_changes))
+            return np.concatenate([data_weight[:, None] * voltages, overlap_weight * pair_overlap_slopes])
 
         return (
-            np.concatenate([weight * (fields.voltages - self.data.voltages), overlap_weight * overlap]),
+            np.concatenate([data_weight * (fields.voltages - self.data.voltages), overlap_weight * pair_overlaps]),
             jacobian,
             scipy.linalg.block_diag(self.data.covariance, pair_identity),
             scipy.linalg.block_diag(self.data.precision, pair_identity),
@@ -282,18 +296,18 @@ class ShapeProblem:
 
         def expand(coefficients, bodies) -> QuadraticModel:
             residual, jacobian, covariance, precision = self.linearise(coefficients, bodies)
-            cost = 0.5 * (residual @ precision @ residual + coefficients @ coefficients)
+            objective_value = 0.5 * (residual @ precision @ residual + coefficients @ coefficients)
 
-            def step(damping):  # the Jacobian is computed only at points that are accepted
-                rows = jacobian()
-                accepted_values[:] = residual, rows
-                return ridge_model(residual, rows, coefficients, covariance, precision)[1](damping)  # pyright: ignore
+            def damped_step(damping):  # the Jacobian is computed only at points that are accepted
+                jacobian_rows = jacobian()
+                accepted_values[:] = residual, jacobian_rows
+                return ridge_model(residual, jacobian_rows, coefficients, covariance, precision)[1](damping)  # pyright: ignore
 
-            return cost, step
+            return objective_value, damped_step
 
-        descent = Descent(rtol=rtol or self.rtol, damping=1.0, history=max_steps + 1)
-        coefficients, state = descent.at_once(expand, start, bodies, max_steps)
-        return ShapeFit(bodies, coefficients, float(state.cost), (accepted_values[0], accepted_values[1]))
+        gauss_newton_descent = Descent(rtol=rtol or self.rtol, damping=1.0, history=max_steps + 1)
+        coefficients, descent_state = gauss_newton_descent.at_once(expand, start, bodies, max_steps)
+        return ShapeFit(bodies, coefficients, float(descent_state.cost), (accepted_values[0], accepted_values[1]))
 
     @property
     def half_log_determinant(self) -> float:
@@ -316,7 +330,9 @@ class ShapeProblem:
 
     def _hessian(self, fit: ShapeFit) -> Float[np.ndarray, "n n"]:
         """Hessian H (n, n) of the cost at its minimum."""
-        _, rows = fit.rows
+        _, jacobian_rows = fit.rows
         num_channels = len(self.data.voltages)
-        weighted_rows = np.concatenate([self.data.precision @ rows[:num_channels], rows[num_channels:]])
-        return np.eye(len(fit.coefficients)) + rows.T @ weighted_rows
+        weighted_rows = np.concatenate(
+            [self.data.precision @ jacobian_rows[:num_channels], jacobian_rows[num_channels:]]
+        )
+        return np.eye(len(fit.coefficients)) + jacobian_rows.T @ weighted_rows

@@ -86,22 +86,24 @@ def with_quantities(
     """
     if accuracy.model_error is not None:
         conductivity = problem.background * np.exp(fit.bodies.image(fit.coefficients).image)
-        rows = accuracy.model_error.voltages(problem.model, conductivity, problem.background)
-        problem = problem.with_errors(np.asarray(problem.data.weight)[:, None] * rows)
+        model_error_rows = accuracy.model_error.voltages(problem.model, conductivity, problem.background)
+        problem = problem.with_errors(np.asarray(problem.data.weight)[:, None] * model_error_rows)
     shown_centroids = [fit.bodies.body(int(k), fit.coefficients).centroid for k in order]
     fit = problem.fit(fit.bodies, fit.coefficients, _MAX_FIT_STEPS)
     if (misfit := problem.misfit(fit)) > 1:  # the errors are larger than assumed, whatever their cause
         problem = problem.with_scaled_errors(misfit)
         fit = problem.fit(fit.bodies, fit.coefficients, _MAX_FIT_STEPS)
-    materials = np.unique(fit.bodies.first).tolist()
-    explored = dict(
+    material_indices = np.unique(fit.bodies.first).tolist()
+    explored_by_material = dict(
         zip(
-            materials, results_of_parts(fit.bodies, lambda k: explore_contrast(problem, fit, k), materials), strict=True
+            material_indices,
+            results_of_parts(fit.bodies, lambda k: explore_contrast(problem, fit, k), material_indices),
+            strict=True,
         )
     )
     return [
         replace(
-            quantify(problem, explored[int(fit.bodies.first[k])], int(k), float(unmodelled[k]), accuracy),
+            quantify(problem, explored_by_material[int(fit.bodies.first[k])], int(k), float(unmodelled[k]), accuracy),
             centroid_radius=centroid_radius(problem, fit, int(k), centroid, accuracy),
         )
         for k, centroid in zip(order, shown_centroids, strict=True)
@@ -122,17 +124,17 @@ def centroid_radius(
     indices = np.arange(1 + k * prior_size, 1 + (k + 1) * prior_size)
     coefficient_covariance = problem.covariance(fit)[np.ix_(indices, indices)]
     centroid = bodies.body(k, fit.coefficients).centroid
-    slope = bodies.centroid_slope(k, fit.coefficients, np.sqrt(np.diag(coefficient_covariance)))
-    points = np.asarray(problem.model.mesh.points)
-    scaling_error = accuracy.size * (centroid - (points.min(axis=0) + points.max(axis=0)) / 2)
+    centroid_slope = bodies.centroid_slope(k, fit.coefficients, np.sqrt(np.diag(coefficient_covariance)))
+    mesh_points = np.asarray(problem.model.mesh.points)
+    scaling_error = accuracy.size * (centroid - (mesh_points.min(axis=0) + mesh_points.max(axis=0)) / 2)
     field_error = _RELATIVE_CENTROID_DEVIATION * accuracy.strength * bodies.span / 2
-    covariance = slope @ coefficient_covariance @ slope.T
+    covariance = centroid_slope @ coefficient_covariance @ centroid_slope.T
     covariance += np.outer(scaling_error, scaling_error) + field_error**2 * np.eye(len(centroid))
     variance = np.trace(covariance)
     squared_radius = np.sum((centroid - shown_centroid) ** 2)
     if variance > 0:
-        scale = np.sum(covariance**2) / variance
-        squared_radius += scale * chdtri(variance / scale, 1 - _CENTROID_PROBABILITY)
+        chi_square_scale = np.sum(covariance**2) / variance
+        squared_radius += chi_square_scale * chdtri(variance / chi_square_scale, 1 - _CENTROID_PROBABILITY)
     return float(np.sqrt(squared_radius))
 
 
@@ -144,13 +146,15 @@ def include_deviation(
     description."""
     if other_body is None:
         return quantities
-    changes = np.expm1(other_body.sign * (other_body.contrast + deviation * np.array([-1, 1]))).tolist()
-    strength = float(other_body.volume * polarisation(other_body.sign * other_body.contrast, other_body.bounded_axes))
+    conductivity_changes = np.expm1(other_body.sign * (other_body.contrast + deviation * np.array([-1, 1]))).tolist()
+    body_strength = float(
+        other_body.volume * polarisation(other_body.sign * other_body.contrast, other_body.bounded_axes)
+    )
     return replace(
         quantities,
-        change_interval=_interval_hull(quantities.change_interval, changes),
+        change_interval=_interval_hull(quantities.change_interval, conductivity_changes),
         measure_interval=_interval_hull(quantities.measure_interval, [other_body.volume]),
-        strength_interval=_interval_hull(quantities.strength_interval, [strength]),
+        strength_interval=_interval_hull(quantities.strength_interval, [body_strength]),
         centroid_radius=max(quantities.centroid_radius, float(np.linalg.norm(other_body.centroid - body.centroid))),
     )
 
@@ -189,30 +193,41 @@ def explore_contrast(problem: ShapeProblem, fit: ShapeFit, k: int) -> list[Explo
     """Explore the contrast of body k of a `fit`, and of all bodies of its material, in both directions until it is
     improbable or at a bound. Returns the fits in ascending order of contrast."""
     bodies = fit.bodies
-    contrast, slope = bodies.contrast(k, bodies.rows(fit.coefficients)[k])
-    contrast = max(contrast, np.exp(_LOG_CONTRAST_BOUNDS[0]))  # of a body fitted with the other sign, it is negative
-    first_log_contrast = float(np.clip(np.log(contrast), *_LOG_CONTRAST_BOUNDS))
-    deviation = problem.deviations(fit)[_radius_and_contrast_index(bodies, k)[1]] * abs(slope) / contrast
-    middle_fit = _fit_with_fixed_contrast(problem, bodies, fit.coefficients, k, np.log(contrast), first_log_contrast)
+    fitted_contrast, contrast_slope = bodies.contrast(k, bodies.rows(fit.coefficients)[k])
+    # Of a body fitted with the other sign, it is negative.
+    fitted_contrast = max(fitted_contrast, np.exp(_LOG_CONTRAST_BOUNDS[0]))
+    first_log_contrast = float(np.clip(np.log(fitted_contrast), *_LOG_CONTRAST_BOUNDS))
+    log_contrast_deviation = (
+        problem.deviations(fit)[_radius_and_contrast_index(bodies, k)[1]] * abs(contrast_slope) / fitted_contrast
+    )
+    middle_fit = _fit_with_fixed_contrast(
+        problem, bodies, fit.coefficients, k, np.log(fitted_contrast), first_log_contrast
+    )
     max_drop = _LOG_POSTERIOR_DROP[bodies.dimension]
 
-    def explore(direction: int) -> list[ExploredContrast]:
-        explored, step = [middle_fit], float(np.clip(deviation, *_LOG_CONTRAST_STEP_LIMITS))
-        while explored[-1].negative_log_evidence < min(one.negative_log_evidence for one in explored) + max_drop:
-            last_fit = explored[-1]
-            log_contrast = float(np.clip(last_fit.log_contrast + direction * step, *_LOG_CONTRAST_BOUNDS))
+    def explore_in_direction(direction: int) -> list[ExploredContrast]:
+        explored_fits, log_contrast_step = (
+            [middle_fit],
+            float(np.clip(log_contrast_deviation, *_LOG_CONTRAST_STEP_LIMITS)),
+        )
+        while (
+            explored_fits[-1].negative_log_evidence
+            < min(explored_fit.negative_log_evidence for explored_fit in explored_fits) + max_drop
+        ):
+            last_fit = explored_fits[-1]
+            log_contrast = float(np.clip(last_fit.log_contrast + direction * log_contrast_step, *_LOG_CONTRAST_BOUNDS))
             if log_contrast == last_fit.log_contrast:
                 break
-            explored.append(
+            explored_fits.append(
                 _fit_with_fixed_contrast(
                     problem, bodies, last_fit.fit.coefficients, k, last_fit.log_contrast, log_contrast
                 )
             )
-            step *= _STEP_GROWTH
-        return explored
+            log_contrast_step *= _STEP_GROWTH
+        return explored_fits
 
-    lower, higher = results_of_parts(bodies, explore, [-1, 1])
-    return [*lower[:0:-1], *higher]
+    fits_at_lower_contrast, fits_at_higher_contrast = results_of_parts(bodies, explore_in_direction, [-1, 1])
+    return [*fits_at_lower_contrast[:0:-1], *fits_at_higher_contrast]
 
 
 def quantify(
@@ -225,20 +240,22 @@ def quantify(
     """
     bodies, fixed_fits = explored[0].fit.bodies, []
     for log_contrast, negative_log_likelihood, fit in explored:
-        deviation = bodies.prior.radius_spread * float(
+        log_radius_deviation = bodies.prior.radius_spread * float(
             problem.deviations(fit)[_radius_and_contrast_index(bodies, k)[0]]
         )
-        deviation = float(np.hypot(bodies.bounded_axes(k) * np.hypot(deviation, accuracy.size), accuracy.strength))
-        measure = fit.bodies.body(k, fit.coefficients).measure
-        log_measure = float(np.log(max(measure, MIN_POSITIVE_VALUE)))
-        fixed_fits.append(_FixedContrastFit(log_contrast, negative_log_likelihood, log_measure, deviation))
+        log_radius_deviation = float(
+            np.hypot(bodies.bounded_axes(k) * np.hypot(log_radius_deviation, accuracy.size), accuracy.strength)
+        )
+        body_measure = fit.bodies.body(k, fit.coefficients).measure
+        log_measure = float(np.log(max(body_measure, MIN_POSITIVE_VALUE)))
+        fixed_fits.append(_FixedContrastFit(log_contrast, negative_log_likelihood, log_measure, log_radius_deviation))
     return _summary(int(bodies.sign[k]), bodies.bounded_axes(k), unmodelled, fixed_fits)
 
 
 def _radius_and_contrast_index(bodies: Bodies, k: int) -> tuple[int, int]:
     """Indices of the log radius of body k, and of its contrast, among the coefficients."""
-    dimension, size = bodies.dimension, bodies.prior.size
-    return 1 + k * size + dimension, 1 + int(bodies.first[k]) * size + dimension + 1
+    dimension, num_coefficients = bodies.dimension, bodies.prior.size
+    return 1 + k * num_coefficients + dimension, 1 + int(bodies.first[k]) * num_coefficients + dimension + 1
 
 
 def _fit_with_fixed_contrast(
@@ -247,15 +264,19 @@ def _fit_with_fixed_contrast(
     """Fit the bodies with the log contrast of body k, and of all other bodies of its material, fixed at `log_contrast`.
     The fit starts from `coefficients` of a fit at `last_log_contrast`, with radii changed so that the strengths stay
     the same."""
-    start, same_material, sign = coefficients.copy(), bodies.first == bodies.first[k], bodies.sign[k]
-    for body_index in np.flatnonzero(same_material).tolist():
+    start_coefficients, is_same_material, sign = coefficients.copy(), bodies.first == bodies.first[k], bodies.sign[k]
+    for body_index in np.flatnonzero(is_same_material).tolist():
         axes = bodies.bounded_axes(body_index)
-        ratio = polarisation(sign * np.exp(last_log_contrast), axes) / polarisation(sign * np.exp(log_contrast), axes)
-        start[_radius_and_contrast_index(bodies, body_index)[0]] += np.log(ratio) / axes / bodies.prior.radius_spread
-    start[_radius_and_contrast_index(bodies, k)[1]] = 0.0
-    fixed_contrast = np.where(same_material, np.exp(log_contrast), bodies.fixed_contrast)
+        polarisation_ratio = polarisation(sign * np.exp(last_log_contrast), axes) / polarisation(
+            sign * np.exp(log_contrast), axes
+        )
+        start_coefficients[_radius_and_contrast_index(bodies, body_index)[0]] += (
+            np.log(polarisation_ratio) / axes / bodies.prior.radius_spread
+        )
+    start_coefficients[_radius_and_contrast_index(bodies, k)[1]] = 0.0
+    fixed_contrast = np.where(is_same_material, np.exp(log_contrast), bodies.fixed_contrast)
     fixed_fit = problem.fit(
-        replace(bodies, fixed_contrast=fixed_contrast), start, *_MAX_STEPS_AND_TOLERANCE[bodies.dimension]
+        replace(bodies, fixed_contrast=fixed_contrast), start_coefficients, *_MAX_STEPS_AND_TOLERANCE[bodies.dimension]
     )
     return ExploredContrast(log_contrast, problem.negative_log_evidence(fixed_fit), fixed_fit)
 
@@ -269,18 +290,21 @@ def _summary(sign: int, axes: int, unmodelled: float, fixed_fits: Sequence[_Fixe
     """Medians and intervals of the posterior, interpolated between the fixed contrasts and convolved with a normal
     distribution of the standard deviation `unmodelled`; `axes`: number of axes along which the body is bounded."""
     log_contrasts, negative_log_likelihoods, log_measure, deviations = np.array(fixed_fits).T
-    grid = np.linspace(log_contrasts[0], log_contrasts[-1], _NUM_CONTRASTS)
+    log_contrast_grid = np.linspace(log_contrasts[0], log_contrasts[-1], _NUM_CONTRASTS)
     grid_negative_log_likelihoods, grid_log_measures, grid_deviations = (
-        PchipInterpolator(log_contrasts, values)(grid) for values in (negative_log_likelihoods, log_measure, deviations)
+        PchipInterpolator(log_contrasts, fit_values)(log_contrast_grid)
+        for fit_values in (negative_log_likelihoods, log_measure, deviations)
     )
-    surprise = grid_negative_log_likelihoods + _contrast_prior(grid)
-    weight = np.exp(surprise.min() - surprise)
+    negative_log_posterior = grid_negative_log_likelihoods + _contrast_prior(log_contrast_grid)
+    posterior_weight = np.exp(negative_log_posterior.min() - negative_log_posterior)
     normal_deviates = ndtri((np.arange(_NUM_NORMAL_DEVIATES) + 0.5) / _NUM_NORMAL_DEVIATES)
-    strength = polarisation(sign * np.exp(grid), axes)[:, None] * np.exp(
+    body_strength = polarisation(sign * np.exp(log_contrast_grid), axes)[:, None] * np.exp(
         grid_log_measures[:, None] + grid_deviations[:, None] * normal_deviates
     )
-    contrast = np.clip(np.exp(grid)[:, None] + unmodelled * normal_deviates, *np.exp(_LOG_CONTRAST_BOUNDS))
-    measures = strength[:, None] / polarisation(sign * contrast, axes)[..., None]
+    true_contrast = np.clip(
+        np.exp(log_contrast_grid)[:, None] + unmodelled * normal_deviates, *np.exp(_LOG_CONTRAST_BOUNDS)
+    )
+    body_measures = body_strength[:, None] / polarisation(sign * true_contrast, axes)[..., None]
     min_negative_log_likelihood = negative_log_likelihoods.min()
     is_open_above = (
         log_contrasts[-1] == _LOG_CONTRAST_BOUNDS[1]
@@ -292,12 +316,17 @@ def _summary(sign: int, axes: int, unmodelled: float, fixed_fits: Sequence[_Fixe
     )
     # If the data do not determine the upper limit of the contrast, they do not determine the lower limit of the area or
     # volume either, and vice versa: a stronger body is smaller.
-    changes = [float(np.expm1(sign * values)) for values in _quantiles(contrast, weight)]
-    change_limits: list[float | None] = [None if is_open_below else changes[0], None if is_open_above else changes[2]]
-    min_measure, median_measure, max_measure = _quantiles(measures, weight)
-    min_strength, median_strength, max_strength = _quantiles(strength, weight)
+    conductivity_changes = [
+        float(np.expm1(sign * fit_values)) for fit_values in _weighted_quantiles(true_contrast, posterior_weight)
+    ]
+    change_limits: list[float | None] = [
+        None if is_open_below else conductivity_changes[0],
+        None if is_open_above else conductivity_changes[2],
+    ]
+    min_measure, median_measure, max_measure = _weighted_quantiles(body_measures, posterior_weight)
+    min_strength, median_strength, max_strength = _weighted_quantiles(body_strength, posterior_weight)
     return Quantities(
-        changes[1],
+        conductivity_changes[1],
         (change_limits[0], change_limits[1]) if sign > 0 else (change_limits[1], change_limits[0]),
         median_measure,
         (None if is_open_above else min_measure, None if is_open_below else max_measure),
@@ -306,14 +335,16 @@ def _summary(sign: int, axes: int, unmodelled: float, fixed_fits: Sequence[_Fixe
     )
 
 
-def _quantiles(values: Float[np.ndarray, "g *s"], weight: Float[np.ndarray, " g"]) -> tuple[float, float, float]:
+def _weighted_quantiles(
+    values: Float[np.ndarray, "g *s"], weight: Float[np.ndarray, " g"]
+) -> tuple[float, float, float]:
     """Weighted quantiles of `values` at the lower end of the interval, the median and the upper end. `weight` (g,):
     weight of all values at each index of the first axis."""
     weight = np.repeat(weight, values[0].size)
-    values, order = values.ravel(), np.argsort(values, axis=None)
-    cumulative_weights = np.cumsum(weight[order])
-    cumulative_weights = (cumulative_weights - weight[order] / 2) / cumulative_weights[-1]
-    low, median, high = np.interp(
-        [_INTERVAL_PROBABILITIES[0], 0.5, _INTERVAL_PROBABILITIES[1]], cumulative_weights, values[order]
+    values, order_by_value = values.ravel(), np.argsort(values, axis=None)
+    cumulative_weights = np.cumsum(weight[order_by_value])
+    cumulative_weights = (cumulative_weights - weight[order_by_value] / 2) / cumulative_weights[-1]
+    lower_quantile, median_value, upper_quantile = np.interp(
+        [_INTERVAL_PROBABILITIES[0], 0.5, _INTERVAL_PROBABILITIES[1]], cumulative_weights, values[order_by_value]
     )
-    return float(low), float(median), float(high)
+    return float(lower_quantile), float(median_value), float(upper_quantile)

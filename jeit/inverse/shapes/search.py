@@ -110,21 +110,27 @@ def reconstruct_shapes(
     [body.centroid for body in found.bodies]
     ```
     """
-    measured, used = check_frame(model, voltages, mask)
-    check_has_values("reconstruct_shapes", (model, measured), "bodies are chosen by comparison", "take reconstruct")
+    measured_voltages, is_used_channel = check_frame(model, voltages, mask)
+    check_has_values(
+        "reconstruct_shapes", (model, measured_voltages), "bodies are chosen by comparison", "take reconstruct"
+    )
     check_flat(model.mesh, "star shapes")
     background = np.asarray(check_background(model, background))
-    deviation = check_noise(noise, measured, used)
+    noise_deviation = check_noise(noise, measured_voltages, is_used_channel)
     bodies_type, prior_type = (Stars, StarPrior) if model.mesh.dimension == 2 else (Ellipsoids, EllipsoidPrior)
     prior = prior_type() if prior is None else prior
     check_kind("prior", prior, prior_type, f"one of bodies of that dimension, such as {prior_type.__name__}(modes=2)")
     if not (is_number(least_rise) and least_rise >= 1):
         raise ValueError(f"least_rise must be a number from 1; it is {describe(least_rise)}.")
-    sign, centre, radius = _check_start(start, model.mesh.dimension)
-    independent_model, data = independent_data(model, measured, used, deviation, at_once=True)
+    signs_of_bodies, centre, radius = _check_start(start, model.mesh.dimension)
+    independent_model, independent_voltages = independent_data(
+        model, measured_voltages, is_used_channel, noise_deviation, at_once=True
+    )
     is_solid = model.mesh.dimension == 3
-    problem = ShapeProblem(independent_model, data, background, COARSE_TOLERANCE if is_solid else ShapeProblem.rtol)
-    bodies = bodies_type.create(model.mesh, prior, centre, sign)
+    problem = ShapeProblem(
+        independent_model, independent_voltages, background, COARSE_TOLERANCE if is_solid else ShapeProblem.rtol
+    )
+    bodies = bodies_type.create(model.mesh, prior, centre, signs_of_bodies)
     coefficients = bodies.of_radii(radius)
     if isinstance(prior, EllipsoidPrior) and prior.kinds == "columns":
         bodies, coefficients = bodies.with_other_kind(range(len(radius)), coefficients)
@@ -132,64 +138,91 @@ def reconstruct_shapes(
         other_changes = MovedElectrodes.create(problem, 0.0 if accuracy is None else accuracy.movement)
     else:
         other_changes = SmoothField.create(smooth, problem)
-    setting = _FitSetting(problem, other_changes)
-    finer_model, report = None, progress or (lambda stage: None)
-    report("bodies")
-    states = []
+    fit_setting = _FitSetting(problem, other_changes)
+    finer_model, report_stage = None, progress or (lambda stage_name: None)
+    report_stage("bodies")
+    search_states = []
     if smooth is None:
-        states.append(_fit_bodies(setting, 0.0, bodies, coefficients, least_rise))
+        search_states.append(_fit_bodies(fit_setting, 0.0, bodies, coefficients, least_rise))
     if other_changes is not None:
-        level, ball_fit, _ = _add_bodies(setting, *bodies.with_modes(1, coefficients))
+        level, ball_fit, _ = _add_bodies(fit_setting, *bodies.with_modes(1, coefficients))
         bodies_with_modes = ball_fit.bodies.with_modes(prior.modes, ball_fit.coefficients)
-        states.append(_fit_bodies(setting, level, *bodies_with_modes, least_rise))
-    state = min(states, key=lambda state: state.negative_log_evidence)
+        search_states.append(_fit_bodies(fit_setting, level, *bodies_with_modes, least_rise))
+    search_state = min(search_states, key=lambda search_state: search_state.negative_log_evidence)
     if is_solid:
-        state, finer_model = _refine_meshes(state, least_rise, report)
-        report("bodies, of which kind")
+        search_state, finer_model = _refine_meshes(search_state, least_rise, report_stage)
+        report_stage("bodies, of which kind")
     else:
-        report("bodies, how many")
-        state = state._replace(found=improve_fit(setting.problem(state.level), state.found, least_rise))
-    (setting, level, (free_fit, objective_ratios, doubtful)), other_changes = state, state.setting.other_changes
-    problem = setting.problem(level)
-    fitted = _with_common_contrast(problem, free_fit)
-    bodies, coefficients = fitted.bodies, fitted.coefficients
-    field = 0.0 if other_changes is None else other_changes.conductivity(level, fitted)
+        report_stage("bodies, how many")
+        search_state = search_state._replace(
+            search_result=improve_fit(fit_setting.problem(search_state.level), search_state.search_result, least_rise)
+        )
+    (fit_setting, level, (free_fit, objective_ratios, doubtful_bodies)), other_changes = (
+        search_state,
+        search_state.setting.other_changes,
+    )
+    problem = fit_setting.problem(level)
+    common_contrast_fit = _with_common_contrast(problem, free_fit)
+    bodies, coefficients = common_contrast_fit.bodies, common_contrast_fit.coefficients
+    smooth_field = 0.0 if other_changes is None else other_changes.conductivity(level, common_contrast_fit)
     mesh_bodies = bodies.on(model.mesh) if isinstance(bodies, Ellipsoids) else bodies
-    conductivity = background * np.exp(mesh_bodies.display_image(coefficients) + field)
-    predicted, image = np.asarray(model.voltages(conductivity if finer_model is None else background)), None
+    conductivity = background * np.exp(mesh_bodies.display_image(coefficients) + smooth_field)
+    predicted_voltages, image = np.asarray(model.voltages(conductivity if finer_model is None else background)), None
     if finer_model is not None:
-        predicted = predicted + finer_model.change(model.protocol, bodies.image(coefficients).image, field)
+        predicted_voltages = predicted_voltages + finer_model.change(
+            model.protocol, bodies.image(coefficients).image, smooth_field
+        )
         image = FinerImage(
-            finer_model.problem.model, as_array(finer_model.conductivity(bodies.display_image(coefficients), field))
+            finer_model.problem.model,
+            as_array(finer_model.conductivity(bodies.display_image(coefficients), smooth_field)),
         )
     if other_changes is not None:
-        predicted = predicted + other_changes.voltages(level, fitted, model.protocol)
-    alternative_bodies, deviations = alternatives(problem, fitted), contrast_deviations(problem, fitted, free_fit)
-    normalised_residual = ((predicted - np.asarray(measured)) / np.asarray(deviation))[used]
-    order = np.argsort(-np.asarray(objective_ratios), kind="stable")
-    bodies_of_fit = [bodies.body(int(k), coefficients, objective_ratios[k]) for k in order]
+        predicted_voltages = predicted_voltages + other_changes.voltages(level, common_contrast_fit, model.protocol)
+    alternative_bodies, deviations_of_contrast = (
+        alternatives(problem, common_contrast_fit),
+        contrast_deviations(problem, common_contrast_fit, free_fit),
+    )
+    normalised_residual = ((predicted_voltages - np.asarray(measured_voltages)) / np.asarray(noise_deviation))[
+        is_used_channel
+    ]
+    order_by_support = np.argsort(-np.asarray(objective_ratios), kind="stable")
+    bodies_of_fit = [bodies.body(int(k), coefficients, objective_ratios[k]) for k in order_by_support]
     if accuracy is not None:
-        report("bodies, how large and how strong")
-        exact_data = independent_data(model, measured, used, accuracy.noise, at_once=True)[1]
-        mesh_correction = setting.bodies_problem.data.voltages - data.voltages  # due to the finer mesh
-        exact_data = eqx.tree_at(lambda data: data.voltages, exact_data, exact_data.voltages + mesh_correction)
-        unmodelled = unmodelled_deviations(problem, fitted, free_fit)
-        quantities = with_quantities(setting.weighted(exact_data).problem(level), fitted, accuracy, unmodelled, order)
-        quantities = [
-            include_deviation(values, body, *alternative_bodies[k])
-            for values, body, k in zip(quantities, bodies_of_fit, order, strict=True)
+        report_stage("bodies, how large and how strong")
+        exact_data = independent_data(model, measured_voltages, is_used_channel, accuracy.noise, at_once=True)[1]
+        # Due to the finer mesh.
+        mesh_correction = fit_setting.bodies_problem.data.voltages - independent_voltages.voltages
+        exact_data = eqx.tree_at(
+            lambda independent_voltages: independent_voltages.voltages,
+            exact_data,
+            exact_data.voltages + mesh_correction,
+        )
+        unmodelled_contrast_deviations = unmodelled_deviations(problem, common_contrast_fit, free_fit)
+        quantities_of_bodies = with_quantities(
+            fit_setting.weighted(exact_data).problem(level),
+            common_contrast_fit,
+            accuracy,
+            unmodelled_contrast_deviations,
+            order_by_support,
+        )
+        quantities_of_bodies = [
+            include_deviation(body_quantities, body, *alternative_bodies[k])
+            for body_quantities, body, k in zip(quantities_of_bodies, bodies_of_fit, order_by_support, strict=True)
         ]
-        bodies_of_fit = [body.with_quantities(values) for body, values in zip(bodies_of_fit, quantities, strict=True)]
+        bodies_of_fit = [
+            body.with_quantities(body_quantities)
+            for body, body_quantities in zip(bodies_of_fit, quantities_of_bodies, strict=True)
+        ]
     return ShapeReconstruction(
         bodies=tuple(bodies_of_fit),
         conductivity=as_array(conductivity),
-        voltages=as_array(predicted),
+        voltages=as_array(predicted_voltages),
         misfit=as_array(np.sqrt(np.mean(normalised_residual**2))),
         drift=float(np.expm1(prior.drift * coefficients[0])),
-        doubtful=doubtful,
-        contrast_deviations=tuple(deviations[k] for k in order),
-        alternatives=tuple(alternative_bodies[k][0] for k in order),
-        alternative_deviations=tuple(alternative_bodies[k][1] for k in order),
+        doubtful=doubtful_bodies,
+        contrast_deviations=tuple(deviations_of_contrast[k] for k in order_by_support),
+        alternatives=tuple(alternative_bodies[k][0] for k in order_by_support),
+        alternative_deviations=tuple(alternative_bodies[k][1] for k in order_by_support),
         finer=image,
     )
 
@@ -197,15 +230,15 @@ def reconstruct_shapes(
 def _check_start(start, dimension: int):
     """Signs (k,), centres (k, d) and radii (k,) of the bodies `start`. Raises `ValueError` for invalid starts."""
     try:
-        sign = np.array([body[0] for body in start], float)
+        signs_of_bodies = np.array([body[0] for body in start], float)
         centre = np.array([body[1] for body in start], float).reshape(-1, dimension)
         radius = np.array([body[2] for body in start], float)
     except (TypeError, ValueError, IndexError) as error:
-        coordinates = "x, y, z"[: 3 * dimension - 2]
-        raise ValueError(f"start: give (sign, ({coordinates}), radius), metres, for every body.") from error
-    if not (np.isin(sign, (-1, 1)).all() and np.isfinite(centre).all() and (radius > 0).all()):
+        names_of_coordinates = "x, y, z"[: 3 * dimension - 2]
+        raise ValueError(f"start: give (sign, ({names_of_coordinates}), radius), metres, for every body.") from error
+    if not (np.isin(signs_of_bodies, (-1, 1)).all() and np.isfinite(centre).all() and (radius > 0).all()):
         raise ValueError("start: signs are +1 or -1, centres finite and radii positive, metres.")
-    return sign, centre, radius
+    return signs_of_bodies, centre, radius
 
 
 class _FitSetting(NamedTuple):
@@ -243,11 +276,11 @@ class _FitSetting(NamedTuple):
         """
         while True:
             problem = self.problem(level)
-            fitted = problem.fit(bodies, coefficients, steps, COARSE_TOLERANCE)
-            best_level = level if self.other_changes is None else self.other_changes.most_likely_level(fitted)
+            shape_fit = problem.fit(bodies, coefficients, steps, COARSE_TOLERANCE)
+            best_level = level if self.other_changes is None else self.other_changes.most_likely_level(shape_fit)
             if best_level >= level:
-                return level, fitted, problem.negative_log_evidence(fitted) + problem.half_log_determinant
-            level, coefficients = best_level, fitted.coefficients
+                return level, shape_fit, problem.negative_log_evidence(shape_fit) + problem.half_log_determinant
+            level, coefficients = best_level, shape_fit.coefficients
 
 
 def _add_bodies(
@@ -259,48 +292,50 @@ def _add_bodies(
     `num_certain_bodies` are beyond doubt and are fitted together, because one of two bodies, fitted alone, would move
     to a place between the two.
     """
-    rows = bodies.rows(coefficients)
+    coefficient_rows = bodies.rows(coefficients)
     supported_indices, num_refused = list(range(num_certain_bodies)), 0
-    start = np.append(coefficients[0], rows[:num_certain_bodies])
-    level, fit, min_surprise = setting.fit_level(bodies.subset(supported_indices), start, 1.0, _NUM_FIRST_STEPS)
-    for k in range(num_certain_bodies, len(rows)):
-        start = np.append(fit.coefficients, rows[k])
-        new_level, new_fit, surprise = setting.fit_level(
-            bodies.subset([*supported_indices, k]), start, level, _NUM_FIRST_STEPS
+    start_coefficients = np.append(coefficients[0], coefficient_rows[:num_certain_bodies])
+    level, shape_fit, min_negative_log_evidence = setting.fit_level(
+        bodies.subset(supported_indices), start_coefficients, 1.0, _NUM_FIRST_STEPS
+    )
+    for k in range(num_certain_bodies, len(coefficient_rows)):
+        start_coefficients = np.append(shape_fit.coefficients, coefficient_rows[k])
+        new_level, new_fit, negative_log_evidence = setting.fit_level(
+            bodies.subset([*supported_indices, k]), start_coefficients, level, _NUM_FIRST_STEPS
         )
-        if surprise + MIN_EVIDENCE_GAIN <= min_surprise:
-            level, fit, min_surprise, supported_indices, num_refused = (
+        if negative_log_evidence + MIN_EVIDENCE_GAIN <= min_negative_log_evidence:
+            level, shape_fit, min_negative_log_evidence, supported_indices, num_refused = (
                 new_level,
                 new_fit,
-                surprise,
+                negative_log_evidence,
                 [*supported_indices, k],
                 0,
             )
         elif (num_refused := num_refused + 1) == _MAX_UNSUPPORTED_STARTS:
             break
-    return level, fit, supported_indices
+    return level, shape_fit, supported_indices
 
 
 class _SearchState(NamedTuple):
-    """State of the search: result `found` of fitting the bodies in a `setting`, with other changes at their
+    """State of the search: `search_result` of fitting the bodies in a `setting`, with other changes at their
     `level`."""
 
     setting: _FitSetting
     level: float
-    found: SearchResult
+    search_result: SearchResult
 
     @property
     def negative_log_evidence(self) -> float:
         """Negative log evidence of the bodies and of the level, up to a constant."""
         problem = self.setting.problem(self.level)
-        return problem.negative_log_evidence(self.found.fit) + problem.half_log_determinant
+        return problem.negative_log_evidence(self.search_result.fit) + problem.half_log_determinant
 
 
 def _fit_bodies(setting: _FitSetting, level: float, bodies: Bodies, coefficients, least_rise: float) -> _SearchState:
     """Fit all bodies together, with other changes at their `level`, and remove those that are not supported."""
     problem = setting.problem(level)
-    fitted = problem.fit(*grow_bodies(problem, bodies, coefficients, _NUM_FIRST_STEPS), STEPS)
-    return _SearchState(setting, level, remove_unsupported(problem, fitted, (), least_rise))
+    shape_fit = problem.fit(*grow_bodies(problem, bodies, coefficients, _NUM_FIRST_STEPS), STEPS)
+    return _SearchState(setting, level, remove_unsupported(problem, shape_fit, (), least_rise))
 
 
 def _refine_meshes(
@@ -315,55 +350,57 @@ def _refine_meshes(
     from jeit.inverse.shapes.finer_mesh import refine_at_surfaces
 
     base_setting, finer_model = state.setting, None
-    for refinement in range(_MAX_REFINEMENTS):
+    for refinement_index in range(_MAX_REFINEMENTS):
         _, level, (last_fit, objective_ratios, doubtful) = state
         if not len(last_fit.bodies.sign):
             break
-        report(f"bodies, finer mesh {refinement + 1}")
+        report(f"bodies, finer mesh {refinement_index + 1}")
         finer_model = refine_at_surfaces(
-            base_setting.bodies_problem, last_fit, _RELATIVE_EDGE_LENGTHS_BY_REFINEMENT[refinement > 0]
+            base_setting.bodies_problem, last_fit, _RELATIVE_EDGE_LENGTHS_BY_REFINEMENT[refinement_index > 0]
         )
-        setting, bodies, coefficients = (
+        refined_setting, bodies, coefficients = (
             base_setting.on(finer_model.problem),
             finer_model.bodies,
             last_fit.coefficients,
         )
-        costs = np.array(objective_ratios) * last_fit.cost
-        if refinement:
-            level, fit, _ = setting.fit_level(bodies, coefficients, level, STEPS)
+        costs_without_body = np.array(objective_ratios) * last_fit.cost
+        if refinement_index:
+            level, shape_fit, _ = refined_setting.fit_level(bodies, coefficients, level, STEPS)
         else:
-            order = np.argsort(-costs)
-            start = np.append(coefficients[0], bodies.rows(coefficients)[order])
-            num_certain_bodies = int((costs > CERTAIN_OBJECTIVE_RATIO * last_fit.cost).sum())
-            level, fit, supported_indices = _add_bodies(setting, bodies.subset(order), start, num_certain_bodies)
-            unsupported_indices = np.setdiff1d(np.arange(len(order)), supported_indices)
+            order_by_cost = np.argsort(-costs_without_body)
+            start_coefficients = np.append(coefficients[0], bodies.rows(coefficients)[order_by_cost])
+            num_certain_bodies = int((costs_without_body > CERTAIN_OBJECTIVE_RATIO * last_fit.cost).sum())
+            level, shape_fit, supported_indices = _add_bodies(
+                refined_setting, bodies.subset(order_by_cost), start_coefficients, num_certain_bodies
+            )
+            unsupported_indices = np.setdiff1d(np.arange(len(order_by_cost)), supported_indices)
             doubtful = (
                 *doubtful,
-                *(bodies.body(k, coefficients, objective_ratios[k]) for k in order[unsupported_indices]),
+                *(bodies.body(k, coefficients, objective_ratios[k]) for k in order_by_cost[unsupported_indices]),
             )
-            costs = costs[order[supported_indices]]
-            coefficients = np.append(coefficients[0], bodies.rows(coefficients)[order[supported_indices]])
-        problem = setting.problem(level)
-        fit = problem.fit(fit.bodies, fit.coefficients, STEPS)
-        result = remove_unsupported(problem, fit, doubtful, least_rise, costs)
-        if refinement == 0:
+            costs_without_body = costs_without_body[order_by_cost[supported_indices]]
+            coefficients = np.append(coefficients[0], bodies.rows(coefficients)[order_by_cost[supported_indices]])
+        problem = refined_setting.problem(level)
+        shape_fit = problem.fit(shape_fit.bodies, shape_fit.coefficients, STEPS)
+        search_result = remove_unsupported(problem, shape_fit, doubtful, least_rise, costs_without_body)
+        if refinement_index == 0:
             report("bodies, how many")
-            result = improve_fit(problem, result, least_rise)
-        elif refinement < _MAX_REFINEMENTS - 1:
-            result, other_fit = alternative_fits(problem, result)
+            search_result = improve_fit(problem, search_result, least_rise)
+        elif refinement_index < _MAX_REFINEMENTS - 1:
+            search_result, other_fit = alternative_fits(problem, search_result)
             if other_fit is not None:
-                result = remove_unsupported(problem, other_fit, result.doubtful, least_rise)
-        state, new_fit = _SearchState(setting, level, result), result.fit
-        if refinement and not bodies.left_refined_cells(coefficients, new_fit.bodies, new_fit.coefficients):
+                search_result = remove_unsupported(problem, other_fit, search_result.doubtful, least_rise)
+        state, new_fit = _SearchState(refined_setting, level, search_result), search_result.fit
+        if refinement_index and not bodies.left_refined_cells(coefficients, new_fit.bodies, new_fit.coefficients):
             break
     return state, finer_model
 
 
 def _with_common_contrast(problem: ShapeProblem, fitted: ShapeFit) -> ShapeFit:
     """Fit one material for all ellipsoids of a sign, if this is likelier than a material for each ellipsoid."""
-    for sign in (1, -1):
+    for contrast_sign in (1, -1):
         bodies = fitted.bodies
-        if isinstance(bodies, Ellipsoids) and ((bodies.sign == sign) & ~bodies.same_material).sum() > 1:
-            common_fit = problem.fit(*bodies.of_one_material(sign, fitted.coefficients), STEPS)
+        if isinstance(bodies, Ellipsoids) and ((bodies.sign == contrast_sign) & ~bodies.same_material).sum() > 1:
+            common_fit = problem.fit(*bodies.of_one_material(contrast_sign, fitted.coefficients), STEPS)
             fitted = min(fitted, common_fit, key=problem.negative_log_evidence)
     return fitted

@@ -75,16 +75,16 @@ class StarPrior(BodyPrior):
         """Prior standard deviations of the q parameters of a star, 1 for the contrast; `span`: longest side of the
         domain, metres."""
         mode_deviations = self.roughness * 2 / np.arange(2, self.modes + 1)
-        deviations = [self.place * span, self.place * span, self.radius_spread, 1.0]
-        return np.concatenate([deviations, np.repeat(mode_deviations, 2)])
+        coefficient_deviations = [self.place * span, self.place * span, self.radius_spread, 1.0]
+        return np.concatenate([coefficient_deviations, np.repeat(mode_deviations, 2)])
 
     def contrast_of(self, coefficient: float, other: bool) -> tuple[float, float]:
         """Contrast of a star in log σ, without its sign, and the derivative of the contrast with respect to its
         `coefficient`. The star is weak if `other`."""
         if not other:
             return self.contrast + self.contrast_spread * coefficient, self.contrast_spread
-        contrast = self.weak_contrast * np.exp(self.weak_spread * coefficient)
-        return contrast, self.weak_spread * contrast
+        body_contrast = self.weak_contrast * np.exp(self.weak_spread * coefficient)
+        return body_contrast, self.weak_spread * body_contrast
 
 
 class Star(Module):
@@ -116,7 +116,7 @@ class Star(Module):
     @property
     def area(self) -> float:
         """Area inside the outline, m²."""
-        return float(abs(self._moments()[0]))
+        return float(abs(self._area_moments()[0]))
 
     @property
     def measure(self) -> float:
@@ -132,34 +132,34 @@ class Star(Module):
     def with_quantities(self, known: Quantities) -> Star:
         """Copy of the body with the quantities `known`. Area and contrast become the medians, but the fitted outline
         does not change if the data do not determine how small a strong body is."""
-        scale = (
+        length_ratio = (
             1.0 if known.measure_interval[0] is None else np.sqrt(known.measure / max(self.area, MIN_POSITIVE_VALUE))
         )
-        outline = self.centroid + (self.outline - self.centroid) * scale
-        return replace(self, outline=outline, contrast=float(np.abs(np.log1p(known.change))), quantities=known)
+        scaled_outline = self.centroid + (self.outline - self.centroid) * length_ratio
+        return replace(self, outline=scaled_outline, contrast=float(np.abs(np.log1p(known.change))), quantities=known)
 
     @property
     def centroid(self) -> Float[np.ndarray, "2"]:
         """Centroid of the area inside the outline, (2,) metres."""
-        area, first = self._moments()
-        return first / area
+        area, first_moment = self._area_moments()
+        return first_moment / area
 
     def holds(self, points: Float[np.ndarray, "*n 2"]) -> Bool[np.ndarray, "*n"]:
         """Whether each of `points`, in metres, lies inside the body."""
-        corners, offsets = self._from_centre(self.outline), self._from_centre(points)
-        corner_angles = np.unwrap(np.angle(corners))
-        direction_angles = corner_angles[0] + (np.angle(offsets) - corner_angles[0]) % (2 * np.pi)
+        outline_offsets, point_offsets = self._from_centre(self.outline), self._from_centre(points)
+        corner_angles = np.unwrap(np.angle(outline_offsets))
+        direction_angles = corner_angles[0] + (np.angle(point_offsets) - corner_angles[0]) % (2 * np.pi)
         outline_distances = np.interp(
             direction_angles,
             np.append(corner_angles, corner_angles[0] + 2 * np.pi),
-            np.abs(np.append(corners, corners[0])),
+            np.abs(np.append(outline_offsets, outline_offsets[0])),
         )
-        return np.abs(offsets) < outline_distances
+        return np.abs(point_offsets) < outline_distances
 
     def _from_centre(self, points) -> Complex[np.ndarray, "*n"]:
         return (points[..., 0] - self.centre[0]) + 1j * (points[..., 1] - self.centre[1])
 
-    def _moments(self):
+    def _area_moments(self):
         x, y = self.outline.T
         cross_products = x * np.roll(y, -1) - np.roll(x, -1) * y
         return cross_products.sum() / 2, (self.outline + np.roll(self.outline, -1, axis=0)).T @ cross_products / 6
@@ -189,16 +189,29 @@ class Stars(Bodies):
     @classmethod
     def create(cls, mesh: Mesh, prior: BodyPrior, start, sign) -> Stars:
         """Create stars for a mesh, with starting centres `start` (k, 2), metres."""
-        points = np.asarray(mesh.points) @ np.array([1, 1j])
-        corners, edges = points[np.asarray(mesh.cells)], points[np.asarray(mesh.facets)]
-        span = float(np.ptp(np.asarray(mesh.points), axis=0).max())
+        complex_points = np.asarray(mesh.points) @ np.array([1, 1j])
+        corners, boundary_edges = complex_points[np.asarray(mesh.cells)], complex_points[np.asarray(mesh.facets)]
+        body_extent = float(np.ptp(np.asarray(mesh.points), axis=0).max())
         area = np.asarray(measures(mesh))
         start = np.reshape(np.asarray(start, float), (-1, 2))
-        width, weight = _RELATIVE_BLUR_WIDTH * np.sqrt(area), area / area.sum()
-        sign, false = np.asarray(sign, float), np.zeros(len(start), bool)
-        nans = np.full(len(start), np.nan)
-        points = corners @ _BARYCENTRIC_SAMPLES.T
-        return cls(prior, weight, span, start, sign, false, false, false, nans, points, width, edges)
+        blur_width, area_fractions = _RELATIVE_BLUR_WIDTH * np.sqrt(area), area / area.sum()
+        sign, none_true = np.asarray(sign, float), np.zeros(len(start), bool)
+        no_contrasts = np.full(len(start), np.nan)
+        complex_points = corners @ _BARYCENTRIC_SAMPLES.T
+        return cls(
+            prior,
+            area_fractions,
+            body_extent,
+            start,
+            sign,
+            none_true,
+            none_true,
+            none_true,
+            no_contrasts,
+            complex_points,
+            blur_width,
+            boundary_edges,
+        )
 
     @property
     def odds(self) -> float:
@@ -213,84 +226,101 @@ class Stars(Bodies):
     def with_other_kind(self, indices, coefficients) -> tuple[Stars, Float[np.ndarray, " n"]]:
         """Make the stars of `indices` weak, and enlarge them so that their effect on the electric field stays the same.
         Returns all stars and their coefficients."""
-        rows, is_weak = self.rows(coefficients), self.is_other_kind.copy()
+        coefficient_rows, is_weak = self.rows(coefficients), self.is_other_kind.copy()
         for k in indices:
-            strength = np.tanh(self.contrast(k, rows[k])[0] / 2) / np.tanh(self.prior.weak_contrast / 2)
-            strength = max(strength, _MIN_RELATIVE_EFFECT)  # of a star fitted with the other sign, it is negative
-            rows[k, 2] += np.log(strength) / 2 / self.prior.radius_spread
-            rows[k, 3], is_weak[k] = 0, True
-        return replace(self, is_other_kind=is_weak), np.append(coefficients[0], rows)
+            relative_strength = np.tanh(self.contrast(k, coefficient_rows[k])[0] / 2) / np.tanh(
+                self.prior.weak_contrast / 2
+            )
+            # Of a star fitted with the other sign, it is negative.
+            relative_strength = max(relative_strength, _MIN_RELATIVE_EFFECT)
+            coefficient_rows[k, 2] += np.log(relative_strength) / 2 / self.prior.radius_spread
+            coefficient_rows[k, 3], is_weak[k] = 0, True
+        return replace(self, is_other_kind=is_weak), np.append(coefficients[0], coefficient_rows)
 
     def mixed_log_conductivity(self, share, contrast):
         """log σ/σ₀ of partly covered cells, 2 artanh(share · tanh(contrast / 2)), by Maxwell Garnett's formula: a
         partly covered cell has `share` times the effect of a covered cell on the electric field. Also the derivatives
         with respect to `share` and `contrast`."""
-        strength = np.tanh(contrast / 2)
-        artanh_slope = 1 / (1 - (share * strength) ** 2)
-        return 2 * np.arctanh(share * strength), 2 * strength * artanh_slope, artanh_slope * share * (1 - strength**2)
+        relative_strength = np.tanh(contrast / 2)
+        artanh_slope = 1 / (1 - (share * relative_strength) ** 2)
+        return (
+            2 * np.arctanh(share * relative_strength),
+            2 * relative_strength * artanh_slope,
+            artanh_slope * share * (1 - relative_strength**2),
+        )
 
     def axis(self, k: int, row, number: int):
         """Unit vector along the longer axis of star k (`number` 0) or across it (1); along x or y for a disk."""
-        waves = self._values(k, row).waves
-        angle = number * np.pi / 2 - (np.angle(waves[0]) / 2 if len(waves) else 0)
+        wave_coefficients = self._star_values(k, row).waves
+        angle = number * np.pi / 2 - (np.angle(wave_coefficients[0]) / 2 if len(wave_coefficients) else 0)
         return np.array([np.cos(angle), np.sin(angle)])
 
     def body(self, k: int, coefficients, rise: float = np.nan) -> Star:
         """Star k, with its outline clipped to the domain."""
         row = self.rows(coefficients)[k]
-        centre, log_radius, waves = self._values(k, row)
-        direction = np.exp(2j * np.pi * np.arange(_NUM_OUTLINE_POINTS) / _NUM_OUTLINE_POINTS)
-        outline_distances = np.exp(log_radius + self._wave(waves, direction)[0])
-        edge_distances, is_inside = _first_crossing_distances(centre, direction, self.edges)
-        cells, share, _ = self.coverage(k, row)
-        if not is_inside and (covered_fractions := share * self.weight[cells]).sum() > 0:
-            outline = centre + direction * outline_distances
+        centre, log_radius, wave_coefficients = self._star_values(k, row)
+        outline_directions = np.exp(2j * np.pi * np.arange(_NUM_OUTLINE_POINTS) / _NUM_OUTLINE_POINTS)
+        outline_distances = np.exp(log_radius + self._radial_wave(wave_coefficients, outline_directions)[0])
+        edge_distances, is_inside = _first_crossing_distances(centre, outline_directions, self.edges)
+        cells, cell_shares, _ = self.coverage(k, row)
+        if not is_inside and (covered_fractions := cell_shares * self.weight[cells]).sum() > 0:
+            outline_positions = centre + outline_directions * outline_distances
             centre = covered_fractions @ self.points[cells].mean(axis=1) / covered_fractions.sum()
             outline_distances, _ = _first_crossing_distances(
-                centre, direction, np.stack([outline, np.roll(outline, -1)], axis=1)
+                centre, outline_directions, np.stack([outline_positions, np.roll(outline_positions, -1)], axis=1)
             )
-            edge_distances, _ = _first_crossing_distances(centre, direction, self.edges)
-        outline = centre + direction * np.minimum(outline_distances, edge_distances)
-        outline_points = np.stack([outline.real, outline.imag], axis=1)
+            edge_distances, _ = _first_crossing_distances(centre, outline_directions, self.edges)
+        outline_positions = centre + outline_directions * np.minimum(outline_distances, edge_distances)
+        outline_points = np.stack([outline_positions.real, outline_positions.imag], axis=1)
         centre_point = np.array([centre.real, centre.imag])
-        contrast = float(self.contrast(k, row)[0])
-        return Star(int(self.sign[k]), centre_point, outline_points, contrast, bool(self.is_other_kind[k]), float(rise))
+        body_contrast = float(self.contrast(k, row)[0])
+        return Star(
+            int(self.sign[k]), centre_point, outline_points, body_contrast, bool(self.is_other_kind[k]), float(rise)
+        )
 
-    def _values(self, k: int, row) -> _StarValues:
-        values = self.prior.deviation(self.span)[4:] * row[4:]
-        return _StarValues(complex(*self.centre(k, row)), self.log_radius(row), values[0::2] - 1j * values[1::2])
+    def _star_values(self, k: int, row) -> _StarValues:
+        wave_values = self.prior.deviation(self.span)[4:] * row[4:]
+        return _StarValues(
+            complex(*self.centre(k, row)), self.log_radius(row), wave_values[0::2] - 1j * wave_values[1::2]
+        )
 
-    def _wave(self, waves, direction):
+    def _radial_wave(self, wave_coefficients, direction):
         """Value of Σ (aₙ cos nθ + bₙ sin nθ) and its derivative with respect to θ, for `direction` exp iθ; and the
         powers exp inθ, n = 2 … N."""
         mode_numbers = np.arange(2, self.prior.modes + 1)
-        repeated = np.broadcast_to(direction, (self.prior.modes, *direction.shape))
-        powers = np.cumprod(repeated, axis=0, dtype=complex)[1:]
-        sums = np.tensordot(np.stack([waves, 1j * mode_numbers * waves]), powers, 1)
-        return sums[0].real, sums[1].real, powers
+        repeated_directions = np.broadcast_to(direction, (self.prior.modes, *direction.shape))
+        direction_powers = np.cumprod(repeated_directions, axis=0, dtype=complex)[1:]
+        wave_sums = np.tensordot(
+            np.stack([wave_coefficients, 1j * mode_numbers * wave_coefficients]), direction_powers, 1
+        )
+        return wave_sums[0].real, wave_sums[1].real, direction_powers
 
     def coverage(self, k: int, row) -> CellCoverage:
         """Coverage of cells by star k, whose coefficients are `row`."""
-        centre, log_radius, waves = self._values(k, row)
+        centre, log_radius, wave_coefficients = self._star_values(k, row)
         # Upper limit of the distance of the outline from the centre. The star does not cover cells that lie farther
         # outside than `_MAX_BLUR_DISTANCE` times the width of its blurred edge.
-        max_distance = np.exp(np.minimum(log_radius + np.abs(waves).sum(), np.log(10 * self.span)))
+        max_distance = np.exp(np.minimum(log_radius + np.abs(wave_coefficients).sum(), np.log(10 * self.span)))
         cells = np.flatnonzero(np.abs(self.points[:, 0] - centre) < max_distance + _MAX_BLUR_DISTANCE * self.width)
-        offset, width = self.points[cells] - centre, self.width[cells, None]
-        distance = np.maximum(np.abs(offset), 1e-9 * self.span)
-        direction = offset / distance
-        wave, slope, powers = self._wave(waves, direction)
-        radius = np.exp(np.minimum(log_radius + wave, np.log(10 * self.span)))
-        inside = 0.5 * (1 + np.tanh(0.5 * (radius - distance) / width))
-        share_slope = inside * (1 - inside) / width / len(_BARYCENTRIC_SAMPLES)  # d share / d(r - distance)
-        # If the centre moves by dz, the distance decreases by Re(dz/u) and θ by Im(dz/u) / distance; u is `direction`.
-        centre_slopes = (share_slope * (1 - 1j * radius * slope / distance) * direction).sum(axis=1)
+        centre_offset, blur_width = self.points[cells] - centre, self.width[cells, None]
+        distance_from_centre = np.maximum(np.abs(centre_offset), 1e-9 * self.span)
+        unit_direction = centre_offset / distance_from_centre
+        wave_of_direction, wave_slope, direction_powers = self._radial_wave(wave_coefficients, unit_direction)
+        radius = np.exp(np.minimum(log_radius + wave_of_direction, np.log(10 * self.span)))
+        inside_fraction = 0.5 * (1 + np.tanh(0.5 * (radius - distance_from_centre) / blur_width))
+        # d share / d(r - distance)
+        share_slope = inside_fraction * (1 - inside_fraction) / blur_width / len(_BARYCENTRIC_SAMPLES)
+        # If the centre moves by dz, the distance decreases by Re(dz/u) and θ by Im(dz/u) / distance, with the
+        # `unit_direction` u.
+        centre_slopes = (share_slope * (1 - 1j * radius * wave_slope / distance_from_centre) * unit_direction).sum(
+            axis=1
+        )
         radius_slopes = share_slope * radius
-        mode_slopes = np.einsum("ms,nms->mn", radius_slopes, powers)
-        share = inside.mean(axis=1)
-        columns = [centre_slopes.real, centre_slopes.imag, radius_slopes.sum(axis=1), np.zeros_like(share)]
-        columns += [part for mode in mode_slopes.T for part in (mode.real, mode.imag)]
-        return CellCoverage(cells, share, np.stack(columns, axis=1) * self.prior.deviation(self.span))
+        mode_slopes = np.einsum("ms,nms->mn", radius_slopes, direction_powers)
+        cell_shares = inside_fraction.mean(axis=1)
+        slope_columns = [centre_slopes.real, centre_slopes.imag, radius_slopes.sum(axis=1), np.zeros_like(cell_shares)]
+        slope_columns += [mode_component for mode in mode_slopes.T for mode_component in (mode.real, mode.imag)]
+        return CellCoverage(cells, cell_shares, np.stack(slope_columns, axis=1) * self.prior.deviation(self.span))
 
 
 def _first_crossing_distances(centre: complex, direction, edges) -> tuple[Float[np.ndarray, " k"], bool]:
@@ -298,13 +328,15 @@ def _first_crossing_distances(centre: complex, direction, edges) -> tuple[Float[
     the ray crosses none; and whether the closed line formed by the edges encloses `centre`."""
     edge_starts, edge_vectors = edges[:, 0] - centre, edges[:, 1] - edges[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        denominators = _cross_products(direction[:, None], edge_vectors)
-        distance, edge_fraction = (
-            _cross_products(edge_starts, edge_vectors) / denominators,
-            _cross_products(edge_starts, direction[:, None]) / denominators,
+        cross_products = _cross_products(direction[:, None], edge_vectors)
+        crossing_distance, edge_fraction = (
+            _cross_products(edge_starts, edge_vectors) / cross_products,
+            _cross_products(edge_starts, direction[:, None]) / cross_products,
         )
-    is_edge_crossed = (distance > 0) & (edge_fraction >= 0) & (edge_fraction < 1)
-    return np.where(is_edge_crossed, distance, np.inf).min(axis=1), bool((is_edge_crossed.sum(axis=1) % 2).mean() > 0.5)
+    is_edge_crossed = (crossing_distance > 0) & (edge_fraction >= 0) & (edge_fraction < 1)
+    return np.where(is_edge_crossed, crossing_distance, np.inf).min(axis=1), bool(
+        (is_edge_crossed.sum(axis=1) % 2).mean() > 0.5
+    )
 
 
 def _cross_products(first_vectors, second_vectors):

@@ -35,7 +35,7 @@ from jeit_solvers.module import Module
 MAX_STEPS_PER_FRAME = 4
 """Default maximum number of iterations per frame."""
 # Default tolerance of the solver.
-_RTOL = 1e-3
+_FRAME_TOLERANCE = 1e-3
 # Default minimum signal of a shape of the prior (see `Parametrisation.informative`).
 _MIN_SIGNAL = 0.03
 # Standard deviation assigned to masked channels, relative to the largest standard deviation of the noise. With a larger
@@ -153,48 +153,48 @@ class Imager(Module):
         """
         check_memory(memory)
         frame_solver = as_solver(GaussNewton() if solver is None else solver, frames=True).for_frames(
-            MAX_STEPS_PER_FRAME, _RTOL
+            MAX_STEPS_PER_FRAME, _FRAME_TOLERANCE
         )
         prior = smooth_prior(float(np.ptp(np.asarray(model.mesh.points), axis=0).max())) if prior is None else prior
         check_prior(prior)
         parametrisation = as_parametrisation(parametrisation)
         _check_combination(frame_solver, prior, parametrisation, memory)
         background = check_background(model, background)
-        predicted = model.voltages(background)
-        frame, is_used = check_frame(model, predicted if reference is None else reference, mask)
-        _check_reference(np.asarray(frame)[is_used], np.asarray(predicted)[is_used])
-        deviation = check_noise(noise, frame, is_used)
-        channels = IndependentChannels.create(model.protocol)
-        independent_model = model.with_protocol(model.protocol.subset(np.asarray(channels.index)))
+        predicted_voltages = model.voltages(background)
+        frame, is_used_channel = check_frame(model, predicted_voltages if reference is None else reference, mask)
+        _check_reference(np.asarray(frame)[is_used_channel], np.asarray(predicted_voltages)[is_used_channel])
+        noise_deviation = check_noise(noise, frame, is_used_channel)
+        independent_channels = IndependentChannels.create(model.protocol)
+        independent_model = model.with_protocol(model.protocol.subset(np.asarray(independent_channels.index)))
         inversion, _ = pose_least_squares(
             eqx.tree_at(
                 lambda forward_model: forward_model.electrodes,
                 independent_model,
                 IntegratedElectrodes(model.electrodes, model.mesh),
             ),
-            channels.weigh(_masked_noise(deviation, is_used)).combine(predicted),
+            independent_channels.weigh(_masked_noise(noise_deviation, is_used_channel)).combine(predicted_voltages),
             background,
             prior,
             hyperparameter,
             parametrisation,
         )
-        persistence = float(np.exp(-1 / memory)) if memory > 0 else 0.0
+        persistence_per_frame = float(np.exp(-1 / memory)) if memory > 0 else 0.0
         min_signal = _MIN_SIGNAL if parametrisation.informative is None else parametrisation.informative
         if (min_signal > 0 or memory > 0) and inversion.penalty.is_standard_normal:
-            inversion = keep_informed_shapes(inversion, min_signal, persistence)
+            inversion = keep_informed_shapes(inversion, min_signal, persistence_per_frame)
         return cls(
-            channels=channels,
+            channels=independent_channels,
             inversion=inversion,
-            noise=as_array(deviation),
-            mask=as_array(is_used),
-            expected=jnp.where(is_used, frame, predicted),
-            offset=jnp.where(is_used, predicted - frame, 0),
+            noise=as_array(noise_deviation),
+            mask=as_array(is_used_channel),
+            expected=jnp.where(is_used_channel, frame, predicted_voltages),
+            offset=jnp.where(is_used_channel, predicted_voltages - frame, 0),
             touching=jnp.asarray(
                 [model.protocol.channels_touching(electrode) for electrode in range(model.protocol.num_electrodes)]
             ),
             tied=jax.tree.map(as_array, model.protocol.reciprocal_pairs()),
             solver=frame_solver,
-            persistence=persistence,
+            persistence=persistence_per_frame,
         )
 
     def with_reference(self, reference: Float[Array | np.ndarray, " M"]) -> "Imager":
@@ -205,19 +205,22 @@ class Imager(Module):
         `ValueError` for a reference that has the wrong shape, lacks a reading of a channel in use, or differs from the
         model's voltages by a factor of ten or in sign.
         """
-        frame, is_used = np.asarray(reference, float), np.asarray(self.mask)
-        if frame.shape != is_used.shape:
+        frame, is_used_channel = np.asarray(reference, float), np.asarray(self.mask)
+        if frame.shape != is_used_channel.shape:
             raise ValueError(
-                f"reference has shape {frame.shape}; give ({is_used.size},), a frame of the undisturbed body."
+                f"reference has shape {frame.shape}; give ({is_used_channel.size},), a frame of the undisturbed body."
             )
-        if (missing_channels := np.flatnonzero(is_used & ~np.isfinite(frame))).size:
+        if (missing_channels := np.flatnonzero(is_used_channel & ~np.isfinite(frame))).size:
             raise ValueError(
                 f"reference has no reading of {counted(missing_channels.size, 'channel')} in use, the first number "
                 f"{missing_channels[0]}."
             )
-        predicted = np.asarray(self.expected) + np.asarray(self.offset)
-        _check_reference(frame[is_used], predicted[is_used])
-        new_fields = as_array(np.where(is_used, frame, predicted)), as_array(np.where(is_used, predicted - frame, 0))
+        predicted_voltages = np.asarray(self.expected) + np.asarray(self.offset)
+        _check_reference(frame[is_used_channel], predicted_voltages[is_used_channel])
+        new_fields = (
+            as_array(np.where(is_used_channel, frame, predicted_voltages)),
+            as_array(np.where(is_used_channel, predicted_voltages - frame, 0)),
+        )
         return eqx.tree_at(lambda imager: (imager.expected, imager.offset), self, new_fields)
 
     @property
@@ -228,7 +231,7 @@ class Imager(Module):
     @property
     def steps(self) -> int:
         """Maximum number of iterations per frame."""
-        return 1 if self.solver.is_linear else self.solver.descent(MAX_STEPS_PER_FRAME, _RTOL).history - 1
+        return 1 if self.solver.is_linear else self.solver.descent(MAX_STEPS_PER_FRAME, _FRAME_TOLERANCE).history - 1
 
     def weighing(self, usable: Bool[Array, " M"]) -> ChannelWeighting:
         """`ChannelWeighting` that maps frames to data in which only the `usable` channels have an effect."""
@@ -257,19 +260,19 @@ def _check_combination(solver: AbstractSolver, prior: AbstractPrior, parametrisa
         raise ValueError("memory: total variation has no covariance to carry on; take another prior, or memory 0.")
     if solver.is_linear and not prior.is_quadratic:
         raise ValueError("prior: total variation is not linear; take solver 'gauss-newton', or another prior.")
-    for name, value in (("bounds", parametrisation.bounds), ("unknowns", parametrisation.unknowns)):
-        if value:
+    for name, unsupported_option in (("bounds", parametrisation.bounds), ("unknowns", parametrisation.unknowns)):
+        if unsupported_option:
             raise ValueError(f"{name}: an Imager takes none, for its time a frame is bounded; take reconstruct.")
 
 
 def _check_reference(measured, predicted) -> None:
     """Check units and polarity of a reference frame. Raise `ValueError` if measured and predicted voltages differ by a
     factor of ten or in sign, which model errors do not explain."""
-    ratio = measured @ predicted / (predicted @ predicted)
-    if not 0.1 < ratio < 10:
+    voltage_ratio = measured @ predicted / (predicted @ predicted)
+    if not 0.1 < voltage_ratio < 10:
         raise ValueError(
-            f"reference: it is {ratio:.2g} times what the model predicts for the background; are both in SI units, and "
-            "the signs right? See calibrate."
+            f"reference: it is {voltage_ratio:.2g} times what the model predicts for the background; are both in SI "
+            "units, and the signs right? See calibrate."
         )
 
 
@@ -282,49 +285,61 @@ def _masked_noise(noise, is_used) -> Float[Array, " M"]:
 @numpy_or_compiled
 def _compute_linear_map(inversion: Inversion, weighing: ChannelWeighting, offset, persistence: float) -> LinearMap:
     xp = namespace(inversion, weighing, offset)
-    start = xp.zeros(inversion.num_coefficients)
+    zero_coefficients = xp.zeros(inversion.num_coefficients)
     problem = eqx.tree_at(lambda inverse_problem: inverse_problem.data, inversion, weighing.combine(offset))
-    residual, jacobian = problem.linearise(start)
+    residual, jacobian = problem.linearise(zero_coefficients)
     inverse_factor = inverse_cholesky((jacobian @ jacobian.T + problem.data.covariance)[None])[0]
-    gain = (inverse_factor.T @ (inverse_factor @ jacobian)).T
+    gain_matrix = (inverse_factor.T @ (inverse_factor @ jacobian)).T
     if inversion.num_coefficients <= len(residual):
-        shapes = xp.eye(inversion.num_coefficients)
-        carried_estimate_matrix = persistence * (shapes - gain @ jacobian)
+        unit_coefficients = xp.eye(inversion.num_coefficients)
+        carried_estimate_matrix = persistence * (unit_coefficients - gain_matrix @ jacobian)
     else:  # not reached with a memory: there are then no more shapes than data
-        shapes, gain = gain.T, xp.eye(len(residual))
-        carried_estimate_matrix = xp.zeros_like(gain)
-    matrix = expand_rows(inversion.basis, shapes).T * inversion.link.slope(inversion.reference)[:, None]
-    constant_image = inversion.link.conductivity(inversion.reference) - matrix @ (gain @ residual)
+        unit_coefficients, gain_matrix = gain_matrix.T, xp.eye(len(residual))
+        carried_estimate_matrix = xp.zeros_like(gain_matrix)
+    image_matrix = (
+        expand_rows(inversion.basis, unit_coefficients).T * inversion.link.slope(inversion.reference)[:, None]
+    )
+    constant_image = inversion.link.conductivity(inversion.reference) - image_matrix @ (gain_matrix @ residual)
     return LinearMap(
-        matrix, gain @ (weighing.weight[:, None] * weighing.estimator), constant_image, carried_estimate_matrix
+        image_matrix,
+        gain_matrix @ (weighing.weight[:, None] * weighing.estimator),
+        constant_image,
+        carried_estimate_matrix,
     )
 
 
 @jax.jit
-def _estimate_frame(imager: Imager, frame, weighing: ChannelWeighting, start) -> FrameEstimate:
-    data = weighing.combine(frame + imager.offset)
-    inversion = eqx.tree_at(lambda inverse_problem: inverse_problem.data, imager.inversion, data)
-    zero_mean = jnp.zeros_like(start)
+def _estimate_frame(imager: Imager, frame, weighing: ChannelWeighting, start_coefficients) -> FrameEstimate:
+    combined_data = weighing.combine(frame + imager.offset)
+    inversion = eqx.tree_at(lambda inverse_problem: inverse_problem.data, imager.inversion, combined_data)
+    zero_mean = jnp.zeros_like(start_coefficients)
     if imager.persistence > 0:  # the prior mean follows the last image, and the coefficients are relative to this mean
-        zero_mean, start = start, zero_mean
+        zero_mean, start_coefficients = start_coefficients, zero_mean
         inversion = eqx.tree_at(
             lambda inverse_problem: inverse_problem.reference, inversion, inversion.estimate(zero_mean)
         )
-    descent = imager.solver.descent(MAX_STEPS_PER_FRAME, _RTOL)
-    solution = optx.least_squares(
-        residual, descent, start, inversion, options={"expand": expand}, max_steps=imager.steps, throw=False
+    gauss_newton_descent = imager.solver.descent(MAX_STEPS_PER_FRAME, _FRAME_TOLERANCE)
+    solver_solution = optx.least_squares(
+        residual,
+        gauss_newton_descent,
+        start_coefficients,
+        inversion,
+        options={"expand": expand},
+        max_steps=imager.steps,
+        throw=False,
     )
     # The objective at the point reached by the last step is not known yet; it requires voltages but no Jacobian.
-    state = solution.state
-    cost = inversion.cost(state.trial)
-    is_trial_better = cost < state.cost
-    coefficients = jnp.where(is_trial_better, state.trial, solution.value)
-    penalty, min_cost = inversion.penalty.cost(coefficients), jnp.where(is_trial_better, cost, state.cost)
-    squared_misfit = 2 * (min_cost - penalty) + data.rest
+    descent_state = solver_solution.state
+    trial_cost = inversion.cost(descent_state.trial)
+    is_trial_better = trial_cost < descent_state.cost
+    coefficients = jnp.where(is_trial_better, descent_state.trial, solver_solution.value)
+    penalty, min_cost = inversion.penalty.cost(coefficients), jnp.where(is_trial_better, trial_cost, descent_state.cost)
+    squared_misfit = 2 * (min_cost - penalty) + combined_data.rest
     return FrameEstimate(
         conductivity=inversion.conductivity(coefficients),
         coefficients=zero_mean + coefficients,
         misfit=jnp.sqrt(squared_misfit / jnp.sum(weighing.noise <= jnp.max(imager.noise))),
-        iterations=state.num_accepted - 1 + is_trial_better,
-        converged=state.converged | (min_cost <= descent.atol),  # no step can lower the cost by more than its value
+        iterations=descent_state.num_accepted - 1 + is_trial_better,
+        converged=descent_state.converged
+        | (min_cost <= gauss_newton_descent.atol),  # no step can lower the cost by more than its value
     )

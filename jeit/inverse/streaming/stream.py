@@ -88,14 +88,19 @@ class FrameCheck:
     def __call__(self, frame):
         """Check a raw frame. Returns its voltages (M,), the mask (M,) of usable channels, the status, and the reason
         for the status as a sentence."""
-        values, usable, status, reason = self._inspect(frame)
+        frame_voltages, usable_channels, status, reason = self._inspect_frame(frame)
         if status == FrameStatus.REFUSED:
-            return values, usable, status, reason
-        change = np.where(usable, values - self.expected_voltages, 0)
-        if np.linalg.norm(change) <= _EQUALITY_TOLERANCE * self.expected_norm:
-            return values, usable, FrameStatus.UNCHANGED, f"{reason} It equals an undisturbed frame.".lstrip()
-        usable, noise_status, noise = self.check_noise_by_reciprocity(change, usable)
-        return values, usable, noise_status or status, f"{reason} {noise}".strip()
+            return frame_voltages, usable_channels, status, reason
+        voltage_change = np.where(usable_channels, frame_voltages - self.expected_voltages, 0)
+        if np.linalg.norm(voltage_change) <= _EQUALITY_TOLERANCE * self.expected_norm:
+            return (
+                frame_voltages,
+                usable_channels,
+                FrameStatus.UNCHANGED,
+                f"{reason} It equals an undisturbed frame.".lstrip(),
+            )
+        usable_channels, noise_status, noise = self.check_noise_by_reciprocity(voltage_change, usable_channels)
+        return frame_voltages, usable_channels, noise_status or status, f"{reason} {noise}".strip()
 
     def check_noise_by_reciprocity(self, change, usable) -> tuple[Bool[np.ndarray, " M"], FrameStatus | None, str]:
         """Compare the changes of reciprocal channels, which noise alone makes unequal. Returns the usable channels, and
@@ -108,15 +113,15 @@ class FrameCheck:
             self.pair_weights * change[self.second] / self.ratio,
         )
         # As in `jeit.data.quality.signal_evidence`: differences of reciprocal channels contain noise, sums also signal.
-        noise, power = (
+        noise, signal_power = (
             np.where(is_usable_pair, (first_changes - second_changes) ** 2, 0),
             np.sum((first_changes + second_changes)[is_usable_pair] ** 2),
         )
         noise_power, num_pairs = noise.sum(), np.count_nonzero(is_usable_pair)
-        has_signal = (power - noise_power) * np.sqrt(num_pairs) > 2 * _MIN_EVIDENCE_DEVIATIONS * noise_power
-        level = 2 * np.sum((self.pair_weights * self.expected_voltages[self.first])[is_usable_pair] ** 2)
-        if noise_power > _MAX_RELATIVE_NOISE**2 * level:
-            noise_fractions = np.sqrt(noise_power / level)
+        has_signal = (signal_power - noise_power) * np.sqrt(num_pairs) > 2 * _MIN_EVIDENCE_DEVIATIONS * noise_power
+        expected_power = 2 * np.sum((self.pair_weights * self.expected_voltages[self.first])[is_usable_pair] ** 2)
+        if noise_power > _MAX_RELATIVE_NOISE**2 * expected_power:
+            noise_fractions = np.sqrt(noise_power / expected_power)
             num_pairs_of_others = np.maximum((is_usable_pair & ~self.touching[:, self.first]).sum(axis=1), 1)
             noise_of_others = (noise * ~self.touching[:, self.first]).sum(axis=1) / num_pairs_of_others
             electrode = int(np.argmin(noise_of_others))
@@ -134,12 +139,12 @@ class FrameCheck:
         reason = "Nothing but noise: reciprocal channels change alike as by chance."
         return usable, FrameStatus.UNCHANGED, reason
 
-    def _inspect(self, frame):
+    def _inspect_frame(self, frame):
         no_usable_channels = np.zeros_like(self.mask)
         if np.ma.isMaskedArray(frame):
             frame = np.ma.filled(frame.astype(float), np.nan)
         try:
-            values = np.asarray(frame)
+            frame_voltages = np.asarray(frame)
         except ValueError:
             return (
                 no_usable_channels,
@@ -147,89 +152,99 @@ class FrameCheck:
                 FrameStatus.REFUSED,
                 f"The frame is ragged, not {self.mask.size} real voltages.",
             )
-        if values.dtype.kind in "US":
+        if frame_voltages.dtype.kind in "US":
             return (
-                values,
+                frame_voltages,
                 no_usable_channels,
                 FrameStatus.REFUSED,
                 f"The frame is text, not {self.mask.size} real voltages.",
             )
-        if values.shape != self.mask.shape or values.dtype.kind not in "iuf":
-            is_real_vector = values.ndim == 1 and values.dtype.kind in "iuf"
+        if frame_voltages.shape != self.mask.shape or frame_voltages.dtype.kind not in "iuf":
+            is_real_vector = frame_voltages.ndim == 1 and frame_voltages.dtype.kind in "iuf"
             shape_text = (
-                f"has {values.size} numbers" if is_real_vector else f"is {values.dtype} of shape {values.shape}"
+                f"has {frame_voltages.size} numbers"
+                if is_real_vector
+                else f"is {frame_voltages.dtype} of shape {frame_voltages.shape}"
             )
             reason = f"The frame {shape_text}, not {self.mask.size} real voltages."
-            return values, no_usable_channels, FrameStatus.REFUSED, reason
-        change = (values - self.expected_voltages)[self.mask]
-        if change @ change < self.max_ordinary_square:  # False for frames with NaN and for frames of zeros
-            return values, self.mask, FrameStatus.IMAGED, ""
-        finite = np.isfinite(values)
-        usable = self.mask if finite.all() else self.mask & finite
-        num_usable = np.count_nonzero(usable)
+            return frame_voltages, no_usable_channels, FrameStatus.REFUSED, reason
+        voltage_change = (frame_voltages - self.expected_voltages)[self.mask]
+        # False for frames with NaN and for frames of zeros.
+        if voltage_change @ voltage_change < self.max_ordinary_square:
+            return frame_voltages, self.mask, FrameStatus.IMAGED, ""
+        is_finite_voltage = np.isfinite(frame_voltages)
+        usable_channels = self.mask if is_finite_voltage.all() else self.mask & is_finite_voltage
+        num_usable = np.count_nonzero(usable_channels)
         if num_usable < _MIN_VALID_CHANNEL_SHARE * np.count_nonzero(self.mask):
             return (
-                values,
-                usable,
+                frame_voltages,
+                usable_channels,
                 FrameStatus.REFUSED,
                 f"Only {num_usable} of {np.count_nonzero(self.mask)} channels can be used.",
             )
-        if not values[usable].any():
+        if not frame_voltages[usable_channels].any():
             return (
-                values,
+                frame_voltages,
                 no_usable_channels,
                 FrameStatus.REFUSED,
                 "All channels read zero; the current source has failed.",
             )
-        difference = np.where(usable, values - self.expected_voltages, 0)
-        relative_change = np.linalg.norm(difference) / self.expected_norm
+        usable_change = np.where(usable_channels, frame_voltages - self.expected_voltages, 0)
+        relative_change = np.linalg.norm(usable_change) / self.expected_norm
         if relative_change > _SUSPICIOUS_RELATIVE_DIFFERENCE:
-            usable, reason = self._remove_dead_electrode(difference, usable)
+            usable_channels, reason = self._remove_dead_electrode(usable_change, usable_channels)
             if reason:
-                return values, usable, FrameStatus.PARTIAL, reason
-            if (is_saturated := self._saturated_channels(values, usable)).any():
-                return self._remove_saturated_channels(values, difference, usable, is_saturated)
+                return frame_voltages, usable_channels, FrameStatus.PARTIAL, reason
+            if (is_saturated := self._saturated_channels(frame_voltages, usable_channels)).any():
+                return self._remove_saturated_channels(frame_voltages, usable_change, usable_channels, is_saturated)
             if relative_change > _MAX_RELATIVE_DIFFERENCE:
                 reason = f"It differs by {relative_change:.0%} from an undisturbed frame: another sensor's, or a fault."
-                return values, no_usable_channels, FrameStatus.REFUSED, reason
+                return frame_voltages, no_usable_channels, FrameStatus.REFUSED, reason
         if num_usable < np.count_nonzero(self.mask):
             num_missing = int(np.count_nonzero(self.mask) - num_usable)
             reason = f"Left out: {counted(num_missing, 'channel')} without a reading."
-            return values, usable, FrameStatus.PARTIAL, reason
-        return values, usable, FrameStatus.IMAGED, ""
+            return frame_voltages, usable_channels, FrameStatus.PARTIAL, reason
+        return frame_voltages, usable_channels, FrameStatus.IMAGED, ""
 
-    def _remove_dead_electrode(self, difference, usable):
+    def _remove_dead_electrode(self, voltage_change, usable_channels):
         """Return the usable channels without the channels of a dead electrode, and a sentence that names the electrode.
         If no electrode is dead, return all usable channels and an empty string."""
-        total_change = np.linalg.norm(difference)
-        remaining_changes = np.array([np.linalg.norm(difference[usable & ~touching]) for touching in self.touching])
+        total_change = np.linalg.norm(voltage_change)
+        remaining_changes = np.array(
+            [np.linalg.norm(voltage_change[usable_channels & ~touching]) for touching in self.touching]
+        )
         # An electrode whose removal leaves too few channels, such as a common reference, cannot be left out.
-        remaining_changes[(usable & ~self.touching).sum(axis=1) < _MIN_VALID_CHANNEL_SHARE * self.mask.sum()] = np.inf
+        remaining_changes[
+            (usable_channels & ~self.touching).sum(axis=1) < _MIN_VALID_CHANNEL_SHARE * self.mask.sum()
+        ] = np.inf
         electrode = int(np.argmin(remaining_changes))
         if not np.isfinite(remaining_changes[electrode]):
-            return usable, ""
-        electrode_channels, channels_of_others = usable & self.touching[electrode], usable & ~self.touching[electrode]
+            return usable_channels, ""
+        electrode_channels, channels_of_others = (
+            usable_channels & self.touching[electrode],
+            usable_channels & ~self.touching[electrode],
+        )
         expected_channels = electrode_channels & (self.expected_voltages != 0)
         is_dead = (
             expected_channels.any()
-            and np.median(np.abs(difference[expected_channels]) / np.abs(self.expected_voltages[expected_channels]))
+            and np.median(np.abs(voltage_change[expected_channels]) / np.abs(self.expected_voltages[expected_channels]))
             > _MIN_DEAD_CHANGE
         )
         explains_change = remaining_changes[electrode] <= min(
             _MAX_REMAINING_SHARE * total_change, _MAX_RELATIVE_DIFFERENCE * self.expected_norm
         )
         if not (is_dead and explains_change):
-            return usable, ""
+            return usable_channels, ""
         return channels_of_others, f"Electrode {electrode + 1} seems to be dead; its channels are left out."
 
-    def _saturated_channels(self, values, usable):
+    def _saturated_channels(self, frame_voltages, usable_channels):
         """Mask (M,) of the channels at which the amplifier is saturated."""
-        is_far_from_expected = np.abs(values - self.expected_voltages) > _SUSPICIOUS_RELATIVE_DIFFERENCE * np.abs(
-            self.expected_voltages
-        )
-        is_saturated = np.zeros_like(usable)
-        for extreme_value in (values[usable].max(), values[usable].min()):
-            is_at_extreme = usable & (values == extreme_value)
+        is_far_from_expected = np.abs(
+            frame_voltages - self.expected_voltages
+        ) > _SUSPICIOUS_RELATIVE_DIFFERENCE * np.abs(self.expected_voltages)
+        is_saturated = np.zeros_like(usable_channels)
+        for extreme_value in (frame_voltages[usable_channels].max(), frame_voltages[usable_channels].min()):
+            is_at_extreme = usable_channels & (frame_voltages == extreme_value)
             if np.count_nonzero(is_at_extreme) < _MIN_SATURATED_CHANNELS or not extreme_value:
                 continue
             # Channels whose readings are equal by symmetry, as in simulated frames, are also equal in the undisturbed
@@ -242,27 +257,27 @@ class FrameCheck:
                 is_saturated |= is_at_extreme
         return is_saturated
 
-    def _remove_saturated_channels(self, values, difference, usable, is_saturated):
+    def _remove_saturated_channels(self, frame_voltages, voltage_change, usable_channels, is_saturated):
         remaining_channels, channel_count = (
-            usable & ~is_saturated,
+            usable_channels & ~is_saturated,
             counted(int(np.count_nonzero(is_saturated)), "channel"),
         )
         if np.count_nonzero(remaining_channels) < _MIN_VALID_CHANNEL_SHARE * np.count_nonzero(self.mask):
             return (
-                values,
+                frame_voltages,
                 remaining_channels,
                 FrameStatus.REFUSED,
                 f"Saturated: {channel_count} at the ends of the range.",
             )
-        if np.linalg.norm(difference[remaining_channels]) > _MAX_RELATIVE_DIFFERENCE * self.expected_norm:
+        if np.linalg.norm(voltage_change[remaining_channels]) > _MAX_RELATIVE_DIFFERENCE * self.expected_norm:
             return (
-                values,
+                frame_voltages,
                 remaining_channels,
                 FrameStatus.REFUSED,
                 f"Saturated: {channel_count}, and the others are far off too.",
             )
         return (
-            values,
+            frame_voltages,
             remaining_channels,
             FrameStatus.PARTIAL,
             f"Left out: {channel_count} at the ends of the range, saturated.",
@@ -336,9 +351,9 @@ def stream(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
 
 
 def _image_frames(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
-    state = StreamState(imager)
-    for number, frame in enumerate(frames):
-        yield state.image(number, frame)
+    stream_state = StreamState(imager)
+    for frame_index, frame in enumerate(frames):
+        yield stream_state.image(frame_index, frame)
 
 
 class StreamState:
@@ -368,20 +383,22 @@ class StreamState:
         self.check = FrameCheck(self.mask, self.expected, touching, reciprocal_pairs, noise)
         self.coefficients = np.asarray(imager.start)
         self.last = self.expected
-        self._weigh(self.mask)
-        self._estimate(self.expected)  # compiles
+        self._set_weighing(self.mask)
+        self._estimate_image(self.expected)  # compiles
         self.coefficients = np.asarray(imager.start)
 
     def image(self, number: int, frame: Any) -> FrameImage:
         """Image of the frame with this `number`, or the reason why the frame was refused."""
         start_time = time.perf_counter()
-        values, usable, status, reason = self.check(frame)
+        frame_voltages, usable, status, reason = self.check(frame)
         if status == FrameStatus.REFUSED:
             return FrameImage(number, None, status, reason, usable, np.nan, 0, time.perf_counter() - start_time)
         if usable is not self.usable and not np.array_equal(usable, self.usable):
-            self._weigh(usable)
-        filled_frame = values if usable is self.mask and self.is_unmasked else np.where(usable, values, self.last)
-        conductivity, misfit, iterations, converged = self._estimate(filled_frame)
+            self._set_weighing(usable)
+        filled_frame = (
+            frame_voltages if usable is self.mask and self.is_unmasked else np.where(usable, frame_voltages, self.last)
+        )
+        conductivity, misfit, iterations, has_converged = self._estimate_image(filled_frame)
         if not np.isfinite(conductivity).all():
             reason = "The image became NaN; the next frame starts from the background again."
             self.coefficients = np.asarray(self.imager.start)
@@ -389,7 +406,7 @@ class StreamState:
                 number, None, FrameStatus.REFUSED, reason, usable, np.nan, iterations, time.perf_counter() - start_time
             )
         self.last = filled_frame
-        if not converged and status in (FrameStatus.IMAGED, FrameStatus.UNCHANGED):
+        if not has_converged and status in (FrameStatus.IMAGED, FrameStatus.UNCHANGED):
             status = FrameStatus.STEP_LIMIT
             iteration_text = counted_iterations(iterations, self.imager.steps - iterations)
             reason = f"Stopped after {iteration_text}: this frame needs more than a frame is given."
@@ -397,9 +414,9 @@ class StreamState:
             number, conductivity, status, reason, usable, misfit, iterations, time.perf_counter() - start_time
         )
 
-    def _weigh(self, usable) -> None:
-        self.usable = usable
-        self.weighing = self.imager.weighing(jnp.asarray(usable))
+    def _set_weighing(self, usable_channels) -> None:
+        self.usable = usable_channels
+        self.weighing = self.imager.weighing(jnp.asarray(usable_channels))
         if self.imager.solver.is_linear:
             linear_map = self.imager.linear_map(self.weighing)
             # Reading the matrix takes most of the time of a linear image. The matrix multiplies differences, so single
@@ -410,14 +427,14 @@ class StreamState:
             self.carry_matrix = np.asarray(linear_map.carry)
             self.level = np.asarray(linear_map.level) + np.asarray(linear_map.matrix) @ self.expected_weights
 
-    def _estimate(self, frame):
+    def _estimate_image(self, frame):
         """Image a checked frame. Returns the conductivity, the misfit, the number of iterations, and whether the image
         converged."""
         if self.imager.solver.is_linear:
-            weights = self.estimator @ frame - self.expected_weights
+            coefficient_weights = self.estimator @ frame - self.expected_weights
             if self.imager.persistence > 0:
-                weights = self.coefficients = weights + self.carry_matrix @ self.coefficients
-            return self.level + self.matrix @ weights.astype(np.float32), np.nan, 1, True
+                coefficient_weights = self.coefficients = coefficient_weights + self.carry_matrix @ self.coefficients
+            return self.level + self.matrix @ coefficient_weights.astype(np.float32), np.nan, 1, True
         estimate = self.imager.estimate(frame, self.weighing, jnp.asarray(self.coefficients))
         self.coefficients = estimate.coefficients * (self.imager.persistence or 1.0)
         return (
