@@ -31,7 +31,7 @@ _take_double_precision()
 _keep_compiled_code()
 _refuse_compiled_code_in_forks()
 
-_find, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_load_attribute, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str):
@@ -39,4 +39,4 @@ def __getattr__(name: str):
         from importlib.metadata import version
 
         return version("jeit")
-    return _find(name)
+    return _load_attribute(name)

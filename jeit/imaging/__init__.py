@@ -13,5 +13,5 @@ import lazy_loader
 
 from jeit.arguments.moved_names import with_moved_names as _with_moved_names
 
-_find, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-__getattr__ = _with_moved_names(__name__, _find)
+_load_attribute, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__ = _with_moved_names(__name__, _load_attribute)

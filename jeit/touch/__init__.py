@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import lazy_loader
 
-_find, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_load_attribute, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str):
@@ -21,4 +21,4 @@ def __getattr__(name: str):
         from jeit.arguments.extras import import_optional
 
         import_optional("sklearn", name)
-    return _find(name)
+    return _load_attribute(name)
