@@ -32,11 +32,11 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jeit.arguments import check_has_values, check_key, check_kind
 from jeit.forward import ForwardModel
-from jeit.forward.model import evaluate, fields_and_impedance_of, jacobian_blocks
+from jeit.forward.model import check_model, evaluate, fields_and_impedance_of, jacobian_blocks
 from jeit.inverse.linearisation import used_channels
 from jeit.inverse.nonlinear.problem import Inversion, check_background
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
@@ -108,15 +108,7 @@ class Posterior(Module):
         """
         cell_measures = on_host(measures(self.inversion.model.mesh))
         is_in_region = np.zeros(cell_measures.size, bool)
-        check_has_values("cells", cells, "the region is made of", "choose them outside")
-        indices = np.asarray(cells)
-        if (indices.dtype == bool and indices.shape != is_in_region.shape) or indices.dtype.kind not in "iub":
-            raise ValueError(f"cells must be booleans ({cell_measures.size},), or indices of cells.")
-        if indices.dtype != bool and indices.size and (indices.min() < 0 or indices.max() >= cell_measures.size):
-            raise ValueError(f"cells must be indices from 0 to {cell_measures.size - 1}.")
-        is_in_region[indices] = True
-        if not is_in_region.any():
-            raise ValueError("cells: none is chosen; give at least one.")
+        is_in_region[_check_cells(cells, cell_measures.size)] = True
         region_weights = jnp.where(is_in_region, cell_measures, 0) / cell_measures[is_in_region].sum()
         mean, deviation_of_mean = _weighted_mean(self, region_weights)
         return (float(mean), float(deviation_of_mean)) if has_values(mean) else (mean, deviation_of_mean)
@@ -148,6 +140,20 @@ class Posterior(Module):
         prior_key, noise_key = jax.random.split(key)
         prior_draws = jax.random.normal(prior_key, (number, self.prior.num_draws(len(self.coefficients))))
         return as_array(_draw_samples(self, prior_draws, jax.random.normal(noise_key, (number, len(self.root)))))
+
+
+def _check_cells(cells: ArrayLike, num_cells: int) -> np.ndarray:
+    """Selected cells of a mesh, as indices or booleans. Raises `ValueError` for an empty selection, invalid indices and
+    traced cells."""
+    check_has_values("cells", cells, "the region is made of", "choose them outside")
+    selected = np.asarray(cells)
+    if (selected.dtype == bool and selected.shape != (num_cells,)) or selected.dtype.kind not in "iub":
+        raise ValueError(f"cells must be booleans ({num_cells},), or indices of cells.")
+    if selected.dtype != bool and selected.size and (selected.min() < 0 or selected.max() >= num_cells):
+        raise ValueError(f"cells must be indices from 0 to {num_cells - 1}.")
+    if not (selected.any() if selected.dtype == bool else selected.size):
+        raise ValueError("cells: none is chosen; give at least one.")
+    return selected
 
 
 def posterior(reconstruction: Reconstruction) -> Posterior:
@@ -323,7 +329,7 @@ def detectable_strength(
     background: ArrayLike,
     noise: Float[Array, " M"] | float,
     mask: Bool[Array, " M"] | None = None,
-    cells: Int[np.ndarray, " k"] | None = None,
+    cells: ArrayLike | None = None,
 ) -> Float[np.ndarray, " k"]:
     """Smallest strength (k,), in m² (3-D: m³), with which a small body in each cell is detected.
 
@@ -338,7 +344,7 @@ def detectable_strength(
     - `background`: conductivity without bodies, one number or (m,), S/m (2-D: S).
     - `noise`: standard deviation of a voltage difference, one number or (M,), volts.
     - `mask` (M,): True for usable channels.
-    - `cells` (k,): indices of the cells; default: all.
+    - `cells`: indices (k,) of the cells, or booleans (m,); default: all.
 
     Raises `ValueError` for invalid or traced arguments.
 
@@ -348,17 +354,20 @@ def detectable_strength(
     strength = detectable_strength(model, 1.0, noise=1e-6)
     ```
     """
-    check_has_values("detectable_strength", (model, background, noise), "it is computed in NumPy", "call it outside")
+    check_model(model)
+    check_has_values("detectable_strength", (model, background, noise), "it is computed from", "call it outside")
     conductivity = np.asarray(check_background(model, background))
     channel_indices, inverse_noise = used_channels(model, noise, mask)
     fields = evaluate(model, fields_and_impedance_of, conductivity)[0]
     mesh, protocol, fields = on_host((model.mesh, model.protocol.subset(channel_indices), fields))
     if cells is not None:
+        cells = _check_cells(cells, mesh.num_cells)
         mesh, conductivity = eqx.tree_at(lambda mesh: mesh.cells, mesh, mesh.cells[cells]), conductivity[cells]
     squared_norm = np.empty(mesh.num_cells)
     for cell_block, jacobian in jacobian_blocks(mesh, protocol, fields):
         squared_norm[cell_block] = np.square(inverse_noise) @ np.square(jacobian)
-    return _DETECTABLE_NORM * np.asarray(measures(mesh)) / (mesh.dimension * conductivity * np.sqrt(squared_norm))
+    with np.errstate(divide="ignore"):  # infinite where no channel in use is sensitive
+        return _DETECTABLE_NORM * np.asarray(measures(mesh)) / (mesh.dimension * conductivity * np.sqrt(squared_norm))
 
 
 def detectable_diameters(
@@ -382,6 +391,7 @@ def detectable_diameters(
     diameters = detectable_diameters(model, 1.0, noise=1e-6)
     ```
     """
+    check_model(model)
     num_cells, cells = model.mesh.num_cells, None
     if num_cells > _MAX_EXAMINED_CELLS:
         cells = np.sort(np.random.default_rng(0).choice(num_cells, _MAX_EXAMINED_CELLS, replace=False))

@@ -1,5 +1,6 @@
 """Smallest detectable bodies, against the voltages of small bodies on a finer mesh, and scaling laws."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -92,8 +93,22 @@ def test_a_small_body_in_a_solid():
         ({"noise": 0.0}, "noise must be positive"),
         ({"noise": np.ones(3)}, "noise has shape"),
         ({"mask": np.zeros(40, bool)}, "mask must be"),
+        ({"cells": [10**6]}, "cells must be indices from 0"),
+        ({"cells": [0.5]}, "cells must be booleans"),
+        ({"cells": []}, "cells must be booleans"),
+        ({"model": 3}, "model must be a ForwardModel"),
     ],
 )
 def test_bad_input(arguments, message, disk):
     with pytest.raises(ValueError, match=message):
-        detectable_strength(disk[0], **{"background": BACKGROUND, "noise": NOISE} | arguments)
+        detectable_strength(**{"model": disk[0], "background": BACKGROUND, "noise": NOISE} | arguments)
+
+
+def test_anything_but_a_model_is_refused():
+    with pytest.raises(ValueError, match="model must be a ForwardModel"):
+        detectable_diameters(None, 1.0, NOISE)  # pyright: ignore[reportArgumentType]
+
+
+def test_traced_noise_is_refused(disk):
+    with pytest.raises(ValueError, match=r"detectable_strength is traced.*call it outside"):
+        jax.jit(lambda noise: detectable_strength(disk[0], BACKGROUND, noise))(NOISE)
