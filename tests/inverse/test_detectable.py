@@ -13,7 +13,7 @@ from jeit.mesh import Disk, Solid, centroids, measures
 from jeit.protocol import adjacent
 
 NOISE, BACKGROUND = 1e-6, 0.3
-LIMIT = 8.0  # standard deviations
+LIMIT = 8.0  # standard deviations; the models have at most 64 channels
 DISK = np.pi * 0.1**2
 
 
@@ -83,6 +83,15 @@ def test_a_small_body_in_a_solid():
     voltages = np.asarray(model.voltages(BACKGROUND + change)) - np.asarray(model.voltages(BACKGROUND))
     cell_strength = float(measures(mesh)[500]) * 1e-3 / 3
     assert np.linalg.norm(voltages) / NOISE * strength / cell_strength == pytest.approx(LIMIT, rel=2e-3)
+
+
+def test_of_many_channels_the_root_mean_square_is_that_of_the_noise():
+    electrodes = BoundaryElectrodes(ring(0.1, 16), 0.01, 1e-3)
+    model = ForwardModel(Disk(0.1).mesh(num_points=400), electrodes, adjacent(16))
+    cell = np.array([20])
+    voltages = model.jacobian(BACKGROUND)[:, cell[0]] / np.asarray(measures(model.mesh))[cell] * 2 * BACKGROUND
+    strength = detectable_strength(model, BACKGROUND, NOISE, cells=cell)
+    assert np.sqrt(np.mean((strength * voltages / NOISE) ** 2)) == pytest.approx(1)
 
 
 @pytest.mark.parametrize(
