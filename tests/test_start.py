@@ -153,12 +153,12 @@ def test_oldest_entries_are_discarded_beyond_the_limits(tmp_path, monkeypatch):
         path.write_bytes(b"x" * 100)
         # The times of reading and of writing; the later one is that of the last use, and file 0 was used last.
         os.utime(path, (10 - number, 0) if number % 2 else (0, 10 - number))
-    monkeypatch.setattr(jax_setup, "_MAX_FILES", 4)
-    jax_setup._discard_oldest(tmp_path)
+    monkeypatch.setattr(jax_setup, "_MAX_CACHE_FILES", 4)
+    jax_setup._discard_oldest_programs(tmp_path)
     assert sorted(path.name[0] for path in tmp_path.rglob("*-cache")) == ["0", "1", "2", "3"]
     for limit, kept in ((300, ["0", "1", "2"]), (250, ["0", "1"])):
-        monkeypatch.setattr(jax_setup, "_MAX_BYTES", limit)
-        jax_setup._discard_oldest(tmp_path)
+        monkeypatch.setattr(jax_setup, "_MAX_CACHE_BYTES", limit)
+        jax_setup._discard_oldest_programs(tmp_path)
         assert sorted(path.name[0] for path in tmp_path.rglob("*-cache")) == kept
 
 
@@ -168,7 +168,7 @@ def test_empty_cache_entries_are_discarded(tmp_path):
     folder.mkdir()
     (folder / "full-cache").write_bytes(b"x")
     (folder / "empty-cache").write_bytes(b"")
-    jax_setup._discard_oldest(tmp_path)
+    jax_setup._discard_oldest_programs(tmp_path)
     assert [path.name for path in folder.iterdir()] == ["full-cache"]
 
 
@@ -256,17 +256,17 @@ def test_flags_for_quick_compilation_are_known_to_the_compiler(monkeypatch):
 def test_a_forked_process_refuses_to_compile_if_jax_had_started(monkeypatch):
     """The steps of a fork, in this process; `test_forks.py` forks."""
     jnp.ones(1)
-    assert jax_setup._has_started()
+    assert jax_setup._jax_has_started()
     registered, cleared = [], []
     monkeypatch.setattr(jax_setup, "_refuses_compilation", False)
     monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(True))
     monkeypatch.setattr(jax.monitoring, "register_event_duration_secs_listener", registered.append)
-    monkeypatch.setattr(jax_setup, "_has_started", lambda: False)
-    jax_setup._refuse_in_child()
+    monkeypatch.setattr(jax_setup, "_jax_has_started", lambda: False)
+    jax_setup._refuse_compilation_in_child()
     assert not registered
-    monkeypatch.setattr(jax_setup, "_has_started", lambda: True)
+    monkeypatch.setattr(jax_setup, "_jax_has_started", lambda: True)
     for _ in range(2):  # the child of a forked process
-        jax_setup._refuse_in_child()
+        jax_setup._refuse_compilation_in_child()
     assert (len(registered), len(cleared)) == (1, 1)
     registered[0]("/jax/backend/other", 0.1, device="cpu")
     with pytest.raises(RuntimeError, match="forked from one that had started JAX"):
@@ -277,7 +277,7 @@ def test_the_refusal_is_registered_where_processes_can_fork(monkeypatch):
     registered = []
     monkeypatch.setattr(os, "register_at_fork", lambda **hooks: registered.append(hooks), raising=False)
     jax_setup.refuse_compiled_code_in_forks()
-    assert registered == [{"after_in_child": jax_setup._refuse_in_child}]
+    assert registered == [{"after_in_child": jax_setup._refuse_compilation_in_child}]
     monkeypatch.delattr(os, "register_at_fork")  # as on Windows
     jax_setup.refuse_compiled_code_in_forks()
     assert len(registered) == 1

@@ -15,8 +15,8 @@ import numpy as np
 
 from jeit_solvers.engines import has_values
 
-# Types whose values are shown in error messages (of other values, only the type is shown), and maximum number of
-# characters of a value.
+# Types whose values are shown in error messages, and maximum number of characters of a shown value. For values of other
+# types, only the type is shown.
 _SHOWN_TYPES, _MAX_SHOWN_TEXT_LENGTH = (str, bytes, int, float, complex, type(None)), 60
 
 
@@ -30,29 +30,31 @@ def check_kind(name: str, value: Any, kind: type | tuple[type, ...], expected: s
 def is_number(value: Any) -> bool:
     """Whether the argument is one finite real number; a zero-dimensional array counts as a number, a boolean does
     not."""
-    number = _scalar(value)
+    number = _to_scalar(value)
     return isinstance(number, Real) and not isinstance(number, bool) and math.isfinite(number)
 
 
 def describe(value: Any) -> str:
     """Describe an argument in a few words: 'laplace', nan, a list, an array of float64 of shape (3,)."""
-    item = _scalar(value)
-    if isinstance(item, (np.ndarray, jax.Array)):
-        return f"an array of {item.dtype} of shape {item.shape}"
-    if isinstance(item, _SHOWN_TYPES):
+    described_value = _to_scalar(value)
+    if isinstance(described_value, (np.ndarray, jax.Array)):
+        return f"an array of {described_value.dtype} of shape {described_value.shape}"
+    if isinstance(described_value, _SHOWN_TYPES):
         try:
-            text = repr(item)
+            value_text = repr(described_value)
         except ValueError:
-            # An integer with more digits than Python converts to text.
+            # The integer has more digits than Python converts to text.
             return "a number without end"
-        return text if len(text) <= _MAX_SHOWN_TEXT_LENGTH else f"{text[: _MAX_SHOWN_TEXT_LENGTH - 1]}…"
-    if isinstance(item, type):
-        return f"the class {item.__name__} itself"
-    name = type(item).__name__
-    return f"{'an' if name[0] in 'AEIOU' else 'a'} {name}"
+        return (
+            value_text if len(value_text) <= _MAX_SHOWN_TEXT_LENGTH else f"{value_text[: _MAX_SHOWN_TEXT_LENGTH - 1]}…"
+        )
+    if isinstance(described_value, type):
+        return f"the class {described_value.__name__} itself"
+    type_name = type(described_value).__name__
+    return f"{'an' if type_name[0] in 'AEIOU' else 'a'} {type_name}"
 
 
-def _scalar(value: Any) -> Any:
+def _to_scalar(value: Any) -> Any:
     """Convert a zero-dimensional array to a Python scalar; everything else, including random keys, is returned
     unchanged."""
     if isinstance(value, (np.generic, np.ndarray, jax.Array)) and value.shape == () and hasattr(value.dtype, "kind"):
@@ -72,8 +74,8 @@ def real_array(name: str, argument: Any, expected: str) -> np.ndarray:
     return values.astype(float)
 
 
-# Percentages below this value are stated as "less than" this value.
-_MIN_PERCENT = 0.001
+# Minimum percentage that is stated as a number; for smaller percentages, the text is "less than" this value.
+_MIN_STATED_PERCENT = 0.001
 
 
 def counted(number: int, noun: str) -> str:
@@ -83,15 +85,15 @@ def counted(number: int, noun: str) -> str:
 
 
 def percent(value: float | None) -> str:
-    """Text of a ratio in per cent, with two significant digits, all digits before the decimal point, and no
-    exponent."""
+    """Text of a ratio in per cent, with two significant digits and without an exponent. All digits before the decimal
+    point are shown."""
     if value is None:
         return "not known"
     percentage = 100 * float(value)
     if not math.isfinite(percentage) or abs(percentage) >= 99.5:
         return f"{percentage:.0f} %"
-    if 0 < abs(percentage) < _MIN_PERCENT:
-        return f"less than {_MIN_PERCENT:g} %"
+    if 0 < abs(percentage) < _MIN_STATED_PERCENT:
+        return f"less than {_MIN_STATED_PERCENT:g} %"
     return f"{percentage:.2g} %"
 
 
@@ -105,20 +107,20 @@ Interval = tuple[float | None, float | None]
 
 
 def interval_text(interval: Interval, format_end: Callable[[float], str]) -> str:
-    """Text of an interval, whose limits `format_end` formats. If only one limit is known, the text is "at least" or "at
-    most" this limit. For a negative upper limit the text is "beyond" this limit, because "at most -90 %" might mean a
-    smaller decrease."""
-    lower_end, upper_end = interval
-    if lower_end is None:
-        if upper_end is None:
+    """Text of an interval whose limits are formatted by `format_end`. If only one limit is known, the text is "at
+    least" or "at most" followed by this limit. For a negative upper limit, "beyond" replaces "at most", because "at
+    most -90 %" could be read as a smaller decrease."""
+    lower_limit, upper_limit = interval
+    if lower_limit is None:
+        if upper_limit is None:
             return "not determined"
-        return f"{'beyond' if upper_end < 0 else 'at most'} {format_end(upper_end)}"
-    if upper_end is None:
-        return f"at least {format_end(lower_end)}"
-    return f"{format_end(lower_end)} to {format_end(upper_end)}"
+        return f"{'beyond' if upper_limit < 0 else 'at most'} {format_end(upper_limit)}"
+    if upper_limit is None:
+        return f"at least {format_end(lower_limit)}"
+    return f"{format_end(lower_limit)} to {format_end(upper_limit)}"
 
 
-# Maximum reading of any instrument, in volts or fractions of volts; squares of such numbers do not overflow.
+# Maximum plausible voltage reading of an instrument, in any unit; squares of such numbers do not overflow.
 _MAX_PLAUSIBLE_READING = 1e12
 
 
@@ -155,13 +157,13 @@ def check_metres(name: str, value: Any, maximum: float = np.inf, limit: str = ""
 
 
 def check_positive(name: str, value: float) -> None:
-    """Raises `ValueError` if `value` is not a finite number greater than zero."""
+    """Raise `ValueError` unless `value` is a finite number greater than zero."""
     if not (is_number(value) and value > 0):
         raise ValueError(f"{name} must be a positive number in SI units; it is {describe(value)}.")
 
 
 def check_not_negative(name: str, value: float) -> None:
-    """Raises `ValueError` if `value` is not a finite number greater than or equal to zero."""
+    """Raise `ValueError` unless `value` is a finite number greater than or equal to zero."""
     if not (is_number(value) and value >= 0):
         raise ValueError(f"{name} must be zero or positive; it is {describe(value)}.")
 
@@ -180,16 +182,16 @@ def did_you_mean(value: Any, names: Iterable[str]) -> str:
     if no name is similar."""
     known_names, lowercase_value = list(names), value.lower() if isinstance(value, str) else ""
     names_with_prefix = [name for name in known_names if lowercase_value and name.startswith(lowercase_value)]
-    matches = difflib.get_close_matches(lowercase_value, known_names, n=1) or names_with_prefix
-    return f" (did you mean {matches[0]!r}?)" if matches else ""
+    similar_names = difflib.get_close_matches(lowercase_value, known_names, n=1) or names_with_prefix
+    return f" (did you mean {similar_names[0]!r}?)" if similar_names else ""
 
 
 def names_text(names: Iterable[Any], max_names: int = 8) -> str:
     """One short line of text with the first `max_names` names, such as those of arrays in a file, and the number of
     remaining names."""
-    texts = [str(name) for name in names]
-    shown_texts = [name if len(name) <= 24 else f"{name[:23]}…" for name in texts[:max_names]]
-    remainder_text = f" and {len(texts) - max_names} more" if len(texts) > max_names else ""
+    name_texts = [str(name) for name in names]
+    shown_texts = [name if len(name) <= 24 else f"{name[:23]}…" for name in name_texts[:max_names]]
+    remainder_text = f" and {len(name_texts) - max_names} more" if len(name_texts) > max_names else ""
     return (", ".join(shown_texts) or "nothing") + remainder_text
 
 
@@ -204,8 +206,8 @@ def check_has_values(name: str, pytree: Any, argument_use: str, instead: str) ->
 
 
 def object_text(describe_object: Callable[[], str], instance: Any) -> str:
-    """Text of an object from `describe_object`; only the name of its class if `describe_object` fails, because JAX
-    temporarily replaces arrays by other objects."""
+    """Text of an object, from `describe_object`. If `describe_object` fails, which happens while JAX temporarily
+    replaces arrays by other objects, the text is the name of the object's class."""
     try:
         return describe_object()
     except Exception:

@@ -6,7 +6,7 @@ import importlib
 from importlib.util import find_spec
 from types import ModuleType
 
-# For each extra, the modules that are imported and the packages that contain them.
+# For each extra, the modules that jeit imports, and the installable package that contains each module.
 EXTRAS = {
     "mesh": {"gmsh": "gmsh"},
     "cad": {"ezdxf": "ezdxf"},
@@ -30,15 +30,15 @@ def require_extra(extra: str, task: str) -> None:
     for which the package is needed."""
     missing_packages = [package for module, package in EXTRAS[extra].items() if _is_missing(module)]
     if missing_packages:
-        names = " and ".join(", ".join(missing_packages).rsplit(", ", 1))
-        raise ImportError(f"{task} needs {names}: {installation_command(extra)}.")
+        package_names = " and ".join(", ".join(missing_packages).rsplit(", ", 1))
+        raise ImportError(f"{task} needs {package_names}: {installation_command(extra)}.")
 
 
 def import_optional(module: str, task: str, alternative: str = "") -> ModuleType:
     """Import a module of an optional package; `task` names the task for which the module is needed.
 
-    Raises `ImportError` if the import fails. The message states the reason, what to install, and the alternative
-    `alternative`.
+    Raises `ImportError` if the import fails. The message states the reason, the package to install, and, if it is
+    given, the `alternative` to the package.
     """
     try:
         return importlib.import_module(module)
@@ -63,5 +63,5 @@ def installation_command(extra: str) -> str:
 def _is_missing(module: str) -> bool:
     try:
         return find_spec(module) is None
-    except ValueError:  # the module is loaded without a specification, as in a test
+    except ValueError:  # the module is loaded but has no specification, as in a test
         return False

@@ -1,5 +1,5 @@
-"""Public names of version 0.2 that have moved. The old names work until version 1.1, with a `DeprecationWarning` that
-states the new name."""
+"""Public names of version 0.2 that have moved. The old names work until version 1.1; their use issues a
+`DeprecationWarning` that states the new name."""
 
 from __future__ import annotations
 
@@ -82,17 +82,19 @@ _RENAMED_NAMES_BY_MODULE = (
     ("jeit.touch.training", "jeit.touch.training", {"Trained": "TrainingResult"}),
 )
 MOVED = {
-    f"{page}.{old}": f"{home}.{new}" for page, home, names in _RENAMED_NAMES_BY_MODULE for old, new in names.items()
+    f"{old_module}.{old_name}": f"{new_module}.{new_name}"
+    for old_module, new_module, new_names in _RENAMED_NAMES_BY_MODULE
+    for old_name, new_name in new_names.items()
 } | {
-    f"{page}.{name}": f"{home}.{name}"
-    for page, homes in _MOVED_NAMES.items()
-    for home, names in homes.items()
-    for name in names.split()
+    f"{old_module}.{name}": f"{new_module}.{name}"
+    for old_module, names_by_module in _MOVED_NAMES.items()
+    for new_module, moved_names in names_by_module.items()
+    for name in moved_names.split()
 }
-"""New full name for each old full name."""
+"""New full name, such as "jeit.touch.Press", for each old full name."""
 
-# Modules that have moved as a whole.
-_MOVED_PAGES = {
+# New name of each module that has moved as a whole, by its old name.
+_MOVED_MODULES = {
     "jeit.electrodes.body_mesh": "jeit.electrodes.face_patches",
     "jeit.report.study": "jeit.design.reports",
     "jeit.simulate.acoustic": "jeit.acoustic.simulate",
@@ -109,17 +111,17 @@ def with_moved_names(page: str, find_current_name: Callable[[str], Any] | None =
 
     Modules of the package that have moved can still be imported under their old names.
     """
-    for old_module in _MOVED_PAGES:
+    for old_module in _MOVED_MODULES:
         if old_module.rpartition(".")[0] == page:
-            sys.modules[old_module] = module = ModuleType(old_module)
-            vars(module)["__getattr__"] = with_moved_names(old_module)
+            sys.modules[old_module] = empty_module = ModuleType(old_module)
+            vars(empty_module)["__getattr__"] = with_moved_names(old_module)
 
     def find_or_forward(name: str) -> Any:
-        old = f"{page}.{name}"
-        if old in MOVED:
-            return _forward(old, MOVED[old])
-        if page in _MOVED_PAGES and not name.startswith("__"):
-            return _forward(old, f"{_MOVED_PAGES[page]}.{name}")
+        old_full_name = f"{page}.{name}"
+        if old_full_name in MOVED:
+            return _import_moved_attribute(old_full_name, MOVED[old_full_name])
+        if page in _MOVED_MODULES and not name.startswith("__"):
+            return _import_moved_attribute(old_full_name, f"{_MOVED_MODULES[page]}.{name}")
         if find_current_name is None:
             raise AttributeError(f"module '{page}' has no attribute '{name}'", name=name, obj=sys.modules[page])
         return find_current_name(name)
@@ -127,8 +129,12 @@ def with_moved_names(page: str, find_current_name: Callable[[str], Any] | None =
     return find_or_forward
 
 
-def _forward(old: str, new: str) -> Any:
-    home, _, name = new.rpartition(".")
-    attribute = getattr(importlib.import_module(home), name)
-    warnings.warn(f"{old} is now {new}; the old name is removed in version 1.1.", DeprecationWarning, stacklevel=3)
+def _import_moved_attribute(old_full_name: str, new_full_name: str) -> Any:
+    new_module, _, name = new_full_name.rpartition(".")
+    attribute = getattr(importlib.import_module(new_module), name)
+    warnings.warn(
+        f"{old_full_name} is now {new_full_name}; the old name is removed in version 1.1.",
+        DeprecationWarning,
+        stacklevel=3,
+    )
     return attribute

@@ -24,8 +24,8 @@ from jeit.cli.options import (
 )
 from jeit.start import discard_damaged_cache_files, quick_compilation
 
-# Commands that run the same compiled program many times. Full optimisation by the compiler makes the computation of a
-# frame three times as fast.
+# Commands that run the same compiled program many times. If the compiler optimises fully, a frame is computed three
+# times as fast.
 _FULLY_OPTIMISED_COMMANDS = (
     "study",
     "live",
@@ -70,9 +70,9 @@ def _print_version_or_help(
     version: Annotated[bool, typer.Option("--version", help="Say which version this is.")] = False,
 ) -> None:
     if version:
-        from importlib.metadata import version as installed
+        from importlib.metadata import version as installed_version
 
-        typer.echo(f"jeit {installed('jeit')}")
+        typer.echo(f"jeit {installed_version('jeit')}")
     elif context.invoked_subcommand is None:
         typer.echo(context.get_help())
 
@@ -83,11 +83,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Exit status: 0 for success, 1 for an error in the data or in values of options, 2 for wrong usage of the command,
     130 if stopped. Errors are reported in one line on standard error; JEIT_DEBUG=1 shows the traceback instead.
     """
-    for output in (sys.stdout, sys.stderr):
-        if isinstance(output, io.TextIOWrapper):
-            output.reconfigure(errors="replace")  # avoids errors on terminals without Greek letters
+    for text_stream in (sys.stdout, sys.stderr):
+        if isinstance(text_stream, io.TextIOWrapper):
+            text_stream.reconfigure(errors="replace")  # avoids errors on terminals without Greek letters
     command_arguments = sys.argv[1:] if arguments is None else list(arguments)
-    command = run_as_command(command_arguments)
+    root_command = run_as_command(command_arguments)
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _create_warning_printer()
@@ -95,16 +95,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 _set_up_process(
                     compile_quickly=not " ".join(command_arguments[:2]).startswith(_FULLY_OPTIMISED_COMMANDS)
                 )
-            status = command.main(args=command_arguments, prog_name="jeit", standalone_mode=False)
-    except (KeyboardInterrupt, StoppedError) as stop:
+            exit_status = root_command.main(args=command_arguments, prog_name="jeit", standalone_mode=False)
+    except (KeyboardInterrupt, StoppedError) as stop_error:
         remove_empty_folders()
-        return _print_error(str(stop) or "stopped.", 130)
+        return _print_error(str(stop_error) or "stopped.", 130)
     except Exception as error:
         remove_empty_folders()
         if os.environ.get("JEIT_DEBUG"):
             raise
         return _report_error(error)
-    return status if isinstance(status, int) else 0
+    return exit_status if isinstance(exit_status, int) else 0
 
 
 def run_as_command(arguments: Sequence[str] = ()):
@@ -113,22 +113,22 @@ def run_as_command(arguments: Sequence[str] = ()):
     If the first of the `arguments` is the name of a command, only that command is imported.
     """
     command_name = arguments[0] if arguments else None
-    command = typer.main.get_command(application([command_name] if command_name in COMMANDS else COMMANDS))
-    _name_options(command)
-    return command
+    root_command = typer.main.get_command(application([command_name] if command_name in COMMANDS else COMMANDS))
+    _name_options_in_errors(root_command)
+    return root_command
 
 
-def _name_options(command) -> None:
+def _name_options_in_errors(command) -> None:
     """Make the error messages of all commands name options instead of Python arguments."""
     for subcommand in getattr(command, "commands", {}).values():
-        _name_options(subcommand)
-    options = {
+        _name_options_in_errors(subcommand)
+    option_names = {
         parameter.name: max(parameter.opts, key=len)
         for parameter in command.params
         if parameter.param_type_name == "option"
     }
-    if command.callback is not None and options:
-        command.callback = recording_input_files(naming_options_in_errors(options)(command.callback))
+    if command.callback is not None and option_names:
+        command.callback = recording_input_files(naming_options_in_errors(option_names)(command.callback))
     if command.callback is not None:
         command.callback = reporting_when_stopped(command.callback)
 
@@ -137,9 +137,9 @@ def _report_error(error: Exception) -> int:
     """Report an error in one line on standard error; return the exit status."""
     if hasattr(error, "format_message"):  # an error of click or typer about the usage of the command
         context = getattr(error, "ctx", None)
-        path = context.command_path if context is not None else "jeit"
+        command_path = context.command_path if context is not None else "jeit"
         message = error.format_message().rstrip(".")  # pyright: ignore[reportAttributeAccessIssue]
-        return _print_error(f"{message}. See '{path} --help'.", 2)
+        return _print_error(f"{message}. See '{command_path} --help'.", 2)
     if type(error).__name__ == "Abort":
         return _print_error("stopped.", 130)
     if isinstance(error, ValueError) or (isinstance(error, ImportError) and "pip install" in str(error)):
@@ -158,29 +158,30 @@ def _report_error(error: Exception) -> int:
     )
 
 
-def _print_error(message: str, status: int) -> int:
-    print(f"jeit: {_join_lines(message)}", file=sys.stderr)
-    return status
+def _print_error(message: str, exit_status: int) -> int:
+    print(f"jeit: {_format_on_one_line(message)}", file=sys.stderr)
+    return exit_status
 
 
-def _join_lines(message: str) -> str:
+def _format_on_one_line(message: str) -> str:
     """Convert an error message to one line of printable characters, shortened in the middle if it is too long."""
-    line = "".join(letter if letter.isprintable() else "�" for letter in " ".join(message.split()))
+    line = "".join(character if character.isprintable() else "�" for character in " ".join(message.split()))
     half_length = (_MAX_MESSAGE_LENGTH - 3) // 2
     return line if len(line) <= _MAX_MESSAGE_LENGTH else f"{line[:half_length]} … {line[-half_length:]}"
 
 
 def _create_warning_printer() -> Callable[..., None]:
-    """Create a function that prints each warning only once, because the same objects are often created repeatedly."""
+    """Create a function that prints each warning only once. Without it, warnings of objects that a command creates
+    repeatedly would be repeated."""
     printed_texts: set[str] = set()
 
     def show_warning(message, category, filename, lineno, file=None, line=None) -> None:
-        text = str(message)
+        warning_text = str(message)
         if issubclass(category, _DEVELOPER_WARNINGS) and not os.environ.get("JEIT_DEBUG"):
             return
-        if text not in printed_texts and not discard_damaged_cache_files(text):
-            printed_texts.add(text)
-            print(f"jeit: warning: {_join_lines(text)}", file=sys.stderr)
+        if warning_text not in printed_texts and not discard_damaged_cache_files(warning_text):
+            printed_texts.add(warning_text)
+            print(f"jeit: warning: {_format_on_one_line(warning_text)}", file=sys.stderr)
 
     return show_warning
 
@@ -191,6 +192,6 @@ def _set_up_process(*, compile_quickly: bool) -> None:
     user take precedence."""
     if compile_quickly:
         os.environ.setdefault("XLA_FLAGS", quick_compilation())
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # hides messages about fonts and unwritable folders
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # suppresses messages about fonts and unwritable folders
     # Imports and tracing create many small objects, which Python's garbage collector would scan repeatedly.
     gc.set_threshold(100_000, 20, 50)

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 _MAX_TABLE_WIDTH = 80
 # Minimum duration of a step, in seconds, for which the elapsed time is shown.
 _MIN_SHOWN_SECONDS = 2.0
-# Pattern of a progress text such as "12 of 60" (completed parts of a step), and minimum completed fraction at which the
-# remaining time is estimated. Texts such as "12 of at most 60" do not match.
-_PROGRESS_PATTERN, _MIN_SHARE_FOR_ESTIMATE = re.compile(r"(\d[\d,]*) of (\d[\d,]*)"), 0.05
+# Pattern of a progress text such as "12 of 60", the numbers of completed parts and of all parts of a step, which does
+# not match "12 of at most 60"; and minimum completed fraction of a step at which the remaining time is estimated.
+_PROGRESS_PATTERN, _MIN_COMPLETED_FRACTION = re.compile(r"(\d[\d,]*) of (\d[\d,]*)"), 0.05
 _SI_PREFIXES = ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n"))
 
 
@@ -47,33 +47,37 @@ class Steps:
     def __init__(self, console: Console, *, quiet: bool):
         self.console = console
         self.quiet = quiet
-        self._status = None
-        self._step = ""
-        self._start = 0.0
+        self._spinner = None
+        self._step_name = ""
+        self._step_start_time = 0.0
 
     def __call__(self, step: str) -> None:
-        self._finish()
-        self._step, self._start = step, time.perf_counter()
+        self._finish_step()
+        self._step_name, self._step_start_time = step, time.perf_counter()
         if not self.quiet:
-            self._status = self.console.status(_StepLine(f"{step} …", self._start))
-            self._status.start()
+            self._spinner = self.console.status(_StepLine(f"{step} …", self._step_start_time))
+            self._spinner.start()
 
     @property
     def current_step_name(self) -> str:
         """Name of the current step; empty before the first step."""
-        return self._step
+        return self._step_name
 
     def report(self, detail: str) -> None:
         """Show the progress within the current step beside its spinner; for a `detail` such as "frame 12 of 100", also
         the remaining time."""
-        if self._status is not None:
+        if self._spinner is not None:
             progress_match = _PROGRESS_PATTERN.search(detail)
-            num_finished, num_parts = (
-                (int(digits.replace(",", "")) for digits in progress_match.groups()) if progress_match else (0, 0)
+            num_completed_parts, num_parts = (
+                (int(number_text.replace(",", "")) for number_text in progress_match.groups())
+                if progress_match
+                else (0, 0)
             )
             current_time = time.perf_counter()
-            self._status.update(
-                _StepLine(f"{self._step} … {detail}", self._start, num_finished, num_parts, current_time)
+            self._spinner.update(
+                _StepLine(
+                    f"{self._step_name} … {detail}", self._step_start_time, num_completed_parts, num_parts, current_time
+                )
             )
 
     def __enter__(self) -> "Steps":
@@ -81,41 +85,48 @@ class Steps:
 
     def __exit__(self, kind, error, traceback) -> None:
         if kind is None:
-            self._finish()
-        elif self._status is not None:
-            self._status.stop()
+            self._finish_step()
+        elif self._spinner is not None:
+            self._spinner.stop()
 
-    def _finish(self) -> None:
-        if self._status is None:
+    def _finish_step(self) -> None:
+        if self._spinner is None:
             return
-        self._status.stop()
-        self._status = None
-        self.console.print(f"  {self._step:<24}{time.perf_counter() - self._start:6.1f} s", highlight=False)
+        self._spinner.stop()
+        self._spinner = None
+        self.console.print(
+            f"  {self._step_name:<24}{time.perf_counter() - self._step_start_time:6.1f} s", highlight=False
+        )
 
 
 @dataclass(frozen=True)
 class _StepLine:
-    """Line beside the spinner: the step, the time since its `start_time`, unless it is short, and, if `num_done` of its
-    `num_parts` parts are completed, an estimate of the remaining time."""
+    """Line beside the spinner: name of the step, time since its `start_time` if at least `_MIN_SHOWN_SECONDS`, and, if
+    `num_completed_parts` of its `num_parts` parts are completed, an estimate of the remaining time."""
 
-    step: str
+    step_name: str
     start_time: float
-    num_done: int = 0
+    num_completed_parts: int = 0
     num_parts: int = 0
-    latest_progress: float = 0.0
+    latest_progress_time: float = 0.0
 
     def __rich__(self) -> Text:
-        seconds = time.perf_counter() - self.start_time
-        text = f"{self.step}  {seconds:.0f} s" if seconds >= _MIN_SHOWN_SECONDS else self.step
-        if seconds >= _MIN_SHOWN_SECONDS and _MIN_SHARE_FOR_ESTIMATE * self.num_parts <= self.num_done < self.num_parts:
-            elapsed = self.latest_progress - self.start_time
-            seconds_left = max(elapsed * self.num_parts / self.num_done - seconds, 0)
-            text += f", about {_rounded_duration(seconds_left)} left"
-        return Text(text)
+        elapsed_seconds = time.perf_counter() - self.start_time
+        line_text = (
+            f"{self.step_name}  {elapsed_seconds:.0f} s" if elapsed_seconds >= _MIN_SHOWN_SECONDS else self.step_name
+        )
+        if (
+            elapsed_seconds >= _MIN_SHOWN_SECONDS
+            and _MIN_COMPLETED_FRACTION * self.num_parts <= self.num_completed_parts < self.num_parts
+        ):
+            duration_until_progress = self.latest_progress_time - self.start_time
+            seconds_left = max(duration_until_progress * self.num_parts / self.num_completed_parts - elapsed_seconds, 0)
+            line_text += f", about {_rounded_duration(seconds_left)} left"
+        return Text(line_text)
 
 
 def _rounded_duration(seconds: float) -> str:
-    """Format an estimated duration with one or two digits, which is the accuracy of the estimate."""
+    """Format an estimated duration with one or two digits, because the estimate is not more accurate."""
     if seconds < 100:
         return f"{seconds:.0f} s" if seconds < 10 else f"{5 * round(seconds / 5)} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
@@ -132,7 +143,7 @@ def name_value_table(title: str, rows: list[tuple[str, str]]) -> Table:
 
 
 def print_written_files(console: Console, first_path: Path, *other_names: str) -> None:
-    """Print the names of the written files: the `first_path` with its folder, the `other_names` without the folder."""
+    """Print the names of the written files: `first_path` with its folder, and `other_names` without the folder."""
     console.print(Text("Written:", "dim"), ", ".join([str(first_path), *other_names]), soft_wrap=True)
 
 
@@ -148,20 +159,26 @@ def format_with_unit(value: float | None, unit: str) -> str:
 
 
 def detectable_text(report: dict[str, Any]) -> str:
-    """Text on the smallest insulating bodies that are detected, from their entry in a report."""
-    diameters = report["diameter_almost_everywhere"], report["diameter_in_half_of_the_domain"]
-    almost_everywhere, median = (diameter if diameter and math.isfinite(diameter) else None for diameter in diameters)
-    if median is None:
+    """Text that states the diameters of the smallest insulating bodies that can be detected, from their entry in a
+    report."""
+    reported_diameters = report["diameter_almost_everywhere"], report["diameter_in_half_of_the_domain"]
+    almost_everywhere, median_diameter = (
+        diameter if diameter and math.isfinite(diameter) else None for diameter in reported_diameters
+    )
+    if median_diameter is None:
         return "none: the noise exceeds the voltages of an insulating body in half of the domain"
-    everywhere = "none" if almost_everywhere is None else f"{1e3 * almost_everywhere:.2g} mm"
-    return f"insulating, {1e3 * median:.2g} mm across in half of the domain, {everywhere} almost everywhere"
+    almost_everywhere_text = "none" if almost_everywhere is None else f"{1e3 * almost_everywhere:.2g} mm"
+    return (
+        f"insulating, {1e3 * median_diameter:.2g} mm across in half of the domain, "
+        f"{almost_everywhere_text} almost everywhere"
+    )
 
 
 def format_in_one_unit(values: list[float], unit: str) -> tuple[str, list[str]]:
     """Format the values of a table column in one unit, with the SI prefix that suits the largest value; return the unit
     and the formatted values."""
     max_value = float(f"{max((abs(value) for value in values), default=0.0):.3g}")
-    exponent, si_prefix = next((pair for pair in _SI_PREFIXES if max_value >= 10.0 ** pair[0]), _SI_PREFIXES[0])
+    exponent, si_prefix = next((prefix for prefix in _SI_PREFIXES if max_value >= 10.0 ** prefix[0]), _SI_PREFIXES[0])
     return f"{si_prefix}{unit}", [f"{value / 10.0**exponent:.3g}" for value in values]
 
 
@@ -171,14 +188,14 @@ def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str, *, background:
     `unit`: unit of conductivity. `background`: conductivity of the reference, if known.
     """
     unit, peaks = format_in_one_unit([inclusion.peak for inclusion in inclusions], unit)
-    noun, size_unit, digits = _size_format(inclusions)
-    columns_of_shares = ["of back-\nground"] if background else []
+    size_name, size_unit, num_decimals = _size_format(inclusions)
+    relative_columns = ["of back-\nground"] if background else []
     rows = []
     for inclusion, peak in zip(inclusions, peaks, strict=True):
-        cells_of_shares = [percent(inclusion.peak / background)] if background else []
-        rows.append([f"{1e6 * inclusion.area:.{digits}f}", peak, *cells_of_shares])
+        relative_cells = [percent(inclusion.peak / background)] if background else []
+        rows.append([f"{1e6 * inclusion.area:.{num_decimals}f}", peak, *relative_cells])
     return _create_inclusion_table(
-        inclusions, [f"{noun}\n/ {size_unit}", f"peak change\n/ {unit}", *columns_of_shares], rows
+        inclusions, [f"{size_name}\n/ {size_unit}", f"peak change\n/ {unit}", *relative_columns], rows
     )
 
 
@@ -189,32 +206,36 @@ def quantity_table(inclusions: "Sequence[Inclusion]", background: float) -> Tabl
     `background`: conductivity of the reference, S/m (2-D: S). If the data determine only one limit of an interval, only
     this limit is shown.
     """
-    noun, unit, _ = _size_format(inclusions)
+    size_name, size_unit, _ = _size_format(inclusions)
     rows = []
     for inclusion in inclusions:
-        size = format_with_interval(inclusion.area, inclusion.area_interval, lambda value: _three_digits(1e6 * value))
+        size_text = format_with_interval(
+            inclusion.area, inclusion.area_interval, lambda value: _format_three_digits(1e6 * value)
+        )
         relative_change = inclusion.peak / background
-        change = format_with_interval(
-            relative_change, inclusion.contrast_interval, lambda value: _three_digits(100 * value, "+")
+        change_text = format_with_interval(
+            relative_change, inclusion.contrast_interval, lambda value: _format_three_digits(100 * value, "+")
         )
-        strength = format_with_interval(
-            inclusion.strength, inclusion.strength_interval, lambda value: _three_digits(1e6 * value)
+        strength_text = format_with_interval(
+            inclusion.strength, inclusion.strength_interval, lambda value: _format_three_digits(1e6 * value)
         )
-        rows.append([size, change, strength])
-    table = _create_inclusion_table(inclusions, [f"{noun}\n/ {unit}", "change\n/ %", f"strength\n/ {unit}"], rows)
+        rows.append([size_text, change_text, strength_text])
+    table = _create_inclusion_table(
+        inclusions, [f"{size_name}\n/ {size_unit}", "change\n/ %", f"strength\n/ {size_unit}"], rows
+    )
     table.caption = "below: the 68 % radius of the place, and 68 % intervals"
     table.caption_justify = "left"
     return table
 
 
-def _three_digits(value: float, sign: str = "") -> str:
+def _format_three_digits(value: float, sign_format: str = "") -> str:
     """Format a number with three significant digits, and without an exponent below a million."""
-    return f"{float(f'{value:.3g}'):{sign}g}"
+    return f"{float(f'{value:.3g}'):{sign_format}g}"
 
 
 def format_with_interval(value: float | None, interval: Interval | None, format_value: Callable[[float], str]) -> str:
-    """Text of a value with its interval on the next line; only the interval if the data do not determine both of its
-    limits."""
+    """Text of a value with its interval on the next line. If the data do not determine both limits of the interval, the
+    text is the interval alone."""
     if value is None or interval is None:
         return "not known" if value is None else format_value(value)
     text = interval_text(interval, format_value)
@@ -222,8 +243,8 @@ def format_with_interval(value: float | None, interval: Interval | None, format_
 
 
 def _size_format(inclusions: "Sequence[Inclusion]") -> tuple[str, str, int]:
-    """Return the name of the size of inclusions, its unit, and its number of decimals. The same factor 1e6 converts
-    square metres to mm² and cubic metres to cm³."""
+    """Return the name of the size of inclusions ("area" or "volume"), its unit, and its number of decimals. The same
+    factor 1e6 converts square metres to mm² and cubic metres to cm³."""
     return ("volume", "cm³", 2) if any(inclusion.is_solid for inclusion in inclusions) else ("area", "mm²", 0)
 
 
@@ -240,10 +261,10 @@ def _create_inclusion_table(inclusions: "Sequence[Inclusion]", columns: list[str
             column.justify = "right"
         for inclusion, row in zip(inclusions, rows, strict=True):
             kind = f"{inclusion.kind}{separator}column" if inclusion.is_column else inclusion.kind
-            place = [f"{1e3 * value:.1f}" for value in inclusion.centroid]
+            position_cells = [f"{1e3 * value:.1f}" for value in inclusion.centroid]
             if inclusion.centroid_radius is not None:
-                place[-1] += f"\n±{1e3 * inclusion.centroid_radius:.2g}"
-            table.add_row(kind, *place, *row)
+                position_cells[-1] += f"\n±{1e3 * inclusion.centroid_radius:.2g}"
+            table.add_row(kind, *position_cells, *row)
         return table
 
     table_on_one_line = create_table(" ")

@@ -83,18 +83,22 @@ _OUTPUT_OPTIONS = ("output", "page", "film")
 
 
 def recording_input_files(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a command so that its input files are recorded; `make_folder` checks that no output overwrites them."""
+    """Wrap a command so that its input files are recorded. `make_folder` then checks that no output overwrites them."""
 
     @wraps(command)
-    def call(**values: Any) -> Any:
+    def call_command(**option_values: Any) -> Any:
         _INPUT_FILES.clear()
-        for name, value in values.items():
+        for name, option_value in option_values.items():
             with suppress(OSError, ValueError):
-                if name not in _OUTPUT_OPTIONS and isinstance(value, str | Path) and Path(value).is_file():
-                    _INPUT_FILES.append(Path(value))
-        return command(**values)
+                if (
+                    name not in _OUTPUT_OPTIONS
+                    and isinstance(option_value, str | Path)
+                    and Path(option_value).is_file()
+                ):
+                    _INPUT_FILES.append(Path(option_value))
+        return command(**option_values)
 
-    return call
+    return call_command
 
 
 class StoppedError(Exception):
@@ -105,26 +109,26 @@ def reporting_when_stopped(command: Callable[..., Any]) -> Callable[..., Any]:
     """Wrap a command so that Ctrl-C raises `StoppedError`, because typer does not report `KeyboardInterrupt`."""
 
     @wraps(command)
-    def call(*arguments: Any, **values: Any) -> Any:
+    def call_command(*arguments: Any, **option_values: Any) -> Any:
         try:
-            return command(*arguments, **values)
+            return command(*arguments, **option_values)
         except KeyboardInterrupt:
             raise StoppedError("stopped.") from None
 
-    return call
+    return call_command
 
 
 @contextmanager
 def naming_options_in_errors(options: dict[str, str]) -> Iterator[None]:
-    """Context manager that replaces names of Python arguments by names of `options` in error messages; see
-    `with_option_names`."""
+    """Context manager that replaces names of Python arguments by names of options in error messages, see
+    `with_option_names`. The keys of `options` are names of arguments, its values names of options."""
     try:
         yield
     except (ValueError, FileNotFoundError) as error:
         message = str(error)
-        if (renamed := with_option_names(message, options)) == message:
+        if (renamed_message := with_option_names(message, options)) == message:
             raise
-        raise ValueError(renamed) from error
+        raise ValueError(renamed_message) from error
 
 
 def read_file(
@@ -179,17 +183,17 @@ def with_option_names(message: str, options: dict[str, str]) -> str:
     """Replace names of Python arguments in an error message by names of options. Names are replaced at the beginning of
     the message, and where they are written as `name=`.
 
-    For options in millimetres, whose names end in "-mm", the question whether the user confused millimetres and metres
-    is removed.
+    For options in millimetres, whose names end in "-mm", the question in the message whether millimetres were confused
+    with metres is removed.
     """
     from jeit.arguments import MILLIMETRE_HINT
 
-    questions = MILLIMETRE_HINT, "are both in metres?"
+    unit_questions = MILLIMETRE_HINT, "are both in metres?"
 
     for argument, option in options.items():
         if message.startswith((f"{argument} ", f"{argument}:")):
-            for question in questions if option.endswith("-mm") else ():
-                message = message.replace(f"; {question}", ".")
+            for unit_question in unit_questions if option.endswith("-mm") else ():
+                message = message.replace(f"; {unit_question}", ".")
             message = option + message.removeprefix(argument)
         message = re.sub(rf"\b{argument}=(?!\w)", option, message)
     return message

@@ -1,6 +1,6 @@
 """Streams on the command line: frames from standard input, with times from a specified frame rate or from the clock;
-and the handling of Ctrl-C and SIGTERM. On these signals the frames received so far are written, and the exit status is
-128 plus the number of the signal."""
+and the handling of Ctrl-C and SIGTERM. When one of these signals arrives, the frames received so far are written, and
+the command ends with an exit status of 128 plus the number of the signal."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ from jeit.arguments import counted
 from jeit.cli.console import Steps
 from jeit.cli.options import remove_empty_folders
 
-# Minimum waiting time after which a frame counts as live, as a fraction of the usual interval between frames.
+# Minimum time that a live frame must be waited for, as a fraction of the usual interval between frames. Frames that
+# arrive sooner were buffered before reading began.
 _MIN_RELATIVE_WAITING_TIME = 0.4
-# Number of consecutive live frames after which no earlier frames are assumed to remain.
+# Number of consecutive live frames after which all buffered frames are assumed to have been read.
 _NUM_CONSECUTIVE_LIVE_FRAMES = 3
-# Maximum time in seconds for reading earlier frames.
+# Maximum time in seconds for reading frames that were buffered before reading began.
 _MAX_SKIPPING_DURATION = 5.0
 _STOPPING_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _END_OF_FRAMES = object()
@@ -52,102 +53,108 @@ class LiveFrames:
         rate."""
         if self.rate is not None:
             return self.rate
-        seconds = [second for second, _ in self.read_frames]
-        return (len(seconds) - 1) / seconds[-1] if len(seconds) > 1 and seconds[-1] > 0 else self.usual_rate
+        frame_times = [frame_time for frame_time, _ in self.read_frames]
+        return (
+            (len(frame_times) - 1) / frame_times[-1]
+            if len(frame_times) > 1 and frame_times[-1] > 0
+            else self.usual_rate
+        )
 
     def initial_frames(self, duration: float) -> Float[np.ndarray, "u M"]:
         """Read the frames (frames, channels) of the first `duration` seconds; iteration returns these frames again.
         Raises `ValueError` if there are none."""
         self._skip_earlier_frames()
         while not self.read_frames or self.read_frames[-1][0] < duration:
-            frame = self._next()
+            frame = self._next_frame()
             if frame is None:
                 break
-            self.read_frames.append((self._current_time(), frame))
-        rows = [frame for second, frame in self.read_frames if isinstance(frame, list) and second <= duration]
-        if not rows:
+            self.read_frames.append((self._next_frame_time(), frame))
+        numeric_frames = [
+            frame for frame_time, frame in self.read_frames if isinstance(frame, list) and frame_time <= duration
+        ]
+        if not numeric_frames:
             raise ValueError("standard input: there was no frame of numbers in it.")
-        frame_lengths = [len(row) for row in rows]
-        usual_width = max(set(frame_lengths), key=frame_lengths.count)
-        return np.array([row for row in rows if len(row) == usual_width])
+        channel_counts = [len(numeric_frame) for numeric_frame in numeric_frames]
+        usual_num_channels = max(set(channel_counts), key=channel_counts.count)
+        return np.array([numeric_frame for numeric_frame in numeric_frames if len(numeric_frame) == usual_num_channels])
 
     def __iter__(self) -> Iterator[tuple[float, object]]:
         self._skip_earlier_frames()
         yield from self.read_frames
-        while (frame := self._next()) is not None:
-            yield self._current_time(), frame
+        while (frame := self._next_frame()) is not None:
+            yield self._next_frame_time(), frame
 
     def _skip_earlier_frames(self) -> None:
         """Skip frames that arrived before reading began. If the input ends among these frames, none is skipped, and
         their times are computed from the usual rate."""
         if not self.by_clock:
             return
-        skipped_frames, num_consecutive, start = [], 0, time.monotonic()
-        while time.monotonic() - start < _MAX_SKIPPING_DURATION:
+        skipped_frames, num_live_frames, skipping_start_time = [], 0, time.monotonic()
+        while time.monotonic() - skipping_start_time < _MAX_SKIPPING_DURATION:
             wait_start_time = time.monotonic()
-            frame = self._next()
+            frame = self._next_frame()
             if frame is None:
                 self.rate = self.measured_rate
                 self.num_returned = len(self.read_frames)
                 self.by_clock = False
-                self.read_frames += [(self._current_time(), skipped_frame) for skipped_frame in skipped_frames]
+                self.read_frames += [(self._next_frame_time(), skipped_frame) for skipped_frame in skipped_frames]
                 return
-            num_consecutive = (
-                num_consecutive + 1
+            num_live_frames = (
+                num_live_frames + 1
                 if time.monotonic() - wait_start_time > _MIN_RELATIVE_WAITING_TIME / self.usual_rate
                 else 0
             )
-            if num_consecutive == _NUM_CONSECUTIVE_LIVE_FRAMES:
+            if num_live_frames == _NUM_CONSECUTIVE_LIVE_FRAMES:
                 self.left_out += len(skipped_frames)
-                self.read_frames.append((self._current_time(), frame))
+                self.read_frames.append((self._next_frame_time(), frame))
                 return
             skipped_frames.append(frame)
         self.left_out += len(skipped_frames)
 
-    def _current_time(self) -> float:
-        now = time.monotonic()
-        self.first_time = now if self.num_returned == 0 else self.first_time
-        second = now - self.first_time if self.by_clock else self.num_returned / self.measured_rate
+    def _next_frame_time(self) -> float:
+        current_time = time.monotonic()
+        self.first_time = current_time if self.num_returned == 0 else self.first_time
+        frame_time = current_time - self.first_time if self.by_clock else self.num_returned / self.measured_rate
         self.num_returned += 1
-        return max(second, self.read_frames[-1][0] if self.read_frames else 0.0)
+        return max(frame_time, self.read_frames[-1][0] if self.read_frames else 0.0)
 
-    def _next(self) -> object | None:
+    def _next_frame(self) -> object | None:
         """Wait for the next frame, and return it; None after the last frame."""
         return next(self.lines, None)
 
 
 class _StoppedError(Exception):
-    """Error raised to skip the remaining work when a stream was stopped."""
+    """Error raised to skip the drawing of pictures when a signal has stopped a stream."""
 
 
 class StreamStopper:
     """Context manager that stops a stream on Ctrl-C and SIGTERM: the iterator of `frames_until_signal` ends after the
-    current frame, or at once while waiting for the next frame. A second signal, or a signal before the first frame,
-    stops the command at once."""
+    current frame, or immediately if it waits for the next frame. A second signal, or a signal before the first frame,
+    stops the command immediately."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
-        self._streaming, self._waiting = False, False
-        self._earlier_handlers: dict[int, Any] = {}
+        self._is_streaming, self._is_waiting = False, False
+        self._earlier_signal_handlers: dict[int, Any] = {}
 
     def frames_until_signal(self, frames: Iterable) -> Iterator:
         """Iterate over the frames until a signal arrives."""
-        self._streaming = True
-        source = iter(frames)
+        self._is_streaming = True
+        frame_iterator = iter(frames)
         try:
             while True:
-                self._waiting = True
+                self._is_waiting = True
                 if self.signal is not None:
                     return
-                frame = next(source, _END_OF_FRAMES)
-                self._waiting = False
+                frame = next(frame_iterator, _END_OF_FRAMES)
+                self._is_waiting = False
                 if frame is _END_OF_FRAMES:
                     return
                 yield frame
         except KeyboardInterrupt:
             return
         finally:
-            self._waiting = False
+            self._is_waiting = False
 
     def drawing_reporter(self, picture_names: Sequence[str], step: Steps) -> Callable[[str], None]:
         """Create a function that reports writing and drawing as steps, and raises `_StoppedError` before drawing if a
@@ -177,13 +184,13 @@ class StreamStopper:
         except KeyboardInterrupt:
             if self.signal is None or frame_counter.number:
                 raise
-            files_hint = ""  # stopped during compilation, before the first frame
+            files_hint = ""  # the command was stopped before the first frame, during compilation
         if self.signal is not None:
-            self._end(f" after {counted(frame_counter.number, 'frame')}{files_hint}")
+            self._exit_command(f" after {counted(frame_counter.number, 'frame')}{files_hint}")
 
-    def _end(self, detail: str) -> NoReturn:
+    def _exit_command(self, message_end: str) -> NoReturn:
         remove_empty_folders()
-        print(f"jeit: stopped{detail}.", file=sys.stderr)
+        print(f"jeit: stopped{message_end}.", file=sys.stderr)
         raise typer.Exit(128 + (self.signal or 0))
 
     def __enter__(self) -> "StreamStopper":
@@ -193,36 +200,36 @@ class StreamStopper:
                 for signal_number in _STOPPING_SIGNALS
                 if signal.getsignal(signal_number) is not signal.SIG_IGN
             ]
-            self._earlier_handlers = {
-                signal_number: signal.signal(signal_number, self._stop) for signal_number in handled_signals
+            self._earlier_signal_handlers = {
+                signal_number: signal.signal(signal_number, self._handle_signal) for signal_number in handled_signals
             }
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_) -> None:
-        for signal_number, handler in self._earlier_handlers.items():
+        for signal_number, handler in self._earlier_signal_handlers.items():
             signal.signal(signal_number, handler)
         if kind is KeyboardInterrupt and self.signal is not None:
-            self._end("")
+            self._exit_command("")
 
-    def _stop(self, signal_number: int, _) -> None:
-        stops_immediately = self.signal is not None or self._waiting or not self._streaming
+    def _handle_signal(self, signal_number: int, _) -> None:
+        stops_immediately = self.signal is not None or self._is_waiting or not self._is_streaming
         self.signal = signal_number
         if stops_immediately:
             raise KeyboardInterrupt
 
 
 class FrameCounter:
-    """Counter of frames that reports the number of frames received a few times per second. `number`: total number of
+    """Counter of received frames, which reports their number a few times per second. `num_frames`: total number of
     frames, if known."""
 
     def __init__(self, step: Steps, num_frames: int | None = None):
-        self._step, self._total_text = step, "" if num_frames is None else f" of {num_frames:,}"
-        self.number, self._last_report = 0, 0.0
+        self._steps, self._total_text = step, "" if num_frames is None else f" of {num_frames:,}"
+        self.number, self._last_report_time = 0, 0.0
 
     def count_frame(self) -> None:
         """Count a frame."""
         self.number += 1
         current_time = time.monotonic()
-        if current_time - self._last_report > _FRAME_COUNT_INTERVAL:
-            self._last_report = current_time
-            self._step.report(f"frame {self.number:,}{self._total_text}")
+        if current_time - self._last_report_time > _FRAME_COUNT_INTERVAL:
+            self._last_report_time = current_time
+            self._steps.report(f"frame {self.number:,}{self._total_text}")

@@ -20,14 +20,14 @@ from jeit.files import atomically_written_files
 from jeit.inverse import DetectableDiameters
 from jeit.mesh import Body
 
-# Handling of characters that cannot be encoded, such as invalid bytes in the names of files.
+# Error handler of `str.encode` for characters that cannot be encoded, such as invalid bytes in the names of files.
 _ENCODING_ERRORS = "backslashreplace"
 
 
 @contextmanager
 def results(folder: str | Path, names: tuple[str, ...]) -> Iterator[Path]:
-    """Context manager with a temporary folder for files of the given `names`. The files are moved to `folder` together
-    once all of them are written; `folder` is created if needed. Raises `ValueError` if the path `folder` cannot be a
+    """Context manager that yields a temporary folder for files with the given `names`. When all files are written, they
+    are moved to `folder` together; `folder` is created if needed. Raises `ValueError` if the path `folder` cannot be a
     folder."""
     with atomically_written_files(results_folder(folder, names)) as temporary_folder:
         yield temporary_folder
@@ -35,21 +35,21 @@ def results(folder: str | Path, names: tuple[str, ...]) -> Iterator[Path]:
 
 def write_json(report: dict[str, Any], path: Path) -> None:
     """Write a report of plain numbers, strings, lists and dictionaries as JSON."""
-    text = json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False)
-    path.write_text(text + "\n", "utf-8", errors=_ENCODING_ERRORS)
+    json_text = json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False)
+    path.write_text(json_text + "\n", "utf-8", errors=_ENCODING_ERRORS)
 
 
 def write_rows(path: Path, columns: Sequence[str], rows: Iterable[Iterable[Any]]) -> None:
     """Write a table as CSV, with the names of its `columns` in the first line."""
     with path.open("w", newline="", encoding="utf-8", errors=_ENCODING_ERRORS) as file:
-        table = csv.writer(file)
-        table.writerow(columns)
-        table.writerows(rows)
+        csv_writer = csv.writer(file)
+        csv_writer.writerow(columns)
+        csv_writer.writerows(rows)
 
 
 def results_folder(folder: str | Path, names: tuple[str, ...]) -> Path:
-    """Check the folder for files of the given `names`, and create it if needed. Raises `ValueError` if the folder
-    cannot be written to, or contains a folder of one of these names."""
+    """Check that files with the given `names` can be written to the folder, and create it if needed. Raises
+    `ValueError` if the folder cannot be written to, or contains a folder with one of these names."""
     path = Path(folder)
     if path.exists() and not path.is_dir():
         raise ValueError(f"folder {path} is a file; give a folder for the results.")
@@ -85,15 +85,15 @@ def describe_domain(domain: Body | None) -> dict[str, Any]:
 
 
 def describe_electrodes(electrodes: AbstractElectrodes | None) -> dict[str, Any]:
-    """Describe electrodes by their kind, number, places and sizes in metres."""
+    """Describe electrodes by their kind and number, and by their positions and sizes in metres."""
     if electrodes is None:
         return {"kind": "at places not known"}
     return to_plain_values(electrodes.describe())
 
 
 def describe_detectable(diameters: DetectableDiameters | None) -> dict[str, Any] | None:
-    """Describe the smallest insulating bodies that are detected by their diameters in metres, None for one that exceeds
-    the domain; None if they are not known."""
+    """Describe the smallest insulating bodies that can be detected by their diameters in metres. A diameter is None if
+    it exceeds the domain; the description is None if `diameters` is None."""
     if diameters is None:
         return None
     return {
@@ -112,8 +112,8 @@ def package_version(package: str) -> str | None:
 
 
 def to_plain_values(value: Any) -> Any:
-    """Convert a value for JSON: arrays to lists, complex numbers to their real and imaginary part, and numbers that are
-    not finite to None."""
+    """Convert a value to types that JSON can represent: arrays to lists, complex numbers to dictionaries of their real
+    and imaginary parts, and numbers that are not finite to None."""
     if isinstance(value, dict):
         return {key: to_plain_values(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):

@@ -28,8 +28,8 @@ from jeit.report.folder import (
     write_json,
 )
 
-# Number of nodes of the mesh on which wirings are compared.
-_MAX_MESH_NODES = 1000
+# Approximate number of nodes of the mesh on which wirings are compared and detectable diameters are computed.
+_NUM_MESH_NODES = 1000
 
 
 def report_measurement(measurement: Measurement) -> dict[str, Any]:
@@ -46,9 +46,13 @@ def report_measurement(measurement: Measurement) -> dict[str, Any]:
     report_measurement(pressed)
     ```
     """
-    protocol, signs, model = measurement.protocol, impossible_signs(measurement), _described_model(measurement)
+    protocol, impossible_sign_shares, model = (
+        measurement.protocol,
+        impossible_signs(measurement),
+        _model_from_description(measurement),
+    )
     noise = _report_noise(measurement)
-    content = {
+    report = {
         **describe_measurement(measurement),
         "frames": measurement.num_frames,
         "frame_names": list(measurement.frame_names),
@@ -62,18 +66,21 @@ def report_measurement(measurement: Measurement) -> dict[str, Any]:
         "electrodes": {**describe_electrodes(measurement.electrodes), "number": protocol.num_electrodes},
         "reciprocity_error": reciprocity_error(measurement),
         "noise": noise,
-        "smallest_detectable_body": _report_detectable(model, measurement, noise)
-        if model and noise and (signs is None or signs.max() <= MAX_IMPOSSIBLE_SIGN_SHARE)
+        "smallest_detectable_body": _report_detectable_diameters(model, measurement, noise)
+        if model
+        and noise
+        and (impossible_sign_shares is None or impossible_sign_shares.max() <= MAX_IMPOSSIBLE_SIGN_SHARE)
         else None,
-        "impossible_signs": None if signs is None else float(signs.max()),
+        "impossible_signs": None if impossible_sign_shares is None else float(impossible_sign_shares.max()),
         "wiring": model and _describe_wiring(model, measurement),
     }
-    return to_plain_values(content)
+    return to_plain_values(report)
 
 
 def _report_noise(measurement: Measurement) -> dict[str, Any] | None:
-    """Noise of a voltage and the method of its estimate; the rounding of the first frame if it is larger, because
-    reciprocal voltages are rounded in the same way."""
+    """Report the standard deviation of the noise of the voltages, and the method by which it was estimated. If the
+    rounding error of the first frame is larger, it is reported instead, because an estimate from reciprocal voltages,
+    which are rounded in the same way, does not include it."""
     noise = estimate_noise(measurement)
     voltages, mask = np.asarray(measurement.voltages)[0], np.asarray(measurement.mask)[0]
     rounding_error = float(np.median(rounding_deviation(voltages, mask)[mask])) if mask.any() else 0.0
@@ -82,45 +89,53 @@ def _report_noise(measurement: Measurement) -> dict[str, Any] | None:
     return None if noise is None else {"standard_deviation": noise.standard_deviation, "method": noise.method}
 
 
-def _described_model(measurement: Measurement) -> ForwardModel | None:
-    """Model of the described body; None if the body or the places of the electrodes are not known."""
+def _model_from_description(measurement: Measurement) -> ForwardModel | None:
+    """Create the forward model of the body that the measurement describes; return None if the body or the positions of
+    the electrodes are not known."""
     domain, electrodes = measurement.domain, measurement.electrodes
     if domain is None or electrodes is None:
         return None
-    mesh = imaging_mesh(domain, electrodes, None, usual=_MAX_MESH_NODES)
+    mesh = imaging_mesh(domain, electrodes, None, usual=_NUM_MESH_NODES)
     return ForwardModel(mesh, electrodes, measurement.protocol)
 
 
 def _reference_frame(measurement: Measurement) -> Measurement:
-    """The frame named "reference", or else all frames."""
+    """Return the frame named "reference", or all frames if no frame has this name."""
     return measurement.split_reference()[1] if "reference" in measurement.frame_names else measurement
 
 
-def _report_detectable(model: ForwardModel, measurement: Measurement, noise: dict[str, Any]) -> dict[str, Any] | None:
-    """Smallest insulating bodies that a difference of two frames of the file shows, with the `noise` of its voltages,
-    which is assumed to be larger for larger voltages, see `relative_noise`. None for complex voltages, and if no
-    voltage of the reference is usable."""
+def _report_detectable_diameters(
+    model: ForwardModel, measurement: Measurement, noise: dict[str, Any]
+) -> dict[str, Any] | None:
+    """Report the diameters of the smallest insulating bodies that can be detected in the difference of two frames of
+    the file. The `noise` of the voltages is assumed to be larger for larger voltages, see `relative_noise`. Returns
+    None for complex voltages, and if no voltage of the reference frame is usable."""
     reference = _reference_frame(measurement)
-    voltages, is_used = np.asarray(reference.voltages)[0], np.asarray(reference.mask)[0]
-    if np.iscomplexobj(voltages) or not is_used.any() or not noise["standard_deviation"]:
+    voltages, usable_channels = np.asarray(reference.voltages)[0], np.asarray(reference.mask)[0]
+    if np.iscomplexobj(voltages) or not usable_channels.any() or not noise["standard_deviation"]:
         return None
-    channel_noise = np.asarray(relative_noise(voltages, is_used))
-    channel_noise = np.sqrt(2) * noise["standard_deviation"] * channel_noise / np.median(channel_noise[is_used])
-    # The median is of channels without contact voltages, which the description does not determine.
-    resistivity = np.median(np.abs(voltages / np.asarray(model.voltages(1.0)))[is_used])
+    channel_noise = np.asarray(relative_noise(voltages, usable_channels))
+    channel_noise = np.sqrt(2) * noise["standard_deviation"] * channel_noise / np.median(channel_noise[usable_channels])
+    # Voltages across contact impedances, which the description does not determine, hardly change the median.
+    resistivity = np.median(np.abs(voltages / np.asarray(model.voltages(1.0)))[usable_channels])
     if not (np.isfinite(resistivity) and resistivity > 0):
         return None
-    return describe_detectable(detectable_diameters(model, 1 / resistivity, channel_noise, is_used))
+    return describe_detectable(detectable_diameters(model, 1 / resistivity, channel_noise, usable_channels))
 
 
 def _describe_wiring(model: ForwardModel, measurement: Measurement) -> str:
-    """Describe in words the wiring estimated from the frame named "reference", or else from the first frame."""
+    """Describe in words the wiring that was estimated from the frame named "reference", or from the first frame if no
+    frame has this name."""
     reference = _reference_frame(measurement)
-    wiring, error = find_wiring(model, reference), reciprocity_error(reference)
-    if error is not None and error > MAX_RECIPROCITY_ERROR and not wiring.explanation:
+    wiring, reference_reciprocity_error = find_wiring(model, reference), reciprocity_error(reference)
+    if (
+        reference_reciprocity_error is not None
+        and reference_reciprocity_error > MAX_RECIPROCITY_ERROR
+        and not wiring.explanation
+    ):
         return (
-            f"reciprocity broken by {percent(error)}, and nothing that was tried mends it: channels or drives in "
-            "another order than described, or nothing but noise"
+            f"reciprocity broken by {percent(reference_reciprocity_error)}, and nothing that was tried mends it: "
+            "channels or drives in another order than described, or nothing but noise"
         )
     if wiring.fault:
         return wiring.fault
@@ -174,17 +189,17 @@ def draw_choice(result: ComparedRules):
     outcomes = result.outcomes
     figure = Figure(figsize=(max(2.1 * len(outcomes), 8.4), 8.2), layout="constrained")
     images_figure, curves_figure = np.asarray(figure.subfigures(2, 1, height_ratios=(1, 1.6)))
-    columns = np.atleast_1d(images_figure.subplots(1, len(outcomes)))
-    for ax, (name, outcome) in zip(columns, outcomes.items(), strict=True):
-        _draw_outcome(ax, name, outcome, result.prepared.mesh)
-    choices = {name: outcome.choice for name, outcome in outcomes.items()}
-    plot_choice(choices, ax=curves_figure.subplots())
+    image_axes = np.atleast_1d(images_figure.subplots(1, len(outcomes)))
+    for ax, (name, outcome) in zip(image_axes, outcomes.items(), strict=True):
+        _draw_rule_image(ax, name, outcome, result.prepared.mesh)
+    rule_choices = {name: outcome.choice for name, outcome in outcomes.items()}
+    plot_choice(rule_choices, ax=curves_figure.subplots())
     figure.suptitle(f"{result.prepared.measurement.name}: change of conductivity by every rule, and how each chose λ")
     return figure
 
 
-def _draw_outcome(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
-    """Draw the image of one rule with its own colour scale; inclusions are marked unless there are more than
+def _draw_rule_image(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
+    """Draw the image of one rule with its own colour scale. Inclusions are marked unless there are more than
     `_MAX_MARKED_INCLUSIONS`."""
     from jeit.plot import ColourScale, plot_image
     from jeit.plot.colours import DARK_GREY
@@ -193,23 +208,25 @@ def _draw_outcome(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
     num_inclusions = len(outcome.inclusions)
     marked_inclusions = outcome.inclusions if num_inclusions <= _MAX_MARKED_INCLUSIONS else ()
     plot_image(mesh, outcome.change, inclusions=marked_inclusions, scale=ColourScale(bar=False), ax=ax)
-    _draw_scale(ax, float(jnp.abs(outcome.change).max()), "S" if mesh.dimension == 2 else "S/m")
+    _draw_colour_bar(ax, float(jnp.abs(outcome.change).max()), "S" if mesh.dimension == 2 else "S/m")
     ax.set_title(
         f"{name}\n{counted(num_inclusions, 'inclusion')}", color=RULE_COLOURS.get(name, DARK_GREY), fontsize=11, pad=0
     )
 
 
-def _draw_scale(ax, max_value: float, unit: str) -> None:
+def _draw_colour_bar(ax, max_value: float, unit: str) -> None:
     """Draw a small colour bar below an image, with labels at its ends and at zero."""
     from jeit.plot.colours import DARK_GREY, LIGHT_GREY, choose_si_prefix
 
-    factor, unit = choose_si_prefix(max_value, unit)
-    colour_limit = factor * max_value
+    prefix_factor, unit = choose_si_prefix(max_value, unit)
+    colour_limit = prefix_factor * max_value
     mappable = next(artist for artist in (*ax.images, *ax.collections) if artist.get_array() is not None)
-    bar = ax.figure.colorbar(mappable, ax=ax, orientation="horizontal", shrink=0.62, aspect=18, pad=0.01)
-    bar.set_ticks([-colour_limit, 0, colour_limit], labels=[f"−{colour_limit:.3g}", "0", f"+{colour_limit:.3g} {unit}"])
-    bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
-    bar.ax.tick_params(length=2, color=LIGHT_GREY, labelcolor=DARK_GREY, labelsize=8)
+    colour_bar = ax.figure.colorbar(mappable, ax=ax, orientation="horizontal", shrink=0.62, aspect=18, pad=0.01)
+    colour_bar.set_ticks(
+        [-colour_limit, 0, colour_limit], labels=[f"−{colour_limit:.3g}", "0", f"+{colour_limit:.3g} {unit}"]
+    )
+    colour_bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+    colour_bar.ax.tick_params(length=2, color=LIGHT_GREY, labelcolor=DARK_GREY, labelsize=8)
 
 
 def report_choice(result: ComparedRules) -> dict[str, Any]:
@@ -227,10 +244,10 @@ def report_choice(result: ComparedRules) -> dict[str, Any]:
     """
     prepared, settings = result.prepared, result.settings
     unit = "S" if prepared.mesh.dimension == 2 else "S/m"
-    rules = []
+    rule_reports = []
     for name, outcome in result.outcomes.items():
         choice = outcome.choice
-        rules.append(
+        rule_reports.append(
             {
                 "rule": name,
                 "hyperparameter": choice.hyperparameter,
@@ -254,7 +271,7 @@ def report_choice(result: ComparedRules) -> dict[str, Any]:
                 "penalty": choice.penalty,
             }
         )
-    content = {
+    report = {
         "data": describe_measurement(prepared.measurement),
         "reference": describe_measurement(prepared.reference),
         "mesh": {"points": prepared.mesh.num_points, "cells": prepared.mesh.num_cells},
@@ -263,8 +280,8 @@ def report_choice(result: ComparedRules) -> dict[str, Any]:
         "conductivity_unit": unit,
         "centroid_unit": "m",
         "residual_unit": "standard deviations of jeit.inverse.relative_noise",
-        "rules": rules,
+        "rules": rule_reports,
         "refused": result.refused,
         "doubts": list(prepared.doubts),
     }
-    return to_plain_values(content)
+    return to_plain_values(report)

@@ -33,9 +33,9 @@ from jeit.report.saved_image import saved_extras
 
 IMAGE_FILES = ("image.png", "image.npz", "report.json", "image.vtu")
 """Names of the files written by `write_image`; the last is written only for solids."""
-# Letters of a doubt per inch of a picture's width, and their colour.
+# Number of letters per inch of a picture's width in the text of a doubt, and colour of this text.
 _LETTERS_PER_INCH, _DOUBT_COLOUR = 16, "#a3350f"
-_PACKAGES = ("jeit", "jax", "numpy", "scipy", "equinox", "lineax", "optimistix", "matplotlib")
+_REPORTED_PACKAGES = ("jeit", "jax", "numpy", "scipy", "equinox", "lineax", "optimistix", "matplotlib")
 
 
 def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[float, float] | None = None) -> None:
@@ -70,18 +70,18 @@ def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[fl
     """
     with results(folder, IMAGE_FILES) as temporary_folder:
         draw_image(result, truth=truth).savefig(temporary_folder / "image.png", dpi=150)
-        np.savez_compressed(temporary_folder / "image.npz", **_arrays(result))
+        np.savez_compressed(temporary_folder / "image.npz", **_image_arrays(result))
         write_json(report_image(result), temporary_folder / "report.json")
         if result.mesh.dimension == 3:
             background, change = np.asarray(result.calibration.conductivity), np.asarray(result.change)
-            values = {"change of conductivity": change, "conductivity": background + change}
+            cell_values = {"change of conductivity": change, "conductivity": background + change}
             from jeit.report.volume_files import draft_vtu
 
-            draft_vtu(temporary_folder / "image.vtu", result.mesh, values, electrodes=result.electrodes)
+            draft_vtu(temporary_folder / "image.vtu", result.mesh, cell_values, electrodes=result.electrodes)
 
 
-def _arrays(result: ImagedDifference) -> dict[str, Any]:
-    """Arrays of the NPZ file, by name."""
+def _image_arrays(result: ImagedDifference) -> dict[str, Any]:
+    """Arrays that `write_image` stores in `image.npz`, by name."""
     arrays: dict[str, Any] = {
         "raster": np.asarray(result.raster),
         "extent": np.asarray(result.extent),
@@ -98,8 +98,8 @@ def _arrays(result: ImagedDifference) -> dict[str, Any]:
 
 
 def _drawn_values(result: ImagedDifference) -> np.ndarray:
-    """Values per cell for the picture: the change of conductivity, or, for iterative images, the change of its
-    logarithm to base 10, because their conductivity ranges from 0.01 to 100 times the background."""
+    """Values per cell that the picture shows: the change of conductivity, or, for iterative images, whose conductivity
+    ranges from 0.01 to 100 times the background, the change of its logarithm to base 10."""
     return np.asarray(result.departure) / (math.log(10) if result.iterative else 1)
 
 
@@ -133,12 +133,14 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
         plot_admittivity(result.mesh, np.asarray(result.change), electrodes, figure=figure)
         _write_doubts(figure, result.doubts)
         return figure
-    scale = FACTOR_SCALE if result.iterative else CHANGE_SCALE
+    colour_scale = FACTOR_SCALE if result.iterative else CHANGE_SCALE
     electrodes = result.electrodes
     if result.mesh.dimension == 3:
         from jeit.plot.solid.slices import plot_solid
 
-        figure = plot_solid(result.mesh, _drawn_values(result), electrodes, inclusions=result.inclusions, scale=scale)
+        figure = plot_solid(
+            result.mesh, _drawn_values(result), electrodes, inclusions=result.inclusions, scale=colour_scale
+        )
         figure.suptitle(result.measurement.name)
         _write_doubts(figure, result.doubts)
         return figure
@@ -149,18 +151,18 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
         electrodes,
         inclusions=result.inclusions if result.labels is None and result.shapes is None else (),
         title=result.measurement.name,
-        scale=scale,
+        scale=colour_scale,
         ax=figure.subplots(),
     )
     if truth is not None:
-        electrode_ring = {
+        truth_marker_style = {
             "marker": "o",
             "markersize": 15,
             "markerfacecolor": "none",
             "markeredgewidth": 2,
             "linestyle": "none",
         }
-        ax.plot(*truth, color="#157f3b", label="pressed here", **electrode_ring)
+        ax.plot(*truth, color="#157f3b", label="pressed here", **truth_marker_style)
     if result.labels is not None:
         draw_labels(result.labels, result.extent, ax=ax)
     elif result.shapes is not None:
@@ -173,13 +175,13 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     return figure
 
 
-def _write_doubts(figure, warning_texts: Sequence[str]) -> None:
+def _write_doubts(figure, doubts: Sequence[str]) -> None:
     """Write the first doubt about an image below it, and the number of further doubts."""
-    if not warning_texts:
+    if not doubts:
         return
-    number_of_others_text = f" {len(warning_texts) - 1} more in report.json." if len(warning_texts) > 1 else ""
-    width = int(_LETTERS_PER_INCH * figure.get_size_inches()[0])
-    figure.supxlabel(fill(f"Doubt: {warning_texts[0]}{number_of_others_text}", width), fontsize=8, color=_DOUBT_COLOUR)
+    further_doubts_text = f" {len(doubts) - 1} more in report.json." if len(doubts) > 1 else ""
+    max_line_length = int(_LETTERS_PER_INCH * figure.get_size_inches()[0])
+    figure.supxlabel(fill(f"Doubt: {doubts[0]}{further_doubts_text}", max_line_length), fontsize=8, color=_DOUBT_COLOUR)
 
 
 def report_image(result: ImagedDifference) -> dict[str, Any]:
@@ -197,8 +199,8 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
     ```
     """
     reconstruction, quality, settings = result.reconstruction, result.quality, result.settings
-    noise = quality.difference_noise
-    content = {
+    difference_noise = quality.difference_noise
+    report = {
         "data": {**describe_measurement(result.measurement), **_frame_report(result)},
         "reference": describe_measurement(result.reference),
         "geometry": {
@@ -212,12 +214,12 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
         ),
         "calibration": _calibration_report(result),
         "noise": None
-        if noise is None
+        if difference_noise is None
         else {
-            "standard_deviation": noise.standard_deviation,
+            "standard_deviation": difference_noise.standard_deviation,
             "unit": "V",
-            "relative_to_difference": noise.relative if quality.noise_share is None else quality.noise_share,
-            "method": noise.method,
+            "relative_to_difference": difference_noise.relative if quality.noise_share is None else quality.noise_share,
+            "method": difference_noise.method,
         },
         "unlike_electrodes": {electrode + 1: ratio for electrode, ratio in result.unlike_electrodes.items()},
         "electrode_change": _electrode_change_report(result.electrode_change),
@@ -230,7 +232,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
             "rounding_relative_to_difference": quality.rounding,
         },
         "reconstruction": {
-            "quantity": f"change of conductivity against the reference, {_unit(result)}",
+            "quantity": f"change of conductivity against the reference, {_conductivity_unit(result)}",
             "method": settings.method,
             "why": result.why or None,
             "least_change_relative_to_background": result.lowest,
@@ -248,13 +250,13 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
         "smallest_detectable_body": describe_detectable(result.detectable_diameters),
         "inclusion_settings": {"level": result.level, "least_peak": settings.least_peak},
         "timings": {**result.timings, "unit": "s"},
-        "versions": {name: package_version(name) for name in _PACKAGES},
+        "versions": {name: package_version(name) for name in _REPORTED_PACKAGES},
     }
-    return to_plain_values(content)
+    return to_plain_values(report)
 
 
 def _uncertainty_report(uncertainty: Uncertainty, mesh: Mesh) -> dict[str, Any]:
-    """Report of the uncertainty of the description of the measurement, on which intervals are based."""
+    """Report of the uncertainty of the measurement's description, from which credible intervals are computed."""
     return {
         "position": uncertainty.position_on(mesh),
         "position_unit": "m",
@@ -265,7 +267,8 @@ def _uncertainty_report(uncertainty: Uncertainty, mesh: Mesh) -> dict[str, Any]:
 
 
 def _electrode_change_report(change: ElectrodeChange | None) -> dict[str, Any] | None:
-    """Report of the change of the electrodes since the reference, if it explains much of the difference."""
+    """Report of the change of the electrodes since the reference frame; None if the change explains little of the
+    difference."""
     if change is None:
         return None
     return {
@@ -277,12 +280,13 @@ def _electrode_change_report(change: ElectrodeChange | None) -> dict[str, Any] |
 
 
 def _frame_report(result: ImagedDifference) -> dict[str, Any]:
-    """Name of the imaged frame, or else its number from 0; and number of frames in the file."""
-    names = result.measurement.frame_names
-    return {"frame": names[0] if names else result.frame, "frames": result.num_frames}
+    """Report of the name of the imaged frame, or its number (from 0) if it has no name, and of the number of frames in
+    the file."""
+    frame_names = result.measurement.frame_names
+    return {"frame": frame_names[0] if frame_names else result.frame, "frames": result.num_frames}
 
 
-def _unit(result: ImagedDifference) -> str:
+def _conductivity_unit(result: ImagedDifference) -> str:
     return "S" if result.mesh.dimension == 2 else "S/m"
 
 
@@ -298,12 +302,12 @@ def _protocol_report(protocol: Protocol) -> dict[str, Any]:
 
 
 def _calibration_report(result: ImagedDifference) -> dict[str, Any]:
-    """Report of the fit of the model to the reference."""
+    """Report of the calibration, which fits the forward model to the reference frame."""
     calibration = result.calibration
     electrodes = calibration.model.electrodes
     return {
         "conductivity": np.asarray(calibration.conductivity).item(),
-        "conductivity_unit": _unit(result),
+        "conductivity_unit": _conductivity_unit(result),
         "contact": result.settings.contact if calibration.shift is None else "each, with the electrode positions",
         "contact_impedance": None if electrodes.is_point else electrodes.contact_impedance,
         "contact_impedance_unit": "ohm·m" if result.mesh.dimension == 2 else "ohm·m²",
@@ -323,15 +327,15 @@ def _inclusion_report(result: ImagedDifference, inclusion: Inclusion) -> dict[st
         "centroid_unit": "m",
         **_size_report(inclusion),
         "peak": inclusion.peak,
-        "peak_unit": _unit(result),
+        "peak_unit": _conductivity_unit(result),
         "peak_relative_to_background": inclusion.peak / float(np.real(result.calibration.conductivity)),
         **_interval_report(inclusion),
     }
 
 
 def _interval_report(inclusion: Inclusion) -> dict[str, Any]:
-    """Radius of the 68 % region of a body's position, and 68 % intervals of its properties; a limit that the data do
-    not determine is None. Empty if no intervals were estimated."""
+    """Report of the radius of the 68 % region of a body's position, and of 68 % intervals of its properties. A limit
+    that the data do not determine is None; the report is empty if no intervals were estimated."""
     if inclusion.contrast_interval is None:
         return {}
     return {
@@ -347,7 +351,7 @@ def _interval_report(inclusion: Inclusion) -> dict[str, Any]:
 
 
 def _size_report(inclusion: Inclusion) -> dict[str, Any]:
-    """Size of an inclusion: its volume in a solid, its area in a sheet."""
+    """Report of the size of an inclusion: its volume in a solid, its area in a sheet."""
     if inclusion.is_solid:
         return {"volume": inclusion.area, "volume_unit": "m³"}
     return {"area": inclusion.area, "area_unit": "m²"}
@@ -358,29 +362,36 @@ def _shapes_report(result: ImagedDifference) -> dict[str, Any] | None:
     fitted."""
     if result.shapes is None:
         return None
-    body_reports, left_out_reports = (
+    body_reports, rejected_body_reports = (
         [
             {
                 "sign": body.sign,
                 "centroid": body.centroid,
                 **_form_report(body),
                 "conductivity_over_background": math.exp(body.sign * body.contrast),
-                "conductivity_is": _evidence_text(body),
+                "conductivity_is": _conductivity_origin_text(body),
                 "rise": body.rise,
             }
             for body in bodies
         ]
         for bodies in (result.shapes.bodies, result.shapes.doubtful)
     )
-    alternatives = zip(result.shapes.alternatives, result.shapes.alternative_deviations, strict=True)
-    for body_report, (alternative_shape, deviation) in zip(body_reports, alternatives, strict=True):
+    alternatives_with_deviations = zip(result.shapes.alternatives, result.shapes.alternative_deviations, strict=True)
+    for body_report, (alternative_shape, deviation) in zip(body_reports, alternatives_with_deviations, strict=True):
         if alternative_shape is not None:
-            ratio = math.exp(alternative_shape.sign * alternative_shape.contrast)
-            evidence = {"conductivity_over_background": ratio, "deviation_of_logarithm": deviation}
-            body_report["or"] = {"centroid": alternative_shape.centroid, **_form_report(alternative_shape), **evidence}
+            conductivity_ratio = math.exp(alternative_shape.sign * alternative_shape.contrast)
+            alternative_conductivity = {
+                "conductivity_over_background": conductivity_ratio,
+                "deviation_of_logarithm": deviation,
+            }
+            body_report["or"] = {
+                "centroid": alternative_shape.centroid,
+                **_form_report(alternative_shape),
+                **alternative_conductivity,
+            }
     return {
         "bodies": body_reports,
-        "left_out": left_out_reports,
+        "left_out": rejected_body_reports,
         "length_unit": "m",
         "rise": "how many times the objective rises if the body is left out",
         "misfit": float(result.shapes.misfit),
@@ -390,14 +401,15 @@ def _shapes_report(result: ImagedDifference) -> dict[str, Any] | None:
 
 
 def _form_report(body: Star | Ellipsoid) -> dict[str, Any]:
-    """Form of a body: area and outline of a star, or volume, centre and half axes of an ellipsoid or a column."""
+    """Report of the form of a body: area and outline of a star-shaped body, or volume, centre and half axes of an
+    ellipsoid or a column."""
     if isinstance(body, Star):
         return {"area": body.area, "outline": body.outline}
-    form = "column" if body.column else "ellipsoid"
-    return {"form": form, "volume": body.volume, "centre": body.centre, "half_axes": body.axes}
+    form_name = "column" if body.column else "ellipsoid"
+    return {"form": form_name, "volume": body.volume, "centre": body.centre, "half_axes": body.axes}
 
 
-def _evidence_text(body: Star | Ellipsoid) -> str:
+def _conductivity_origin_text(body: Star | Ellipsoid) -> str:
     """Describe in words whether the conductivity of a body was estimated or assumed."""
     if not body.contrast_is_determined:
         return "assumed, as of what is strong"
@@ -408,11 +420,11 @@ def _evidence_text(body: Star | Ellipsoid) -> str:
 
 def _prior_name(settings: ImagingSettings, dimension: int) -> str | None:
     """Name of the prior in the settings, or of the fixed prior of the method; None for methods without a prior."""
-    method = METHODS[settings.method]
+    imaging_method = METHODS[settings.method]
     if settings.method == "shapes" and dimension == 3:
         return "ellipsoids and columns"
-    if not method.takes_prior:
-        return method.prior
+    if not imaging_method.takes_prior:
+        return imaging_method.prior
     return settings.prior if isinstance(settings.prior, str) else type(settings.prior).__name__
 
 

@@ -15,19 +15,19 @@ from matplotlib.figure import Figure
 from jeit.report.image import draw_image
 from jeit_solvers.engines import has_values
 
-# Dots per inch of pictures, and maximum number of frames of a measurement that are drawn.
-_DPI, _MAX_FRAMES = 90, 12
+# Resolution of pictures in dots per inch, and maximum number of frames of a measurement that are drawn.
+_PICTURE_DPI, _MAX_DRAWN_FRAMES = 90, 12
 
 
 def picture(value: Any) -> bytes | None:
-    """Picture of an object as PNG; None for objects of a kind that has no picture, and inside `jax.jit` or a
-    derivative."""
+    """Picture of an object as PNG; None for objects of a kind that has no picture, and for objects that are traced by
+    `jax.jit` or a derivative."""
     draw_function = _DRAW_FUNCTIONS.get(type(value).__name__)
     if draw_function is None or not has_values(value):
         return None
-    file = io.BytesIO()
-    draw_function(value).savefig(file, dpi=_DPI, format="png")
-    return file.getvalue()
+    png_file = io.BytesIO()
+    draw_function(value).savefig(png_file, dpi=_PICTURE_DPI, format="png")
+    return png_file.getvalue()
 
 
 def page(value: Any) -> str | None:
@@ -35,8 +35,11 @@ def page(value: Any) -> str | None:
     png = picture(value)
     if png is None:
         return None
-    data = base64.b64encode(png).decode("ascii")
-    return f'<pre>{html.escape(repr(value))}</pre><img alt="{type(value).__name__}" src="data:image/png;base64,{data}">'
+    encoded_png = base64.b64encode(png).decode("ascii")
+    return (
+        f'<pre>{html.escape(repr(value))}</pre><img alt="{type(value).__name__}" '
+        f'src="data:image/png;base64,{encoded_png}">'
+    )
 
 
 def _draw_mesh(mesh: Any) -> Figure:
@@ -69,8 +72,8 @@ def _draw_layout(layout: Any) -> Figure:
     for centre, radius, label in zip(centres, radii, layout.labels, strict=True):
         ax.add_patch(Circle(tuple(centre), float(radius), facecolor="none", edgecolor=LIGHT_GREY))
         ax.annotate(label, tuple(centre), ha="center", va="center", fontsize=7)
-    x, y = np.asarray(ax.dataLim.intervalx), np.asarray(ax.dataLim.intervaly)
-    extent = (x[0], x[1], y[0], y[1])
+    x_range, y_range = np.asarray(ax.dataLim.intervalx), np.asarray(ax.dataLim.intervaly)
+    extent = (x_range[0], x_range[1], y_range[0], y_range[1])
     hide_axes(ax, extent, numbered=False)
     draw_scale_bar(ax, extent)
     ax.set_title(layout.name, fontsize=10)
@@ -82,13 +85,15 @@ def _draw_measurement(measurement: Any) -> Figure:
 
     figure = Figure(figsize=(7.0, 3.2), layout="constrained")
     ax = figure.subplots()
-    frame_indices = np.unique(np.linspace(0, measurement.num_frames - 1, _MAX_FRAMES).round().astype(int))
-    values = np.where(measurement.mask, np.real(np.asarray(measurement.voltages)), np.nan)[frame_indices]
-    factor, unit = choose_si_prefix(float(np.abs(values[np.isfinite(values)]).max(initial=0)) or 1.0, "V")
-    ax.plot(factor * values.T, linewidth=0.8)
+    frame_indices = np.unique(np.linspace(0, measurement.num_frames - 1, _MAX_DRAWN_FRAMES).round().astype(int))
+    drawn_voltages = np.where(measurement.mask, np.real(np.asarray(measurement.voltages)), np.nan)[frame_indices]
+    prefix_factor, unit = choose_si_prefix(
+        float(np.abs(drawn_voltages[np.isfinite(drawn_voltages)]).max(initial=0)) or 1.0, "V"
+    )
+    ax.plot(prefix_factor * drawn_voltages.T, linewidth=0.8)
     ax.set(xlabel="Channel", ylabel=f"Voltage ({unit})")
-    count_text = "" if len(frame_indices) == measurement.num_frames else f"{len(frame_indices)} of "
-    ax.set_title(f"{measurement.name}: {count_text}{measurement.num_frames} frames", fontsize=10)
+    drawn_frames_text = "" if len(frame_indices) == measurement.num_frames else f"{len(frame_indices)} of "
+    ax.set_title(f"{measurement.name}: {drawn_frames_text}{measurement.num_frames} frames", fontsize=10)
     ax.spines[["top", "right"]].set_visible(False)
     return figure
 
@@ -99,12 +104,12 @@ def _draw_series(series: Any) -> Figure:
     return plot_frames(series.mesh, series.changes, titles=series.titles)
 
 
-def _draw_figures_of_merit(figures: Any) -> Figure:
+def _draw_figures_of_merit(figures_of_merit: Any) -> Figure:
     from jeit.plot.imaging.judgement import plot_figures_of_merit
 
     figure = Figure(figsize=(10.6, 5.6), layout="constrained")
-    target_figures = jax.tree.map(np.atleast_1d, figures)
-    plot_figures_of_merit({"targets": target_figures}, ax=figure.subplots())
+    figures_per_target = jax.tree.map(np.atleast_1d, figures_of_merit)
+    plot_figures_of_merit({"targets": figures_per_target}, ax=figure.subplots())
     return figure
 
 

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from jeit.plot import Camera, ColourScale
 
 _VALID_FILE_HINT = "give the image.npz that jeit reconstruct writes"
-# Descriptions of files that are not images, with the suffixes of their names.
-_OTHER_FILES = {
+# Suffixes of the names of files that are not images, by a description of the kind of file.
+_SUFFIXES_OF_OTHER_FILES = {
     "a table of data, which is to be imaged first": (".csv", ".txt", ".mat", ".eit", ".get", ".npy"),
     "a picture, which any viewer shows": (".png", ".gif", ".mp4", ".jpg", ".jpeg", ".svg", ".pdf"),
     "a file for ParaView": (".vtu", ".vtk", ".xdmf", ".pvd"),
@@ -136,27 +136,28 @@ def read_image(path: str | Path) -> SavedImage:
     ```
     """
     path = Path(path)
-    name = path.name[:80]
+    file_name = path.name[:80]
     if path.is_dir():
-        raise ValueError(f"{name} is a folder; give the image.npz in it.")
+        raise ValueError(f"{file_name} is a folder; give the image.npz in it.")
     try:
         with path.open("rb") as file:
             if file.read(2) != b"PK":
                 raise ValueError(f"not an image that jeit wrote{_other_file_hint(path)}; {_VALID_FILE_HINT}.")
         arrays = npz_arrays(path, *_READ_ARRAYS)
-        _check_kind(arrays)
+        _check_contains_image(arrays)
         require_arrays(arrays, *_REQUIRED_ARRAYS)
         if arrays["points"].dtype.kind not in "fiu":
             raise ValueError(f"'points' is {describe(arrays['points'])}; real numbers are wanted, metres.")
-        with size_checked():  # the command that wrote the file checked the size of the mesh
+        with size_checked():  # the size of the mesh was checked by the command that wrote the file
             mesh = Mesh.create(arrays["points"], arrays["cells"])
         return _create_saved_image(mesh, arrays)
     except ValueError as error:
-        raise ValueError(f"{name}: {error}"[:400]) from None
+        raise ValueError(f"{file_name}: {error}"[:400]) from None
 
 
-def _check_kind(arrays: dict[str, np.ndarray]) -> None:
-    """Raise `ValueError` for NPZ files that are not an image: series of frames, and files without an image."""
+def _check_contains_image(arrays: dict[str, np.ndarray]) -> None:
+    """Raise `ValueError` for NPZ files that do not contain one image: files of a series of frames, and files without an
+    image."""
     array_names = set(arrays[""].tolist())
     if array_names & {"images", "depth", "functional"}:
         raise ValueError("it holds many frames; give the image.npz of one, of jeit reconstruct.")
@@ -166,8 +167,10 @@ def _check_kind(arrays: dict[str, np.ndarray]) -> None:
 
 
 def _other_file_hint(path: Path) -> str:
-    kind = next((kind for kind, suffixes in _OTHER_FILES.items() if path.suffix.lower() in suffixes), None)
-    return "" if kind is None else f", but {kind}"
+    file_kind = next(
+        (file_kind for file_kind, suffixes in _SUFFIXES_OF_OTHER_FILES.items() if path.suffix.lower() in suffixes), None
+    )
+    return "" if file_kind is None else f", but {file_kind}"
 
 
 def _create_saved_image(mesh: Mesh, arrays: dict[str, np.ndarray]) -> SavedImage:
@@ -200,32 +203,49 @@ def _read_electrodes(mesh: Mesh, arrays: dict[str, np.ndarray]) -> ElectrodeShap
     if "electrode_corners" not in arrays:
         return None
     require_arrays(arrays, "electrode_sizes", "electrode_numbers")
-    corners, sizes, numbers = (arrays[f"electrode_{name}"] for name in ("corners", "sizes", "numbers"))
-    if corners.ndim != 2 or corners.shape[1] != mesh.points.shape[1] or corners.dtype.kind not in "fiu":
+    polygon_corners, corner_counts, electrode_numbers = (
+        arrays[f"electrode_{name}"] for name in ("corners", "sizes", "numbers")
+    )
+    if (
+        polygon_corners.ndim != 2
+        or polygon_corners.shape[1] != mesh.points.shape[1]
+        or polygon_corners.dtype.kind not in "fiu"
+    ):
         raise ValueError("'electrode_corners' are no places in the mesh's space; write it again.")
-    if not np.isfinite(corners).all():
+    if not np.isfinite(polygon_corners).all():
         raise ValueError("'electrode_corners' are no places: some are not finite; write it again.")
-    are_integers = all(array.dtype.kind in "iu" and array.ndim == 1 for array in (sizes, numbers))
-    if not (are_integers and len(sizes) == len(numbers) > 0 and sizes.min() > 0 and sizes.sum() == len(corners)):
+    are_integers = all(array.dtype.kind in "iu" and array.ndim == 1 for array in (corner_counts, electrode_numbers))
+    if not (
+        are_integers
+        and len(corner_counts) == len(electrode_numbers) > 0
+        and corner_counts.min() > 0
+        and corner_counts.sum() == len(polygon_corners)
+    ):
         raise ValueError("'electrode_sizes' does not say whose corners 'electrode_corners' are; write it again.")
-    # Every electrode needs a polygon; without a polygon its place is unknown.
-    if not np.array_equal(np.unique(numbers), np.arange(numbers.max() + 1)):
+    # Every electrode needs a polygon, because the polygon states the position of the electrode.
+    if not np.array_equal(np.unique(electrode_numbers), np.arange(electrode_numbers.max() + 1)):
         raise ValueError("'electrode_numbers' leave electrodes out; write it again.")
-    return ElectrodeShapes(corners.astype(float), sizes, numbers)
+    return ElectrodeShapes(polygon_corners.astype(float), corner_counts, electrode_numbers)
 
 
 def _read_inclusions(mesh: Mesh, arrays: dict[str, np.ndarray]) -> tuple[Inclusion, ...]:
     if "inclusion_centroids" not in arrays:
         return ()
     require_arrays(arrays, "inclusion_sizes", "inclusion_peaks")
-    centroids, sizes, peaks = (arrays[f"inclusion_{name}"] for name in ("centroids", "sizes", "peaks"))
+    centroids, inclusion_sizes, peaks = (arrays[f"inclusion_{name}"] for name in ("centroids", "sizes", "peaks"))
     num_inclusions = peaks.size
-    if centroids.shape != (num_inclusions, mesh.points.shape[1]) or not sizes.shape == peaks.shape == (num_inclusions,):
+    if centroids.shape != (num_inclusions, mesh.points.shape[1]) or not inclusion_sizes.shape == peaks.shape == (
+        num_inclusions,
+    ):
         raise ValueError("'inclusion_centroids', '_sizes' and '_peaks' do not belong together; write it again.")
-    if not all(array.dtype.kind == "f" and np.isfinite(array).all() for array in (centroids, sizes, peaks)):
+    if not all(array.dtype.kind == "f" and np.isfinite(array).all() for array in (centroids, inclusion_sizes, peaks)):
         raise ValueError("inclusions have values that are not finite; write it again.")
     inclusion_values = zip(
-        centroids.tolist(), sizes.tolist(), peaks.tolist(), _read_forms(arrays, num_inclusions), strict=True
+        centroids.tolist(),
+        inclusion_sizes.tolist(),
+        peaks.tolist(),
+        _read_solid_forms(arrays, num_inclusions),
+        strict=True,
     )
     return tuple(
         Inclusion(1 if peak > 0 else -1, tuple(centroid), size, peak, mesh.is_surface, form)
@@ -233,29 +253,32 @@ def _read_inclusions(mesh: Mesh, arrays: dict[str, np.ndarray]) -> tuple[Inclusi
     )
 
 
-def _read_forms(arrays: dict[str, np.ndarray], num_inclusions: int) -> list[SolidForm | None]:
+def _read_solid_forms(arrays: dict[str, np.ndarray], num_inclusions: int) -> list[SolidForm | None]:
     if "inclusion_axes" not in arrays:
         return [None] * num_inclusions
     require_arrays(arrays, "inclusion_centres", "inclusion_columns")
-    centres, axes, columns = (arrays[f"inclusion_{name}"] for name in ("centres", "axes", "columns"))
+    centres, half_axes, column_flags = (arrays[f"inclusion_{name}"] for name in ("centres", "axes", "columns"))
     if not (
         centres.shape == (num_inclusions, 3)
-        and axes.shape == (num_inclusions, 3, 3)
-        and columns.shape == (num_inclusions,)
+        and half_axes.shape == (num_inclusions, 3, 3)
+        and column_flags.shape == (num_inclusions,)
     ):
         raise ValueError("'inclusion_centres', '_axes' and '_columns' are not of every inclusion; write it again.")
-    if not all(array.dtype.kind == "f" and np.isfinite(array).all() for array in (centres, axes)):
+    if not all(array.dtype.kind == "f" and np.isfinite(array).all() for array in (centres, half_axes)):
         raise ValueError("inclusions have places that are not finite; write it again.")
     return [
-        SolidForm(tuple(centre), tuple(map(tuple, half_axes)), bool(column))
-        for centre, half_axes, column in zip(centres.tolist(), axes.tolist(), columns.tolist(), strict=True)
+        SolidForm(tuple(centre), tuple(map(tuple, axes_of_body)), bool(is_column))
+        for centre, axes_of_body, is_column in zip(
+            centres.tolist(), half_axes.tolist(), column_flags.tolist(), strict=True
+        )
     ]
 
 
 VIEW_FILES = ("overview.png", "isosurfaces.png", "slices.png", "planes.png", "surface.png", "image.png")
 """Names of the files written by `write_views`: the first three for a solid, `planes.png` if planes are given,
 `surface.png` for a surface in space, and `image.png` for a sheet."""
-_HALF_LEVEL, _DPI = (0.5,), 150
+# Default levels of isosurfaces, as fractions of the maximum change, and resolution of pictures in dots per inch.
+_DEFAULT_ISOSURFACE_LEVELS, _PICTURE_DPI = (0.5,), 150
 
 
 def write_views(
@@ -263,7 +286,7 @@ def write_views(
     folder: str | Path,
     *,
     camera: "Camera | None" = None,
-    levels: Sequence[float] = _HALF_LEVEL,
+    levels: Sequence[float] = _DEFAULT_ISOSURFACE_LEVELS,
     planes: Sequence[Plane] = (),
     axis: str = "z",
     slices: int = 9,
@@ -300,7 +323,7 @@ def write_views(
     figures_by_name = _draw_figures(image, camera, levels, planes, axis, slices)
     with results(folder, tuple(figures_by_name)) as temporary_folder:
         for name, figure in figures_by_name.items():
-            figure.savefig(temporary_folder / name, dpi=_DPI)
+            figure.savefig(temporary_folder / name, dpi=_PICTURE_DPI)
     return tuple(figures_by_name)
 
 
@@ -322,25 +345,25 @@ def _draw_figures(image: SavedImage, camera, levels, planes, axis: str, slices: 
     from jeit.plot.solid.slices import plot_slice, plot_slices, plot_solid
     from jeit.plot.solid.surfaces import plot_surface
 
-    first_camera = CORNER_VIEW if camera is None else camera
+    main_camera = CORNER_VIEW if camera is None else camera
     values, scale = drawn_values(image)
     mesh, electrodes = image.mesh, image.electrodes
     if mesh.dimension == 2 and not mesh.is_surface:
         return {"image.png": _draw_sheet(image, values, scale)}
-    opposite_camera = Camera(first_camera.azimuth + 180, first_camera.elevation)
-    cameras = {
-        "": first_camera,
+    opposite_camera = Camera(main_camera.azimuth + 180, main_camera.elevation)
+    cameras_by_title = {
+        "": main_camera,
         "from the other side": opposite_camera,
         "from the front": Camera(-90, 0),
         "from above": Camera(-90, 90),
     }
 
-    def draw_panels(draw_function, names, width: float, height: float):
+    def draw_panels(draw_subject, panel_subjects, width: float, height: float):
         figure = _new_figure(width, height)
-        panels = figure.subplots(math.ceil(len(names) / 2), min(2, len(names)), squeeze=False).ravel()
-        for name, panel in zip(names, panels, strict=False):
-            draw_function(name, panel)
-        for panel in panels[len(names) :]:
+        panels = figure.subplots(math.ceil(len(panel_subjects) / 2), min(2, len(panel_subjects)), squeeze=False).ravel()
+        for subject, panel in zip(panel_subjects, panels, strict=False):
+            draw_subject(subject, panel)
+        for panel in panels[len(panel_subjects) :]:
             panel.set_axis_off()
         return figure
 
@@ -349,35 +372,41 @@ def _draw_figures(image: SavedImage, camera, levels, planes, axis: str, slices: 
         def draw_surface_side(name, panel):
             cells = np.asarray(mesh.cells)
             plot_surface(
-                mesh.points, cells, values, electrodes, camera=cameras[name], scale=scale, title=name, ax=panel
+                mesh.points, cells, values, electrodes, camera=cameras_by_title[name], scale=scale, title=name, ax=panel
             )
 
-        return {"surface.png": draw_panels(draw_surface_side, list(cameras), 11, 9.5)}
+        return {"surface.png": draw_panels(draw_surface_side, list(cameras_by_title), 11, 9.5)}
 
-    options: dict[str, Any] = {"inclusions": image.inclusions, "scale": scale}
+    plot_options: dict[str, Any] = {"inclusions": image.inclusions, "scale": scale}
 
-    def draw_side(name, panel):
-        plot_isosurfaces(mesh, values, electrodes, levels=levels, camera=cameras[name], ax=panel, **options)
-        panel.set_title(name or _angle_text(first_camera), fontsize=10)
+    def draw_isosurface_side(name, panel):
+        plot_isosurfaces(
+            mesh, values, electrodes, levels=levels, camera=cameras_by_title[name], ax=panel, **plot_options
+        )
+        panel.set_title(name or _camera_angle_text(main_camera), fontsize=10)
 
-    # Sections are drawn first: they are fast, and report planes that miss the body and axes that do not exist.
-    sections = {}
+    # Sections are drawn first, because they are fast, and because drawing them raises an error for planes that miss the
+    # body and for axes that do not exist.
+    section_figures = {}
     if planes:
 
         def draw_section(plane, panel):
-            plot_slice(mesh, values, plane, electrodes, ax=panel, **options)
+            plot_slice(mesh, values, plane, electrodes, ax=panel, **plot_options)
 
         num_rows = math.ceil(len(planes) / 2)
-        sections["planes.png"] = draw_panels(draw_section, list(planes), 5.6 * min(2, len(planes)), 5 * num_rows)
-    sections = {"slices.png": plot_slices(mesh, values, electrodes, axis=axis, at=slices, **options), **sections}
+        section_figures["planes.png"] = draw_panels(draw_section, list(planes), 5.6 * min(2, len(planes)), 5 * num_rows)
+    section_figures = {
+        "slices.png": plot_slices(mesh, values, electrodes, axis=axis, at=slices, **plot_options),
+        **section_figures,
+    }
     return {
-        "overview.png": plot_solid(mesh, values, electrodes, levels=levels, camera=first_camera, **options),
-        "isosurfaces.png": draw_panels(draw_side, list(cameras), 12, 10),
-        **sections,
+        "overview.png": plot_solid(mesh, values, electrodes, levels=levels, camera=main_camera, **plot_options),
+        "isosurfaces.png": draw_panels(draw_isosurface_side, list(cameras_by_title), 12, 10),
+        **section_figures,
     }
 
 
-def _angle_text(camera: "Camera") -> str:
+def _camera_angle_text(camera: "Camera") -> str:
     return f"azimuth {camera.azimuth:g}°, elevation {camera.elevation:g}°".replace("-", "−")
 
 

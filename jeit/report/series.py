@@ -18,8 +18,8 @@ from jeit.report.folder import describe_measurement, results, to_plain_values, w
 FILM_FORMATS = (".gif", ".mp4")
 FILM_FRAMES = 120
 """Maximum number of frames of a film."""
-# Maximum number of frames per second of a film, and default number if the rate of the stream is not known.
-_MAX_RATE, _DEFAULT_RATE = 25.0, 10.0
+# Maximum frame rate of a film in frames per second, and default frame rate if that of the stream is not known.
+_MAX_FILM_RATE, _DEFAULT_FILM_RATE = 25.0, 10.0
 
 
 def check_film(name: str) -> str:
@@ -74,26 +74,31 @@ def write_film(
     from jeit.plot.imaging.image import slice_text
     from jeit.plot.imaging.series import FramePicture, fit_scale, select_frames
 
-    path, values = Path(path), np.asarray(changes)
+    path, frame_changes = Path(path), np.asarray(changes)
     check_film(path.name)
-    frame_titles = [f"frame {number}" for number in range(len(values))] if titles is None else list(titles)
+    frame_titles = [f"frame {number}" for number in range(len(frame_changes))] if titles is None else list(titles)
     figure = Figure(figsize=(5.0, 4.4), layout="constrained")
-    fitted_scale, selected = fit_scale(values, mesh, ColourScale(limit=limit)), select_frames(len(values), FILM_FRAMES)
-    picture = FramePicture(figure.subplots(), mesh, electrodes, fitted_scale)
-    fitted_scale.draw_bar(picture.ax, picture.mappable)
-    picture.show(values[selected[0]], frame_titles[selected[0]])
-    if text := slice_text(mesh):
-        figure.supxlabel(text, fontsize=9, color=LIGHT_GREY)
+    colour_scale, selected_frames = (
+        fit_scale(frame_changes, mesh, ColourScale(limit=limit)),
+        select_frames(len(frame_changes), FILM_FRAMES),
+    )
+    frame_picture = FramePicture(figure.subplots(), mesh, electrodes, colour_scale)
+    colour_scale.draw_bar(frame_picture.ax, frame_picture.mappable)
+    frame_picture.show(frame_changes[selected_frames[0]], frame_titles[selected_frames[0]])
+    if slice_caption := slice_text(mesh):
+        figure.supxlabel(slice_caption, fontsize=9, color=LIGHT_GREY)
     figure.canvas.draw()
-    figure.set_layout_engine("none")  # prevents a different layout in each frame
-    frame_rate = min(_DEFAULT_RATE if rate is None else rate * len(selected) / len(values), _MAX_RATE)
-    writer = (PillowWriter if path.suffix.lower() == ".gif" else FFMpegWriter)(fps=max(frame_rate, 0.1))  # pyright: ignore
+    figure.set_layout_engine("none")  # keeps the same layout in all frames
+    film_rate = min(
+        _DEFAULT_FILM_RATE if rate is None else rate * len(selected_frames) / len(frame_changes), _MAX_FILM_RATE
+    )
+    writer = (PillowWriter if path.suffix.lower() == ".gif" else FFMpegWriter)(fps=max(film_rate, 0.1))  # pyright: ignore
     with writer.saving(figure, str(path), 80):
-        for frame_index, frame in enumerate(selected):
-            picture.show(values[frame], frame_titles[frame])
+        for film_position, frame_number in enumerate(selected_frames):
+            frame_picture.show(frame_changes[frame_number], frame_titles[frame_number])
             writer.grab_frame()
             if progress is not None:
-                progress(f"{frame_index + 1} of {len(selected)}")
+                progress(f"{film_position + 1} of {len(selected_frames)}")
 
 
 SERIES_FILES = ("series.png", "series.npz", "regions.csv", "report.json")
@@ -131,12 +136,12 @@ def write_series(
     """
     series, model = series_result.series, series_result.prepared.model
     region_masks = {"whole body": np.ones(series.mesh.num_cells, bool)} if not regions else dict(regions)
-    films = () if film is None else (check_film(film),)
-    curves = {name: series.mean_change(region) for name, region in region_masks.items()}
-    report = _report(series_result, curves, oscillations)
+    film_names = () if film is None else (check_film(film),)
+    region_curves = {name: series.mean_change(region) for name, region in region_masks.items()}
+    report = _series_report(series_result, region_curves, oscillations)
     from jeit.plot.imaging.series import plot_series
 
-    with results(folder, (*SERIES_FILES, *films)) as temporary_folder:
+    with results(folder, (*SERIES_FILES, *film_names)) as temporary_folder:
         plot_series(series, region_masks, oscillations, model.electrodes).savefig(
             temporary_folder / "series.png", dpi=130
         )
@@ -156,9 +161,13 @@ def write_series(
                 -1, series.mesh.num_cells
             ),
         )
-        rows = zip(series.times, *curves.values(), strict=True)
-        cells = ([f"{time:.9g}", *("" if np.isnan(value) else f"{value:.6g}" for value in row)] for time, *row in rows)
-        write_rows(temporary_folder / "regions.csv", ("time_s" if series.timed else "frame", *curves), cells)
+        table_rows = zip(series.times, *region_curves.values(), strict=True)
+        formatted_rows = (
+            [f"{time:.9g}", *("" if np.isnan(value) else f"{value:.6g}" for value in row)] for time, *row in table_rows
+        )
+        write_rows(
+            temporary_folder / "regions.csv", ("time_s" if series.timed else "frame", *region_curves), formatted_rows
+        )
         write_json(report, temporary_folder / "report.json")
         if film is not None:
             titles, rate = series.titles, series.frame_rate
@@ -166,20 +175,23 @@ def write_series(
     return report
 
 
-def _report(sequence: ImagedSequence, curves: Mapping[str, np.ndarray], oscillations: Sequence[Oscillation]) -> dict:
+def _series_report(
+    sequence: ImagedSequence, region_curves: Mapping[str, np.ndarray], oscillations: Sequence[Oscillation]
+) -> dict:
     series = sequence.series
     oscillation_reports = []
     for fitted_oscillation in oscillations:
         region_oscillations = {
-            name: oscillation(curve, series.times, fitted_oscillation.frequency) for name, curve in curves.items()
+            name: oscillation(region_curve, series.times, fitted_oscillation.frequency)
+            for name, region_curve in region_curves.items()
         }
         region_reports = {
             name: {
-                "amplitude": float(component.amplitude),
-                "noise": float(component.noise),
-                "phase_degrees": float(np.degrees(component.phase)),
+                "amplitude": float(region_oscillation.amplitude),
+                "noise": float(region_oscillation.noise),
+                "phase_degrees": float(np.degrees(region_oscillation.phase)),
             }
-            for name, component in region_oscillations.items()
+            for name, region_oscillation in region_oscillations.items()
         }
         oscillation_reports.append(
             {
@@ -194,7 +206,9 @@ def _report(sequence: ImagedSequence, curves: Mapping[str, np.ndarray], oscillat
             "measurement": describe_measurement(sequence.prepared.measurement),
             "frames": len(series.times),
             "refused": int(sequence.refused.sum()),
-            "refused_frames": [{"frame": number, "reason": why} for number, why in sorted(sequence.reasons.items())],
+            "refused_frames": [
+                {"frame": frame_number, "reason": reason} for frame_number, reason in sorted(sequence.reasons.items())
+            ],
             "frames_with_moved_electrodes": np.flatnonzero(sequence.moved).tolist(),
             "frame_rate": series.frame_rate,
             "frame_rate_unit": "Hz",

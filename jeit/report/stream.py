@@ -1,5 +1,5 @@
-"""Files of a stream: a table and images, written frame by frame, and pictures at the end. Files can grow to any length
-with constant memory."""
+"""Files of a stream: a table and images, which are written frame by frame, and pictures, which are drawn at the end.
+The memory that is needed does not depend on the number of frames."""
 
 from __future__ import annotations
 
@@ -30,13 +30,14 @@ from jeit.report.series import FILM_FRAMES, check_film, write_film
 PICTURES = ("contact sheet", "film")
 """Names of the pictures of a stream, as passed to `drawing`."""
 
-_COLUMNS = ("frame", "status", "channels", "misfit", "iterations", "latency_ms", "x_m", "y_m", "peak", "reason")
-_STATUSES_WITHOUT_IMAGE = (FrameStatus.REFUSED, FrameStatus.UNCHANGED)
-# End of the colour scale of streams without changes, as a share of the background; large enough that noise is not
-# visible.
-_MIN_COLOUR_SCALE_SHARE = 0.01
+_TABLE_COLUMNS = ("frame", "status", "channels", "misfit", "iterations", "latency_ms", "x_m", "y_m", "peak", "reason")
+# Statuses of frames for which no change of conductivity was imaged.
+_STATUSES_WITHOUT_CHANGE = (FrameStatus.REFUSED, FrameStatus.UNCHANGED)
+# End of the colour scale of streams without changes, as a fraction of the conductivity of the background. It is large
+# enough that noise is not visible.
+_UNCHANGED_COLOUR_LIMIT = 0.01
 # Maximum number of refused frames named below the contact sheet.
-_MAX_NAMED_FRAMES = 8
+_MAX_LISTED_REFUSALS = 8
 # Number of bytes read and compressed at once, and maximum number of values of a `SeriesSample`.
 _BLOCK_BYTES, _MAX_SAMPLE_VALUES = 2**20, 2**16
 
@@ -103,66 +104,69 @@ def write_stream(
         raise ValueError(f"rate must be positive, frames in a second; it is {describe(rate)}.")
     file_names = ("frames.csv", "images.npz", "frames.png", *([] if film is None else [film]))
     folder = results_folder(folder, file_names)
-    for earlier_name in file_names[1:]:
-        (folder / earlier_name).unlink(missing_ok=True)  # the file belongs to an earlier stream
+    for earlier_file_name in file_names[1:]:
+        (folder / earlier_file_name).unlink(missing_ok=True)  # the file belongs to an earlier stream
     remove_unfinished_files(folder)
-    report = drawing or (lambda task: None)
-    mesh, summary = calibration.model.mesh, _StreamSummary(calibration)
-    with GrowingRows(folder, (mesh.num_cells,)) as rows:
-        with GrowingTable(folder / "frames.csv", _COLUMNS) as table:
+    report_drawing = drawing or (lambda task: None)
+    mesh, stream_summary = calibration.model.mesh, _StreamSummary(calibration)
+    with GrowingRows(folder, (mesh.num_cells,)) as image_rows:
+        with GrowingTable(folder / "frames.csv", _TABLE_COLUMNS) as frame_table:
             for frame_image in images:
-                row, image = summary.add_frame(frame_image)
-                with reporting_partial_results(rows):
-                    table.write(row)
-                    rows.append(image)
+                table_row, image = stream_summary.add_frame(frame_image)
+                with reporting_partial_results(image_rows):
+                    frame_table.write(table_row)
+                    image_rows.append(image)
                 if progress is not None:
                     progress(frame_image)
-        if not rows.number:
+        if not image_rows.number:
             raise ValueError(f"'{name}': there was no frame in it.")
-        arrays = {"background": calibration.conductivity, "points": mesh.points, "cells": mesh.cells}
-        report("images")
-        with reporting_partial_results(rows):
-            rows.write_npz(
-                folder / "images.npz", "conductivity", arrays, lambda progress_text: report(f"images: {progress_text}")
+        model_arrays = {"background": calibration.conductivity, "points": mesh.points, "cells": mesh.cells}
+        report_drawing("images")
+        with reporting_partial_results(image_rows):
+            image_rows.write_npz(
+                folder / "images.npz",
+                "conductivity",
+                model_arrays,
+                lambda progress_text: report_drawing(f"images: {progress_text}"),
             )
-        latency = summary.latency.values()
-        if latency.size:
-            _StreamPictures(folder, film, rate, report).draw_pictures(rows, summary)
-        return WrittenStream(rows.number, summary.counts, latency, summary.first_reason)
+        latencies = stream_summary.latencies.values()
+        if latencies.size:
+            _StreamPictures(folder, film, rate, report_drawing).draw_pictures(image_rows, stream_summary)
+        return WrittenStream(image_rows.number, stream_summary.status_counts, latencies, stream_summary.first_reason)
 
 
 class _StreamSummary:
-    """Statistics of the frames of a stream, which take the same memory for any number of frames."""
+    """Statistics of the frames of a stream. The memory that they need does not depend on the number of frames."""
 
     def __init__(self, calibration: Calibration):
         self.calibration = calibration
         mesh, self.background = calibration.model.mesh, float(calibration.conductivity)
         self._strongest_region = StrongestRegion(mesh)
-        self._empty_image = np.full(mesh.num_cells, np.nan, np.float32)
-        self.latency, self.counts, self.first_reason = SeriesSample(), {}, ""
-        self.refused_frames, self.first_imaged, self.max_change = [], -1, 0.0
+        self._refused_image = np.full(mesh.num_cells, np.nan, np.float32)
+        self.latencies, self.status_counts, self.first_reason = SeriesSample(), {}, ""
+        self.refused_frames, self.first_imaged_frame, self.max_change = [], -1, 0.0
 
     def add_frame(self, frame_image: FrameImage) -> tuple[list[object], Float[np.ndarray, " m"]]:
         """Add a frame to the statistics; return its line of the table, and its image."""
-        self.counts[str(frame_image.status)] = self.counts.get(str(frame_image.status), 0) + 1
+        self.status_counts[str(frame_image.status)] = self.status_counts.get(str(frame_image.status), 0) + 1
         if frame_image.conductivity is None:
             self.first_reason = self.first_reason or frame_image.reason
-            self.refused_frames += [frame_image.number] if len(self.refused_frames) < _MAX_NAMED_FRAMES else []
-            return _table_row(frame_image, self._strongest_region, self.background), self._empty_image
-        self.first_imaged = frame_image.number if self.first_imaged < 0 else self.first_imaged
-        self.latency.append(frame_image.latency)
+            self.refused_frames += [frame_image.number] if len(self.refused_frames) < _MAX_LISTED_REFUSALS else []
+            return _table_row(frame_image, self._strongest_region, self.background), self._refused_image
+        self.first_imaged_frame = frame_image.number if self.first_imaged_frame < 0 else self.first_imaged_frame
+        self.latencies.append(frame_image.latency)
         image = frame_image.conductivity.astype(np.float32)
         self.max_change = max(self.max_change, float(np.abs(image - np.float32(self.background)).max()))
         return _table_row(frame_image, self._strongest_region, self.background), image
 
     @property
     def colour_limit(self) -> float:
-        """End of the colour scale: the maximum change, or, for streams without changes, `_MIN_COLOUR_SCALE_SHARE` times
+        """End of the colour scale: the maximum change, or, for streams without changes, `_UNCHANGED_COLOUR_LIMIT` times
         the background, so that noise does not fill the scale."""
-        has_changed_frames = sum(self.counts.values()) > sum(
-            self.counts.get(status, 0) for status in _STATUSES_WITHOUT_IMAGE
+        has_changed_frames = sum(self.status_counts.values()) > sum(
+            self.status_counts.get(status, 0) for status in _STATUSES_WITHOUT_CHANGE
         )
-        return self.max_change if has_changed_frames else _MIN_COLOUR_SCALE_SHARE * self.background
+        return self.max_change if has_changed_frames else _UNCHANGED_COLOUR_LIMIT * self.background
 
 
 @dataclass(frozen=True)
@@ -171,56 +175,65 @@ class _StreamPictures:
     reported."""
 
     folder: Path
-    film: str | None
-    rate: float | None
-    report: Callable[[str], None]
+    film_name: str | None
+    frame_rate: float | None
+    report_progress: Callable[[str], None]
 
-    def draw_pictures(self, rows: GrowingRows, summary: _StreamSummary) -> None:
+    def draw_pictures(self, image_rows: GrowingRows, stream_summary: _StreamSummary) -> None:
         """Draw the contact sheet and the film from evenly spaced rows."""
         from jeit.plot import ColourScale, plot_frames
         from jeit.plot.imaging.series import NUM_CONTACT_SHEET_FRAMES, FrameCount
 
-        model, colour_limit = summary.calibration.model, summary.colour_limit
-        self.report(PICTURES[0])
-        changes, titles = self._selected_changes(rows, summary, NUM_CONTACT_SHEET_FRAMES)
-        count = FrameCount(rows.number, summary.counts.get("refused", 0), self._titles(summary.refused_frames))
-        scale = ColourScale(limit=colour_limit)
-        sheet = plot_frames(model.mesh, changes, model.electrodes, titles=titles, scale=scale, count=count)
+        model, colour_limit = stream_summary.calibration.model, stream_summary.colour_limit
+        self.report_progress(PICTURES[0])
+        changes, titles = self._selected_changes(image_rows, stream_summary, NUM_CONTACT_SHEET_FRAMES)
+        frame_count = FrameCount(
+            image_rows.number,
+            stream_summary.status_counts.get("refused", 0),
+            self._frame_titles(stream_summary.refused_frames),
+        )
+        colour_scale = ColourScale(limit=colour_limit)
+        contact_sheet = plot_frames(
+            model.mesh, changes, model.electrodes, titles=titles, scale=colour_scale, count=frame_count
+        )
         with atomically_written_file(self.folder / "frames.png") as file:
-            sheet.savefig(file, dpi=120)
-        if self.film is None:
+            contact_sheet.savefig(file, dpi=120)
+        if self.film_name is None:
             return
-        changes, titles = self._selected_changes(rows, summary, FILM_FRAMES)
-        film_rate = None if self.rate is None else self.rate * len(changes) / rows.number
+        changes, titles = self._selected_changes(image_rows, stream_summary, FILM_FRAMES)
+        film_rate = None if self.frame_rate is None else self.frame_rate * len(changes) / image_rows.number
         with atomically_written_files(self.folder) as temporary_folder:
             write_film(
-                temporary_folder / self.film,
+                temporary_folder / self.film_name,
                 model.mesh,
                 changes,
                 model.electrodes,
                 titles=titles,
                 rate=film_rate,
                 limit=colour_limit,
-                progress=lambda progress_text: self.report(f"{PICTURES[1]}: {progress_text}"),
+                progress=lambda progress_text: self.report_progress(f"{PICTURES[1]}: {progress_text}"),
             )
 
     def _selected_changes(
-        self, rows: GrowingRows, summary: _StreamSummary, max_frames: int
+        self, image_rows: GrowingRows, stream_summary: _StreamSummary, max_frames: int
     ) -> tuple[Float[np.ndarray, "k m"], list[str]]:
         from jeit.plot.imaging.series import select_frames
 
-        selected = select_frames(rows.number, max_frames)
-        images = rows.read(selected)
-        if not np.isfinite(images).any():  # include a frame that was imaged
-            selected = sorted({summary.first_imaged, *selected[1:]})
-            images = rows.read(selected)
-        return images - np.float32(summary.background), self._titles(selected)
+        selected_frames = select_frames(image_rows.number, max_frames)
+        images = image_rows.read(selected_frames)
+        if not np.isfinite(images).any():  # all selected frames were refused: include a frame that was imaged
+            selected_frames = sorted({stream_summary.first_imaged_frame, *selected_frames[1:]})
+            images = image_rows.read(selected_frames)
+        return images - np.float32(stream_summary.background), self._frame_titles(selected_frames)
 
-    def _titles(self, numbers: Iterable[int]) -> list[str]:
-        return [f"frame {number}" if self.rate is None else f"{number / self.rate:.2f} s" for number in numbers]
+    def _frame_titles(self, frame_numbers: Iterable[int]) -> list[str]:
+        return [
+            f"frame {frame_number}" if self.frame_rate is None else f"{frame_number / self.frame_rate:.2f} s"
+            for frame_number in frame_numbers
+        ]
 
 
-def _table_row(frame_image: FrameImage, strongest: StrongestRegion, background: float) -> list[object]:
+def _table_row(frame_image: FrameImage, strongest_region: StrongestRegion, background: float) -> list[object]:
     """Values of a frame for its line of `frames.csv`."""
     latency_text = f"{1e3 * frame_image.latency:.3f}"
     if frame_image.conductivity is None:
@@ -236,19 +249,19 @@ def _table_row(frame_image: FrameImage, strongest: StrongestRegion, background: 
             "",
             frame_image.reason,
         ]
-    misfit = "" if np.isnan(frame_image.misfit) else f"{frame_image.misfit:.4g}"
-    first_values = [
+    misfit_text = "" if np.isnan(frame_image.misfit) else f"{frame_image.misfit:.4g}"
+    first_cells = [
         frame_image.number,
         frame_image.status,
         int(frame_image.usable.sum()),
-        misfit,
+        misfit_text,
         frame_image.iterations,
         latency_text,
     ]
     if frame_image.status == FrameStatus.UNCHANGED:
-        return [*first_values, "", "", "", frame_image.reason]
-    centroid, peak = strongest(frame_image.conductivity - background)
-    return [*first_values, *(f"{value:.5f}" for value in centroid[:2]), f"{peak:.5g}", frame_image.reason]
+        return [*first_cells, "", "", "", frame_image.reason]
+    centroid, peak = strongest_region(frame_image.conductivity - background)
+    return [*first_cells, *(f"{value:.5f}" for value in centroid[:2]), f"{peak:.5g}", frame_image.reason]
 
 
 class GrowingTable:
@@ -263,13 +276,13 @@ class GrowingTable:
 
     def write(self, row: Iterable[Any]) -> None:
         """Write one line, completely or not at all."""
-        text = io.StringIO()
-        csv.writer(text).writerow(row)
-        line = text.getvalue().encode("utf-8", "backslashreplace")
-        line_start, num_written = self._file.tell(), 0
+        text_buffer = io.StringIO()
+        csv.writer(text_buffer).writerow(row)
+        encoded_line = text_buffer.getvalue().encode("utf-8", "backslashreplace")
+        line_start, num_bytes_written = self._file.tell(), 0
         try:
-            while num_written < len(line):
-                num_written += self._file.write(line[num_written:])
+            while num_bytes_written < len(encoded_line):
+                num_bytes_written += self._file.write(encoded_line[num_bytes_written:])
         except OSError:
             self._file.truncate(line_start)
             raise
@@ -282,8 +295,8 @@ class GrowingTable:
 
 
 class GrowingRows:
-    """Array (n, *shape) of single precision, stored row by row in a temporary file in `folder`. The system deletes the
-    file when the process ends. Raises `OSError` if the disk is full."""
+    """Array (n, *shape) of single precision that is stored row by row in a temporary file in `folder`. The operating
+    system deletes the file when the process ends. Raises `OSError` if the disk is full."""
 
     def __init__(self, folder: Path, shape: tuple[int, ...]):
         self.folder, self.shape, self.number = folder, shape, 0
@@ -295,11 +308,11 @@ class GrowingRows:
         self.number += 1
 
     def read(self, row_indices: Iterable[int]) -> Float[np.ndarray, "k *shape"]:
-        """Read the rows of the given `row_indices`; call it only after the last `append`."""
-        size, rows = 4 * int(np.prod(self.shape)), []
+        """Read the rows with the given `row_indices`. This method must be called only after the last `append`."""
+        row_bytes, rows = 4 * int(np.prod(self.shape)), []
         for row_index in row_indices:
-            self._file.seek(size * row_index)
-            rows.append(np.frombuffer(self._file.read(size), np.float32).reshape(self.shape))
+            self._file.seek(row_bytes * row_index)
+            rows.append(np.frombuffer(self._file.read(row_bytes), np.float32).reshape(self.shape))
         return np.stack(rows)
 
     def write_npz(
@@ -312,25 +325,25 @@ class GrowingRows:
         """Write an NPZ file, completely or not at all, with all rows as the array `name`, and with the arrays
         `other_arrays`. The rows are copied block by block; for large files, `progress` is called with the percentage
         written."""
-        header = {"descr": "<f4", "fortran_order": False, "shape": (self.number, *self.shape)}
+        npy_header = {"descr": "<f4", "fortran_order": False, "shape": (self.number, *self.shape)}
         with atomically_written_file(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array_header_1_0(member, header)
-                for completed_share, block in self._blocks():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as npy_file:
+                np.lib.format.write_array_header_1_0(npy_file, npy_header)
+                for copied_share, block in self._file_blocks():
                     if progress is not None and self._file.tell() > _BLOCK_BYTES:
-                        progress(f"{100 * completed_share:.0f} %")
-                    member.write(block)
+                        progress(f"{100 * copied_share:.0f} %")
+                    npy_file.write(block)
             for other_name, values in other_arrays.items():
-                with archive.open(f"{other_name}.npy", "w", force_zip64=True) as member:
-                    np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
+                with archive.open(f"{other_name}.npy", "w", force_zip64=True) as npy_file:
+                    np.lib.format.write_array(npy_file, np.asarray(values), allow_pickle=False)
 
-    def _blocks(self) -> Iterator[tuple[float, bytes]]:
-        """Yield the file of rows in blocks, each with the share of the file that has been read at the end of the
-        block."""
-        size = self._file.seek(0, os.SEEK_END)
+    def _file_blocks(self) -> Iterator[tuple[float, bytes]]:
+        """Yield the file of rows in blocks, each preceded by the fraction of the file that has been read at the end of
+        the block."""
+        file_size = self._file.seek(0, os.SEEK_END)
         self._file.seek(0)
         while block := self._file.read(_BLOCK_BYTES):
-            yield self._file.tell() / size, block
+            yield self._file.tell() / file_size, block
 
     def __enter__(self) -> "GrowingRows":
         return self
@@ -342,13 +355,13 @@ class GrowingRows:
 
 @contextlib.contextmanager
 def reporting_partial_results(rows: GrowingRows) -> Iterator[None]:
-    """Context manager that adds to the message of an `OSError`, for example for a full disk, how many frames have been
-    written, and raises a new `OSError`."""
+    """Context manager that replaces an `OSError`, for example that of a full disk, by an `OSError` whose message also
+    states how many frames have been written."""
     try:
         yield
     except OSError as error:
-        remaining_text = f"frames.csv has the {counted(rows.number, 'frame')} until then"
-        message = f"{error.strerror or error}: what came of the stream could not all be written; {remaining_text}"
+        written_frames_text = f"frames.csv has the {counted(rows.number, 'frame')} until then"
+        message = f"{error.strerror or error}: what came of the stream could not all be written; {written_frames_text}"
         raise OSError(error.errno, message, str(rows.folder)) from error
 
 
@@ -358,16 +371,16 @@ class SeriesSample:
     stored."""
 
     def __init__(self) -> None:
-        self._values, self._step, self._number = array("d"), 1, 0
+        self._stored_values, self._sampling_step, self._num_appended = array("d"), 1, 0
 
     def append(self, value: float) -> None:
         """Add the next number of the series, and store it if it belongs to the sample."""
-        if self._number % self._step == 0:
-            if len(self._values) == _MAX_SAMPLE_VALUES:
-                self._values, self._step = self._values[::2], 2 * self._step
-            self._values.append(value)
-        self._number += 1
+        if self._num_appended % self._sampling_step == 0:
+            if len(self._stored_values) == _MAX_SAMPLE_VALUES:
+                self._stored_values, self._sampling_step = self._stored_values[::2], 2 * self._sampling_step
+            self._stored_values.append(value)
+        self._num_appended += 1
 
     def values(self) -> Float[np.ndarray, " k"]:
         """Return the stored numbers."""
-        return np.array(self._values)
+        return np.array(self._stored_values)

@@ -18,7 +18,7 @@ from jeit.mesh import Mesh, write
 from jeit.mesh.mesh import facet_measures
 from jeit.report.folder import results_folder
 
-# A node counts as under an electrode if the electrode covers at least this share of the surface around the node.
+# Minimum fraction of the surface around a node that an electrode covers if the node belongs to the electrode.
 _MIN_COVERED_SHARE = 0.1
 
 
@@ -65,12 +65,12 @@ def draft_vtu(
     point_data: Mapping[str, ArrayLike] | None = None,
     electrodes: AbstractElectrodes | None = None,
 ) -> None:
-    """Write a VTU file as `write_vtu` does, but directly to `path`, for example in the temporary folder of
-    `results`."""
-    node_data = dict(point_data or {})
+    """Write a VTU file as `write_vtu` does, but directly to `path`, for example into the temporary folder that
+    `results` yields."""
+    point_arrays = dict(point_data or {})
     if electrodes is not None:
-        node_data["electrode"] = electrode_of_nodes(mesh, electrodes)
-    write(mesh, path, cell_data=_real_arrays(cell_data), point_data=_real_arrays(node_data))
+        point_arrays["electrode"] = electrode_of_nodes(mesh, electrodes)
+    write(mesh, path, cell_data=_real_arrays(cell_data), point_data=_real_arrays(point_arrays))
 
 
 def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]) -> None:
@@ -96,13 +96,13 @@ def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: 
     path = Path(path)
     if path.suffix.lower() != ".pvd":
         raise ValueError(f"path: {path.name[:80]} must end in .pvd.")
-    seconds, values = _checked_frames(mesh, times, cell_data)
-    names = [f"{path.stem}_{k:04d}.vtu" for k in range(len(seconds))]
+    frame_times, cell_values = _checked_frames(mesh, times, cell_data)
+    vtu_names = [f"{path.stem}_{frame_number:04d}.vtu" for frame_number in range(len(frame_times))]
     file_entries = [
         f'    <DataSet timestep="{time:.17g}" part="0" file={quoteattr(name)}/>'
-        for time, name in zip(seconds, names, strict=True)
+        for time, name in zip(frame_times, vtu_names, strict=True)
     ]
-    lines = [
+    pvd_lines = [
         '<?xml version="1.0"?>',
         '<VTKFile type="Collection" version="0.1">',
         "  <Collection>",
@@ -110,10 +110,10 @@ def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: 
         "  </Collection>",
         "</VTKFile>",
     ]
-    with atomically_written_files(results_folder(path.parent, (path.name, *names))) as temporary_folder:
-        for k, name in enumerate(names):
-            draft_vtu(temporary_folder / name, mesh, {key: array[k] for key, array in values.items()})
-        (temporary_folder / path.name).write_text("\n".join(lines) + "\n", "utf-8")
+    with atomically_written_files(results_folder(path.parent, (path.name, *vtu_names))) as temporary_folder:
+        for frame_number, name in enumerate(vtu_names):
+            draft_vtu(temporary_folder / name, mesh, {key: array[frame_number] for key, array in cell_values.items()})
+        (temporary_folder / path.name).write_text("\n".join(pvd_lines) + "\n", "utf-8")
 
 
 def write_xdmf(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]) -> None:
@@ -137,47 +137,49 @@ def write_xdmf(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: Mappin
     path = Path(path)
     if path.suffix.lower() != ".xdmf":
         raise ValueError(f"path: {path.name[:80]} must end in .xdmf.")
-    seconds, values = _checked_frames(mesh, times, cell_data)
+    frame_times, cell_values = _checked_frames(mesh, times, cell_data)
     points = np.asarray(mesh.points, float)
     if points.shape[1] == 2:
         points = np.column_stack([points, np.zeros(len(points))])
-    kind = {3: "triangle", 4: "tetra"}[mesh.cells.shape[1]]
+    cell_type = {3: "triangle", 4: "tetra"}[mesh.cells.shape[1]]
     folder = results_folder(path.parent, (path.name,))
     with (
         atomically_written_files(folder) as temporary_folder,
         TimeSeriesWriter(str(temporary_folder / path.name), data_format="XML") as file,
     ):
-        file.write_points_cells(points, [(kind, np.asarray(mesh.cells))])
-        for k, time in enumerate(seconds):
-            file.write_data(float(time), cell_data={key: [array[k]] for key, array in values.items()})
+        file.write_points_cells(points, [(cell_type, np.asarray(mesh.cells))])
+        for frame_number, time in enumerate(frame_times):
+            file.write_data(float(time), cell_data={key: [array[frame_number]] for key, array in cell_values.items()})
 
 
 def electrode_of_nodes(mesh: Mesh, electrodes: AbstractElectrodes) -> Int[np.ndarray, " n"]:
     """Number, from 1, of the electrode at each node of a mesh (n,); 0 for nodes without an electrode."""
     contact = electrodes.contact(mesh)
-    load = np.asarray(contact.load)
+    node_shares = np.asarray(contact.load)
     if not electrodes.is_point:
-        load = load * np.asarray(electrodes.contact_impedance)
-        facets = np.asarray(contact.nodes[0])
-        if len(contact.nodes) == 1 and facets.shape == np.shape(mesh.facets):
-            facet_shares = np.repeat(np.asarray(facet_measures(mesh)) / facets.shape[1], facets.shape[1])
-            node_measures = np.bincount(facets.ravel(), facet_shares, mesh.num_points)
-            load = load / np.where(node_measures > 0, node_measures, np.inf)[:, None]
+        node_shares = node_shares * np.asarray(electrodes.contact_impedance)
+        contact_facets = np.asarray(contact.nodes[0])
+        if len(contact.nodes) == 1 and contact_facets.shape == np.shape(mesh.facets):
+            node_measures_per_facet = np.repeat(
+                np.asarray(facet_measures(mesh)) / contact_facets.shape[1], contact_facets.shape[1]
+            )
+            node_measures = np.bincount(contact_facets.ravel(), node_measures_per_facet, mesh.num_points)
+            node_shares = node_shares / np.where(node_measures > 0, node_measures, np.inf)[:, None]
         else:
-            load = load / load.max(axis=0)
-    return np.where(load.max(axis=1) > _MIN_COVERED_SHARE, load.argmax(axis=1) + 1, 0)
+            node_shares = node_shares / node_shares.max(axis=0)
+    return np.where(node_shares.max(axis=1) > _MIN_COVERED_SHARE, node_shares.argmax(axis=1) + 1, 0)
 
 
-def _real_arrays(data: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
+def _real_arrays(arrays_by_name: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
     """Replace complex arrays by two arrays, their real and imaginary part."""
-    arrays = {}
-    for name, values in data.items():
+    real_arrays = {}
+    for name, values in arrays_by_name.items():
         array: Any = np.asarray(values)
         if np.iscomplexobj(array):
-            arrays[f"{name}, real"], arrays[f"{name}, imaginary"] = array.real, array.imag
+            real_arrays[f"{name}, real"], real_arrays[f"{name}, imaginary"] = array.real, array.imag
         else:
-            arrays[name] = array
-    return arrays
+            real_arrays[name] = array
+    return real_arrays
 
 
 def _checked_frames(
@@ -186,19 +188,19 @@ def _checked_frames(
     """Check the times and values of a series, and return them as arrays. Raises `ValueError` if they do not fit the
     mesh and each other."""
     check_kind("mesh", mesh, Mesh, "a Mesh, such as Disk(0.05).mesh()")
-    seconds: Sequence | np.ndarray = np.atleast_1d(np.asarray(times, dtype=object))
-    if len(seconds) == 0 or not all(is_number(time) for time in seconds):
+    frame_times: Sequence | np.ndarray = np.atleast_1d(np.asarray(times, dtype=object))
+    if len(frame_times) == 0 or not all(is_number(time) for time in frame_times):
         raise ValueError(f"times must be a time for each frame, seconds; they are {describe(times)}.")
-    seconds = np.asarray(seconds, float)
-    if not (np.diff(seconds) > 0).all():
+    frame_times = np.asarray(frame_times, float)
+    if not (np.diff(frame_times) > 0).all():
         raise ValueError("times must rise from frame to frame.")
-    values = _real_arrays(cell_data)
-    for name, array in values.items():
-        if array.shape != (len(seconds), mesh.num_cells):
+    cell_values = _real_arrays(cell_data)
+    for name, array in cell_values.items():
+        if array.shape != (len(frame_times), mesh.num_cells):
             raise ValueError(
-                f"cell_data: {str(name)[:40]!r} has shape {array.shape}; give one value for each of the {len(seconds)} "
-                f"times and {mesh.num_cells} cells."
+                f"cell_data: {str(name)[:40]!r} has shape {array.shape}; give one value for each of the "
+                f"{len(frame_times)} times and {mesh.num_cells} cells."
             )
-    if not values:
+    if not cell_values:
         raise ValueError("cell_data is empty; give the values of the frames by name.")
-    return seconds, values
+    return frame_times, cell_values

@@ -18,9 +18,9 @@ import jax
 
 
 def take_double_precision() -> None:
-    """Set JAX to double precision, because single precision is not accurate enough for the change of the voltages by a
-    light touch, 1e-4. A value of JAX_ENABLE_X64 that the user has set takes precedence; for single precision a warning
-    states the loss of accuracy (docs/explanation/numerics.md).
+    """Set JAX to double precision, because a light touch changes voltages by 1e-4, for which single precision is not
+    accurate enough. A value of JAX_ENABLE_X64 that the user has set takes precedence; if it selects single precision, a
+    warning states the loss of accuracy (docs/explanation/numerics.md).
 
     Products of single-precision matrices use all 24 bits of the factors, which JAX would by default round to 11 bits on
     graphics processors. A value of JAX_DEFAULT_MATMUL_PRECISION that the user has set takes precedence.
@@ -41,10 +41,10 @@ def take_double_precision() -> None:
 
 
 def quick_compilation() -> str:
-    """Value of the environment variable XLA_FLAGS for fast compilation; it must be set before JAX computes anything.
+    """Value of the environment variable XLA_FLAGS for fast compilation. It must be set before JAX computes anything.
 
-    Code without optimisation compiles in a quarter of the time. The flags depend on the version of jaxlib, because XLA
-    (JAX's compiler) aborts the process at unknown flags.
+    Without optimisation, compilation takes a quarter of the time. The flags depend on the version of jaxlib, because
+    XLA (JAX's compiler) aborts the process at unknown flags.
     """
     fusion_option = " --xla_cpu_use_fusion_emitters=false" if version("jaxlib").startswith("0.10.") else ""
     return f"--xla_backend_optimization_level=0{fusion_option}"
@@ -58,19 +58,19 @@ def refuse_compiled_code_in_forks() -> None:
     threads, so a compiled program would wait forever. Methods of jeit that run in NumPy still work, and a process
     forked before JAX has started is not restricted."""
     if hasattr(os, "register_at_fork"):
-        os.register_at_fork(after_in_child=_refuse_in_child)
+        os.register_at_fork(after_in_child=_refuse_compilation_in_child)
 
 
-def _refuse_in_child() -> None:
+def _refuse_compilation_in_child() -> None:
     global _refuses_compilation
-    if _refuses_compilation or not _has_started():
+    if _refuses_compilation or not _jax_has_started():
         return
     _refuses_compilation = True
-    jax.clear_caches()  # programs compiled before the fork are deleted, and compilation of new programs is refused
+    jax.clear_caches()  # programs compiled before the fork must not run; they would be compiled anew, which is refused
     jax.monitoring.register_event_duration_secs_listener(_raise_at_compilation)
 
 
-def _has_started() -> bool:
+def _jax_has_started() -> bool:
     from jax._src import xla_bridge
 
     return xla_bridge.backends_are_initialized()
@@ -87,7 +87,8 @@ def _raise_at_compilation(event: str, duration_secs: float, **_: str | int) -> N
         )
 
 
-_MAX_BYTES, _MAX_FILES = 256 * 2**20, 5000
+# Maximum total size and number of the files in the cache of compiled programs.
+_MAX_CACHE_BYTES, _MAX_CACHE_FILES = 256 * 2**20, 5000
 
 
 def keep_compiled_code() -> None:
@@ -99,19 +100,19 @@ def keep_compiled_code() -> None:
     identifies programs by their text and by the versions of JAX and of the compiler. The least recently used programs
     are deleted when there are more than 5,000 files or 256 MiB.
     """
-    user_folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    setting = os.environ.get("JEIT_COMPILATION_CACHE", "").strip().lower()
-    if user_folder is not None or setting in ("off", "0", "no", "none", "false", "disabled"):
+    user_cache_folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    cache_setting = os.environ.get("JEIT_COMPILATION_CACHE", "").strip().lower()
+    if user_cache_folder is not None or cache_setting in ("off", "0", "no", "none", "false", "disabled"):
         return
     try:
         cache_folder = _cache_folder() / "jeit" / "jax"
-        folder = cache_folder / _processor()
-        folder.mkdir(parents=True, exist_ok=True)
-        _discard_oldest(cache_folder)
+        processor_folder = cache_folder / _processor_identifier()
+        processor_folder.mkdir(parents=True, exist_ok=True)
+        _discard_oldest_programs(cache_folder)
     except (OSError, RuntimeError):
         return
-    if os.access(folder, os.W_OK):
-        jax.config.update("jax_compilation_cache_dir", str(folder))
+    if os.access(processor_folder, os.W_OK):
+        jax.config.update("jax_compilation_cache_dir", str(processor_folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
@@ -123,47 +124,51 @@ def discard_damaged_cache_files(warning: str) -> bool:
     JAX does not overwrite cached files. If they stayed, it would compile the program again and repeat the warning in
     every later process.
     """
-    match = re.match(r"Error reading persistent compilation cache entry for '([\w<>.-]+)'", warning)
-    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    if match is None or not folder or not Path(folder).is_relative_to(_cache_folder() / "jeit"):
+    warning_match = re.match(r"Error reading persistent compilation cache entry for '([\w<>.-]+)'", warning)
+    processor_folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    if (
+        warning_match is None
+        or not processor_folder
+        or not Path(processor_folder).is_relative_to(_cache_folder() / "jeit")
+    ):
         return False
-    for path in Path(folder).glob(f"{glob.escape(match[1])}-*"):
+    for cache_file in Path(processor_folder).glob(f"{glob.escape(warning_match[1])}-*"):
         with contextlib.suppress(OSError):
-            path.unlink()
+            cache_file.unlink()
     return True
 
 
-def _processor() -> str:
-    """Identifier of the type of processor. Machines with different processors may share a home folder, and must not run
-    each other's compiled code."""
-    description = platform.machine() + platform.processor()
-    with contextlib.suppress(OSError), open("/proc/cpuinfo") as lines:
-        description += next((line for line in lines if line.startswith(("flags", "Features"))), "")
-    return hashlib.sha256(description.encode()).hexdigest()[:12]
+def _processor_identifier() -> str:
+    """Identifier of the type of processor, by which compiled programs are stored. Machines with different processors
+    may share a home folder, and must not run each other's programs."""
+    processor_description = platform.machine() + platform.processor()
+    with contextlib.suppress(OSError), open("/proc/cpuinfo") as cpu_info:
+        processor_description += next((line for line in cpu_info if line.startswith(("flags", "Features"))), "")
+    return hashlib.sha256(processor_description.encode()).hexdigest()[:12]
 
 
-def _discard_oldest(folder: Path) -> None:
-    """Delete the least recently used cached programs beyond the limits on number and size. Also delete empty files,
-    which a full disk leaves behind, and which JAX cannot read."""
-    files = sorted(_last_uses_of_files(folder), reverse=True)
+def _discard_oldest_programs(cache_folder: Path) -> None:
+    """Delete the least recently used cached programs until the limits on number and size are met. Also delete empty
+    files, which remain when the disk was full, and which JAX cannot read."""
+    cache_files = sorted(_last_uses_of_files(cache_folder), reverse=True)
     total_bytes = 0
-    for file_index, (_, num_bytes, path) in enumerate(files):
-        total_bytes += num_bytes
-        if file_index >= _MAX_FILES or total_bytes > _MAX_BYTES or not num_bytes:
-            path.unlink(missing_ok=True)
+    for file_index, (_, file_bytes, cache_file) in enumerate(cache_files):
+        total_bytes += file_bytes
+        if file_index >= _MAX_CACHE_FILES or total_bytes > _MAX_CACHE_BYTES or not file_bytes:
+            cache_file.unlink(missing_ok=True)
 
 
-def _last_uses_of_files(folder: Path) -> Iterator[tuple[float, int, Path]]:
+def _last_uses_of_files(cache_folder: Path) -> Iterator[tuple[float, int, Path]]:
     """Time of last use, size in bytes, and path of each file in the cache folder."""
-    for path in folder.glob("*/*"):
+    for cache_file in cache_folder.glob("*/*"):
         with contextlib.suppress(FileNotFoundError):  # another process may delete the file
-            status = path.stat()
-            yield max(status.st_atime, status.st_mtime), status.st_size, path
+            file_status = cache_file.stat()
+            yield max(file_status.st_atime, file_status.st_mtime), file_status.st_size, cache_file
 
 
 def _cache_folder() -> Path:
     if sys.platform == "darwin":
         return Path.home() / "Library" / "Caches"
-    variable = "LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME"
-    folder = Path(os.environ.get(variable, ""))
-    return folder if folder.is_absolute() else Path.home() / ".cache"
+    folder_variable = "LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME"
+    user_folder = Path(os.environ.get(folder_variable, ""))
+    return user_folder if user_folder.is_absolute() else Path.home() / ".cache"

@@ -16,7 +16,7 @@ from jeit.imaging import ImagingSettings, compare_on_data, image_difference
 from jeit.inverse import RULES
 from jeit.mesh import disk
 from jeit.report import draw_choice, report_choice
-from jeit.report.hyperparameter_rules import _draw_outcome
+from jeit.report.hyperparameter_rules import _draw_rule_image
 
 SMALL = ("--num-points", 250, "--contact", "fixed")
 
@@ -70,7 +70,7 @@ def test_the_image_of_a_rule_has_its_own_scale_and_few_marks(number, title, mark
     outcome: Any = SimpleNamespace(change=change, inclusions=number * found)
     figure = Figure()
     ax = figure.subplots()
-    _draw_outcome(ax, "gcv", outcome, mesh)
+    _draw_rule_image(ax, "gcv", outcome, mesh)
     bar = figure.axes[1]
     assert [label.get_text() for label in bar.get_xticklabels()] == ["−2", "0", "+2 mS"]
     np.testing.assert_allclose(bar.get_xticks(), [-2, 0, 2])

@@ -165,7 +165,7 @@ def test_the_time_left_is_estimated_where_parts_are_known(monkeypatch):
             step("image")
             now[0] += seconds
             step.report(detail)
-            return str(step._status.status.__rich__())
+            return str(step._spinner.status.__rich__())
 
         assert shown(4, "frame 10 of 40") == "image … frame 10 of 40  4 s, about 10 s left"
         assert shown(60, "1,000 of 4,000 films") == "image … 1,000 of 4,000 films  60 s, about 3 min left"

@@ -43,9 +43,9 @@ def test_progress_shows_the_step_and_the_best_score(monkeypatch):
     with step:
         step.report("nothing is under way yet")
         step("optimise")
-        monkeypatch.setattr(step._status, "update", messages.append)
+        monkeypatch.setattr(step._spinner, "update", messages.append)
         step.report("step 3 of at most 60, best score 1.234")
-        monkeypatch.setattr(step, "_start", step._start - 7.2)
+        monkeypatch.setattr(step, "_step_start_time", step._step_start_time - 7.2)
         step.report("step 40 of at most 60")
     assert [str(one.__rich__()) for one in messages] == [
         "optimise … step 3 of at most 60, best score 1.234",

@@ -17,7 +17,7 @@ from jeit.imaging.wiring import Wiring
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes import Ellipsoid, Star
 from jeit.mesh import centroids
-from jeit.report.image import _arrays, draw_image, report_image
+from jeit.report.image import _image_arrays, draw_image, report_image
 from jeit_solvers import Status
 
 
@@ -121,13 +121,13 @@ def test_fitted_bodies_are_reported_with_their_conductivity_relative_to_the_back
 def test_the_arrays_of_an_iterative_image_contain_the_logarithm_of_its_conductivity(imaged):
     change, background = np.asarray(imaged.change), float(imaged.calibration.conductivity)
     iterative = replace(imaged, reconstruction=object.__new__(Reconstruction))
-    arrays = _arrays(iterative)
+    arrays = _image_arrays(iterative)
     np.testing.assert_allclose(arrays["departure"], np.log10((background + change) / background), rtol=1e-9, atol=1e-15)
     np.testing.assert_array_equal(arrays["conductivity"], change)
     assert arrays["background"] == background
-    assert "departure" not in {*_arrays(imaged), *_arrays(replace(iterative, change=change * (1 + 0.1j)))}
+    assert "departure" not in {*_image_arrays(imaged), *_image_arrays(replace(iterative, change=change * (1 + 0.1j)))}
     assert "labels" not in arrays
-    np.testing.assert_array_equal(_arrays(replace(imaged, labels=np.eye(3)))["labels"], np.eye(3))
+    np.testing.assert_array_equal(_image_arrays(replace(imaged, labels=np.eye(3)))["labels"], np.eye(3))
 
 
 def test_a_calibration_that_failed_is_explained(imaged, printed):

@@ -15,7 +15,7 @@ from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
 from jeit.report import write_stream
 from jeit.report.stream import (
-    _COLUMNS,
+    _TABLE_COLUMNS,
     GrowingRows,
     GrowingTable,
     SeriesSample,
@@ -75,7 +75,7 @@ def test_a_stream_is_written_as_it_was_imaged(calibrated, tmp_path):
 
 @pytest.mark.parametrize(("rate", "titles"), [(None, ["frame 0", "frame 7"]), (5.0, ["0.00 s", "1.40 s"])])
 def test_frames_are_called_by_their_times_if_the_rate_is_known(rate, titles, tmp_path):
-    assert _StreamPictures(tmp_path, None, rate, print)._titles([0, 7]) == titles
+    assert _StreamPictures(tmp_path, None, rate, print)._frame_titles([0, 7]) == titles
 
 
 def test_the_line_of_a_solid_has_the_horizontal_place():
@@ -84,7 +84,7 @@ def test_the_line_of_a_solid_has_the_horizontal_place():
 
     pressed = FrameImage(3, np.full(5, 1.2), FrameStatus.IMAGED, "", np.ones(40, bool), np.nan, 2, 2e-3)
     line = _table_row(pressed, strongest, 1.0)  # pyright: ignore[reportArgumentType]
-    stated = dict(zip(_COLUMNS, line, strict=True))
+    stated = dict(zip(_TABLE_COLUMNS, line, strict=True))
     assert (stated["x_m"], stated["y_m"], stated["peak"]) == ("0.01000", "-0.02000", "0.2")
     assert (stated["misfit"], stated["latency_ms"]) == ("", "2.000")
 

@@ -1,5 +1,5 @@
-"""`jeit describe`: find out how the voltages in a file may have been measured, write a description of the file, and
-image its first frame."""
+"""`jeit describe`: estimate how the voltages in a file were measured, write a description of the file, and image its
+first frame."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from jeit.imaging.describe import Findings
 
 # For each shape of a body, the names of its sizes in a description, and the name of the layout of its electrodes.
-_SHAPES = {
+_BODY_SHAPES = {
     "disk": (("radius",), "ring"),
     "rectangle": (("width", "height"), "perimeter"),
     "cylinder": (("radius", "height"), "ring"),
@@ -34,8 +34,8 @@ _SHAPES = {
 }
 _DESCRIPTION_FILE = "description.toml"
 _WRITTEN_FILES = (_DESCRIPTION_FILE, "image.png", "image.npz", "report.json", "image.vtu")
-# Maximum number of explanations that are listed.
-_MAX_LISTED_EXPLANATIONS = 5
+# Maximum number of explanations of a file that are printed.
+_MAX_PRINTED_EXPLANATIONS = 5
 
 
 def describe(
@@ -83,25 +83,27 @@ def describe(
     from jeit.imaging.describe import find_description
     from jeit.report import write_image
 
-    known_values: dict[str, Any] = {"number": electrodes, "order": order}
+    protocol_options: dict[str, Any] = {"number": electrodes, "order": order}
     if protocol is not None:
-        known_values["kind"] = protocol.replace("-", "_")
-        check_name("--protocol", known_values["kind"], ("adjacent", "skip", "opposite", "two_terminal"))
+        protocol_options["kind"] = protocol.replace("-", "_")
+        check_name("--protocol", protocol_options["kind"], ("adjacent", "skip", "opposite", "two_terminal"))
     if order is not None:
         check_name("--order", order, ("rotating", "fixed"))
-    examples = {"--shape disk:0.1": shape, "--width 0.01": width}
-    missing = [example for example, value in examples.items() if value is None]
-    if missing and not sys.stdin.isatty():
-        raise ValueError(f"the file does not state all sizes; add them in metres, such as {' '.join(missing)}.")
+    option_examples = {"--shape disk:0.1": shape, "--width 0.01": width}
+    missing_examples = [example for example, value in option_examples.items() if value is None]
+    if missing_examples and not sys.stdin.isatty():
+        raise ValueError(
+            f"the file does not state all sizes; add them in metres, such as {' '.join(missing_examples)}."
+        )
     geometry, electrode_table = _body_tables(
         _value_or_prompt(shape, "The body in metres, such as disk:0.1"), width, height
     )
     make_folder(output, _WRITTEN_FILES)
-    target = output / _DESCRIPTION_FILE
-    if target.exists():
-        raise ValueError(f"--output: {target} exists already; move it, or give another folder.")
+    description_path = output / _DESCRIPTION_FILE
+    if description_path.exists():
+        raise ValueError(f"--output: {description_path} exists already; move it, or give another folder.")
     console = plain_console()
-    given_values = {name: value for name, value in known_values.items() if value is not None}
+    known_protocol = {name: value for name, value in protocol_options.items() if value is not None}
     option_names = {"key": "--key", "number": "--electrodes", "width": "--width", "height": "--height"}
     with Steps(console, quiet=quiet) as step, naming_options_in_errors(option_names), _naming_size_options_in_errors():
         findings = find_description(
@@ -110,7 +112,7 @@ def describe(
             electrode_table,
             reference=reference,
             keys=(key, reference_key),
-            known=given_values,
+            known=known_protocol,
             current=current,
             progress=step,
         )
@@ -124,39 +126,42 @@ def describe(
             f"undecided: {findings.candidates[0].name}, or {other_names} explain the voltages as well. Decide by "
             "--electrodes, --protocol or --order."
         )
-    with atomically_written_file(target) as file:
+    with atomically_written_file(description_path) as file:
         file.write(findings.text.encode())
     if reference is None and reference_key is None:
-        frames = findings.candidates[0].frames
-        hint = (
-            f"; or say which of its {frames} frames are of the empty body, and which to image: jeit reconstruct {data} "
-            f"--description {target} --reference-frames 0-1 --frame {frames - 1}"
+        num_frames = findings.candidates[0].frames
+        frames_hint = (
+            f"; or say which of its {num_frames} frames are of the empty body, and which to image: "
+            f"jeit reconstruct {data} --description {description_path} --reference-frames 0-1 --frame {num_frames - 1}"
         )
         console.print(
-            f"Written: {target}. Give --reference, a file of the empty body, to image it{hint * (frames > 1)}.",
+            f"Written: {description_path}. Give --reference, a file of the empty body, to image it"
+            f"{frames_hint * (num_frames > 1)}.",
             soft_wrap=True,
         )
         return
     with Steps(console, quiet=quiet) as step:
-        reference_measurement = read(data if reference is None else reference, description=target, key=reference_key)
-        measured = read(data, description=target, like=reference_measurement, key=key)
+        reference_measurement = read(
+            data if reference is None else reference, description=description_path, key=reference_key
+        )
+        measurement = read(data, description=description_path, like=reference_measurement, key=key)
         imageable_frames = [
-            k for k, quality in enumerate(assess(measured, reference_measurement.mean_frame())) if quality.imageable
+            k for k, quality in enumerate(assess(measurement, reference_measurement.mean_frame())) if quality.imageable
         ]
         result = image_difference(
-            measured, reference_measurement, frame=imageable_frames[0] if imageable_frames else None, progress=step
+            measurement, reference_measurement, frame=imageable_frames[0] if imageable_frames else None, progress=step
         )
         step("write the first image")
         write_image(result, output)
     if not quiet:
         print_imaging_result(console, result)
-        print_written_files(console, target, *_WRITTEN_FILES[1 : 4 + (result.mesh.dimension == 3)])
+        print_written_files(console, description_path, *_WRITTEN_FILES[1 : 4 + (result.mesh.dimension == 3)])
 
 
 @contextmanager
 def _naming_size_options_in_errors() -> Iterator[None]:
-    """Context manager that names the options --shape, --width and --height in error messages about bodies and
-    electrodes."""
+    """Context manager that replaces names of entries of a description by the options --shape, --width and --height in
+    error messages about bodies and electrodes."""
     try:
         yield
     except ValueError as error:
@@ -175,23 +180,23 @@ def _value_or_prompt(value: Any, question: str) -> Any:
 
 
 def _body_tables(shape: str, width: float | None, height: float | None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Sections `[geometry]` and `[electrodes]` of a description, from the options. Raises `ValueError` for invalid
-    values."""
-    name, _, sizes_text = shape.partition(":")
+    """Create the sections `[geometry]` and `[electrodes]` of a description from the options. Raises `ValueError` for
+    invalid values."""
+    body_shape, _, sizes_text = shape.partition(":")
     try:
-        numbers = [float(number) for number in sizes_text.split(",")]
+        size_values = [float(number) for number in sizes_text.split(",")]
     except ValueError:
-        numbers = []
-    size_names, layout = _SHAPES.get(name, ((), ""))
-    if not numbers or len(numbers) != len(size_names):
-        options = ", ".join(
-            f"{shape_name}:{','.join(body_sizes).upper()}" for shape_name, (body_sizes, _) in _SHAPES.items()
+        size_values = []
+    size_names, electrode_layout = _BODY_SHAPES.get(body_shape, ((), ""))
+    if not size_values or len(size_values) != len(size_names):
+        shape_options = ", ".join(
+            f"{shape_name}:{','.join(body_sizes).upper()}" for shape_name, (body_sizes, _) in _BODY_SHAPES.items()
         )
-        raise ValueError(f"--shape: give one of {options}, in metres; it is {shape[:40]!r}.")
-    geometry = {"shape": name, **dict(zip(size_names, numbers, strict=True))}
+        raise ValueError(f"--shape: give one of {shape_options}, in metres; it is {shape[:40]!r}.")
+    geometry = {"shape": body_shape, **dict(zip(size_names, size_values, strict=True))}
     electrode_width = float(_value_or_prompt(width, "Width of an electrode in metres, such as 0.01"))
-    electrode_table: dict[str, Any] = {"layout": layout, "width": electrode_width}
-    if name in ("cylinder", "box"):
+    electrode_table: dict[str, Any] = {"layout": electrode_layout, "width": electrode_width}
+    if body_shape in ("cylinder", "box"):
         electrode_height = geometry["height"] if height is None else height
         electrode_table = {
             "kind": "patch",
@@ -200,28 +205,34 @@ def _body_tables(shape: str, width: float | None, height: float | None) -> tuple
             "levels": geometry["height"] / 2,
         }
     elif height is not None:
-        raise ValueError(f"--height: a {name} is a sheet; leave it out.")
+        raise ValueError(f"--height: a {body_shape} is a sheet; leave it out.")
     return geometry, electrode_table
 
 
 def _print_findings(console, data: Path, findings: "Findings") -> None:
-    """Print the explanations of the file that were found."""
+    """Print the arrangements of electrodes and channels that may explain the voltages in the file."""
     from jeit.arguments import counted, percent
     from jeit.cli.console import name_value_table
 
-    rows = []
-    for candidate in findings.candidates[:_MAX_LISTED_EXPLANATIONS]:
-        evidence = [counted(candidate.frames, "frame")]
-        evidence += [] if candidate.reciprocity is None else [f"reciprocity broken by {percent(candidate.reciprocity)}"]
-        evidence += [f"frames of the empty body differ by {percent(candidate.spread)}"] if candidate.spread else []
-        misfit = "not compared" if candidate.wiring is None else f"misfit {percent(candidate.misfit)}"
-        rows.append((misfit, f"{candidate.name}: {', '.join(evidence)}"))
+    table_rows = []
+    for candidate in findings.candidates[:_MAX_PRINTED_EXPLANATIONS]:
+        evidence_texts = [counted(candidate.frames, "frame")]
+        evidence_texts += (
+            [] if candidate.reciprocity is None else [f"reciprocity broken by {percent(candidate.reciprocity)}"]
+        )
+        evidence_texts += (
+            [f"frames of the empty body differ by {percent(candidate.spread)}"] if candidate.spread else []
+        )
+        misfit_text = "not compared" if candidate.wiring is None else f"misfit {percent(candidate.misfit)}"
+        table_rows.append((misfit_text, f"{candidate.name}: {', '.join(evidence_texts)}"))
     best_candidate = findings.candidates[0]
-    rows += [("note", note) for note in best_candidate.measurement.notes]
+    table_rows += [("note", note) for note in best_candidate.measurement.notes]
     if best_candidate.gains is not None:
-        rows.append(("gains", "those of the measurements differ, and are corrected: [data] gains of the description"))
+        table_rows.append(
+            ("gains", "those of the measurements differ, and are corrected: [data] gains of the description")
+        )
     if best_candidate.wiring is not None and best_candidate.wiring.explanation and not best_candidate.reversed_signs:
-        rows.append(("wiring", best_candidate.wiring.explanation))
+        table_rows.append(("wiring", best_candidate.wiring.explanation))
     console.print()
-    console.print(name_value_table(f"{data.name} may be", rows))
+    console.print(name_value_table(f"{data.name} may be", table_rows))
     console.print()

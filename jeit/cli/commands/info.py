@@ -32,11 +32,11 @@ def info(
     measurement = read_file("DATA", data, format, description, key=key)
     report = report_measurement(measurement)
     body, noise, smallest_body = report["body"], report["noise"], report["smallest_detectable_body"]
-    names = f" ({', '.join(report['frame_names'])})" if report["frame_names"] else ""
-    rate = f", {report['frame_rate']:.4g} a second" if report["frame_rate"] else ""
+    frame_names_text = f" ({', '.join(report['frame_names'])})" if report["frame_names"] else ""
+    frame_rate_text = f", {report['frame_rate']:.4g} a second" if report["frame_rate"] else ""
     noise_text = noise and f"{format_with_unit(noise['standard_deviation'], 'V')}, from {noise['method']}"
     rows = [
-        ("frames", f"{report['frames']}{names}{rate}"),
+        ("frames", f"{report['frames']}{frame_names_text}{frame_rate_text}"),
         ("protocol", report["protocol"]),
         ("channels", f"{report['channels']}, of {counted(report['drives'], 'drive')}"),
         ("masked", f"{report['masked']} of {report['voltages']} voltages"),
@@ -57,14 +57,16 @@ def info(
 
 
 def _body_text(body: dict[str, Any]) -> str:
-    """Text on the shape and size of a body, with the words that a description uses."""
+    """Text that states the shape and the sizes of a body by their names in a description file."""
     from jeit.arguments import counted
 
     if body["shape"] == "mesh":
         return f"mesh, {body['dimension']}-D, {counted(body['points'], 'node')}"
-    names = {key: key for key in ("radius", "width", "height", "thickness")}
-    shape = body["shape"]
-    if "thickness" in body and shape in _SOLID_NAMES_AND_SIZE_KEYS:
-        shape, renamed_keys = _SOLID_NAMES_AND_SIZE_KEYS[shape]
-        names |= renamed_keys
-    return ", ".join([shape, *(f"{name} {1e3 * body[key]:g} mm" for key, name in names.items() if key in body)])
+    size_names = {key: key for key in ("radius", "width", "height", "thickness")}
+    shape_name = body["shape"]
+    if "thickness" in body and shape_name in _SOLID_NAMES_AND_SIZE_KEYS:
+        shape_name, solid_size_names = _SOLID_NAMES_AND_SIZE_KEYS[shape_name]
+        size_names |= solid_size_names
+    return ", ".join(
+        [shape_name, *(f"{name} {1e3 * body[key]:g} mm" for key, name in size_names.items() if key in body)]
+    )

@@ -161,8 +161,8 @@ def reconstruct(
         write_image(result, output)
     if not quiet:
         print_imaging_result(console, result, frame_given=frame is not None)
-        solid_files = ("image.vtu",) if result.mesh.dimension == 3 else ()
-        print_written_files(console, output / "image.png", "image.npz", "report.json", *solid_files)
+        solid_file_names = ("image.vtu",) if result.mesh.dimension == 3 else ()
+        print_written_files(console, output / "image.png", "image.npz", "report.json", *solid_file_names)
 
 
 # Fraction of the difference between frame and reference above which rounding of the voltages is reported.
@@ -170,7 +170,7 @@ _MIN_REPORTED_ROUNDING_ERROR = 2e-3
 
 
 def print_imaging_result(console, result: "ImagedDifference", *, frame_given: bool = False) -> None:
-    """Print the result of imaging; `frame_given`: whether the user selected the frame."""
+    """Print the result of imaging. `frame_given` states whether the user selected the frame."""
     import numpy as np
 
     from jeit.arguments import counted, percent
@@ -189,7 +189,7 @@ def print_imaging_result(console, result: "ImagedDifference", *, frame_given: bo
     unit = "S" if result.mesh.dimension == 2 else "S/m"
     noise, noise_share = result.quality.difference_noise, result.quality.noise_share
     hyperparameter = float(reconstruction.hyperparameter)
-    choice_text = "none" if result.chosen_by == "none" else f"{hyperparameter:.3g} ({result.chosen_by})"
+    hyperparameter_text = "none" if result.chosen_by == "none" else f"{hyperparameter:.3g} ({result.chosen_by})"
     background = np.asarray(calibration.conductivity).item()
     background_text = format_with_unit(background.real, unit)
     background_text += (
@@ -198,51 +198,57 @@ def print_imaging_result(console, result: "ImagedDifference", *, frame_given: bo
     noise_text = "not known" if noise is None else f"{percent(noise.relative)}, from {noise.method}"
     noise_text = noise_text if noise_share is None else f"{percent(noise_share)}, from {result.quality.noise_source}"
     noise_text += "" if result.electrode_change is None else "; of the rest that moved electrodes leave"
-    rows = [
+    table_rows = [
         ("background", f"{background_text}, misfit {percent(float(calibration.misfit))}"),
         ("difference", f"{percent(result.quality.difference)} of the reference"),
         ("noise in it", noise_text),
-        ("method", f"{result.settings.method}, hyperparameter {choice_text}"),
+        ("method", f"{result.settings.method}, hyperparameter {hyperparameter_text}"),
         ("mesh", f"{counted(result.mesh.num_points, 'node')}, {counted(result.mesh.num_cells, 'cell')}"),
     ]
-    if (diameters := describe_detectable(result.detectable_diameters)) is not None:
-        rows.insert(3, ("smallest body", detectable_text(diameters)))
+    if (detectable_report := describe_detectable(result.detectable_diameters)) is not None:
+        table_rows.insert(3, ("smallest body", detectable_text(detectable_report)))
     if result.quality.rounding > _MIN_REPORTED_ROUNDING_ERROR:
-        rows.insert(3, ("rounding", f"{percent(result.quality.rounding)} of the difference: voltages have few digits"))
+        table_rows.insert(
+            3, ("rounding", f"{percent(result.quality.rounding)} of the difference: voltages have few digits")
+        )
     if calibration.note:
-        rows.insert(1, ("note", calibration.note))
+        table_rows.insert(1, ("note", calibration.note))
     if calibration.status != Status.CONVERGED:
-        rows.insert(1, ("calibration", f"{calibration.status}. {calibration.reason}"))
+        table_rows.insert(1, ("calibration", f"{calibration.status}. {calibration.reason}"))
     if reconstruction.choice is not None and reconstruction.choice.note:
-        rows.append(("hyperparameter", reconstruction.choice.note))
+        table_rows.append(("hyperparameter", reconstruction.choice.note))
     if isinstance(reconstruction, Reconstruction):
-        misfit = f"misfit {float(reconstruction.misfit):.2g} standard deviations"
-        iterations = counted(int(reconstruction.iterations), "iteration")
-        rows.append(("iteration", f"{reconstruction.status}, {iterations}, {misfit}"))
-    rows += [("doubt", doubt) for doubt in result.doubts]
+        misfit_text = f"misfit {float(reconstruction.misfit):.2g} standard deviations"
+        iterations_text = counted(int(reconstruction.iterations), "iteration")
+        table_rows.append(("iteration", f"{reconstruction.status}, {iterations_text}, {misfit_text}"))
+    table_rows += [("doubt", doubt) for doubt in result.doubts]
     if result.shapes is not None:
-        rows.append(("bodies", bodies_text(result.shapes, result.mesh.dimension)))
+        table_rows.append(("bodies", bodies_text(result.shapes, result.mesh.dimension)))
     if result.why:
-        rows.append(("chosen, for", result.why))
+        table_rows.append(("chosen, for", result.why))
     if unlike_electrodes := result.unlike_electrodes:
-        numbers = ", ".join(f"{electrode + 1} ({ratio:.1f} times)" for electrode, ratio in unlike_electrodes.items())
-        rows.append(("note", f"more misfit than at other electrodes at {numbers}: what reads them counts less"))
+        electrode_numbers = ", ".join(
+            f"{electrode + 1} ({ratio:.1f} times)" for electrode, ratio in unlike_electrodes.items()
+        )
+        table_rows.append(
+            ("note", f"more misfit than at other electrodes at {electrode_numbers}: what reads them counts less")
+        )
     if result.wiring.fault:
-        rows.append(("wiring", result.wiring.fault))
-    rows += [("note", note) for note in dict.fromkeys((*result.measurement.notes, *result.reference.notes))]
+        table_rows.append(("wiring", result.wiring.fault))
+    table_rows += [("note", note) for note in dict.fromkeys((*result.measurement.notes, *result.reference.notes))]
     console.print()
     if result.num_frames > 1:
-        rows.insert(0, ("frame", _frame_text(result, frame_given)))
-    console.print(name_value_table(result.measurement.name, rows))
+        table_rows.insert(0, ("frame", _frame_text(result, frame_given)))
+    console.print(name_value_table(result.measurement.name, table_rows))
     console.print()
     if any(inclusion.contrast_interval is not None for inclusion in result.inclusions):
-        table, note = quantity_table(result.inclusions, background.real), ""
+        inclusions_table, table_note = quantity_table(result.inclusions, background.real), ""
     else:
-        table = inclusion_table(result.inclusions, unit, background=background.real)
-        note = "  peaks of the image, which blurs; only fitted bodies have intervals"
-    console.print(table if result.inclusions else "  no inclusion found")
-    if result.inclusions and note:
-        console.print(note, style="dim", highlight=False)
+        inclusions_table = inclusion_table(result.inclusions, unit, background=background.real)
+        table_note = "  peaks of the image, which blurs; only fitted bodies have intervals"
+    console.print(inclusions_table if result.inclusions else "  no inclusion found")
+    if result.inclusions and table_note:
+        console.print(table_note, style="dim", highlight=False)
     console.print()
 
 
@@ -251,12 +257,12 @@ def bodies_text(shapes: "ShapeReconstruction", dimension: int) -> str:
     from jeit.arguments import counted, percent
     from jeit.inverse.shapes import Ellipsoid
 
-    noun = "surface" if dimension == 3 else "outline"
-    left_out_bodies_text = f"; {counted(len(shapes.doubtful), 'ghost')} left out" if shapes.doubtful else ""
+    shape_noun = "surface" if dimension == 3 else "outline"
+    rejected_bodies_text = f"; {counted(len(shapes.doubtful), 'ghost')} left out" if shapes.doubtful else ""
     num_undetermined_contrasts = sum(not body.contrast_is_determined for body in shapes.bodies)
     num_columns = sum(isinstance(body, Ellipsoid) and body.column for body in shapes.bodies)
     columns_text = f", {counted(num_columns, 'column')} through the whole height" if num_columns else ""
-    assumed_text = (
+    undetermined_text = (
         f"; of {num_undetermined_contrasts} the data give a limit of the change only"
         if num_undetermined_contrasts
         else ""
@@ -264,17 +270,17 @@ def bodies_text(shapes: "ShapeReconstruction", dimension: int) -> str:
     shares_material = any(isinstance(body, Ellipsoid) and body.alike for body in shapes.bodies)
     material_text = ", as of one material: the data do not contradict it" if shares_material else ""
     background_drift_text = f"the background has drifted by {percent(shapes.drift)}"
-    fitted_text = f"{counted(len(shapes.bodies), noun)} fitted{columns_text}"
-    return f"{fitted_text}{material_text}{left_out_bodies_text}{assumed_text}; {background_drift_text}"
+    fitted_text = f"{counted(len(shapes.bodies), shape_noun)} fitted{columns_text}"
+    return f"{fitted_text}{material_text}{rejected_bodies_text}{undetermined_text}; {background_drift_text}"
 
 
 def _frame_text(result: "ImagedDifference", frame_given: bool) -> str:
-    """Text that states which frame of how many was imaged, and how to image others."""
-    names = result.measurement.frame_names
-    text = f"{names[0]!r}, " if names else ""
-    text += f"{result.frame} of {result.num_frames}"
+    """Text that states which frame was imaged, the number of frames, and how to image other frames."""
+    frame_names = result.measurement.frame_names
+    frame_text = f"{frame_names[0]!r}, " if frame_names else ""
+    frame_text += f"{result.frame} of {result.num_frames}"
     if frame_given:
-        return text
-    # Named frames usually show different objects, so that their mean is not useful.
-    mean_hint = "" if names else ', or their mean: frames = "mean" in [data] of the description'
-    return f"{text}, from 0; --frame takes another{mean_hint}"
+        return frame_text
+    # The mean of named frames is not proposed, because named frames usually show different objects.
+    mean_hint = "" if frame_names else ', or their mean: frames = "mean" in [data] of the description'
+    return f"{frame_text}, from 0; --frame takes another{mean_hint}"

@@ -109,58 +109,67 @@ def series(
     )
     film_name = None if film == "none" else film
     with naming_options_in_errors({"film": "--film"}):
-        films = () if film_name is None else (check_film(film_name),)
+        film_names = () if film_name is None else (check_film(film_name),)
     bands = [_parse_band(band_text) for band_text in frequency or ()]
     parsed_regions = {region_text: _parse_region(region_text) for region_text in region or ()}
-    make_folder(output, (*SERIES_FILES, *films))
+    make_folder(output, (*SERIES_FILES, *film_names))
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        measured, reference_measurement = read_pair(
+        measurement, reference_measurement = read_pair(
             data, reference, reference_frames, format, description, (key, reference_key)
         )
         with naming_options_in_errors({"rate": "--rate"}):
-            measured = measured if rate is None else measured.at_rate(rate)
+            measurement = measurement if rate is None else measurement.at_rate(rate)
         with naming_options_in_errors({"frequency": "--frequency"}):
-            if measured.times is None and bands:
-                raise ValueError(f"frequency: '{measured.name}' says no times; give --rate, in frames a second.")
-            if measured.times is not None:
+            if measurement.times is None and bands:
+                raise ValueError(f"frequency: '{measurement.name}' says no times; give --rate, in frames a second.")
+            if measurement.times is not None:
                 for band in bands:
-                    oscillation(np.zeros((measured.num_frames, 1)), measured.times, band)
-        regions = {text: partial(_region_mask, text, parsed) for text, parsed in parsed_regions.items()}
-        sequence = image_sequence(measured, reference_measurement, settings, regions=regions, progress=step)
+                    oscillation(np.zeros((measurement.num_frames, 1)), measurement.times, band)
+        regions = {
+            text: partial(_region_mask, text, shape_and_numbers) for text, shape_and_numbers in parsed_regions.items()
+        }
+        sequence = image_sequence(measurement, reference_measurement, settings, regions=regions, progress=step)
         with naming_options_in_errors({"frequency": "--frequency"}):
             oscillations = [oscillation(sequence.series.changes, sequence.series.times, band) for band in bands]
         step("write")
         report = write_series(sequence, output, regions=sequence.regions, oscillations=oscillations, film=film_name)
     if quiet:
         return
-    frames, unit = counted(report["frames"], "frame"), report["unit"]
+    frames_text, unit = counted(report["frames"], "frame"), report["unit"]
     frame_rate_text = "" if report["frame_rate"] is None else f", {report['frame_rate']:.4g} a second"
     missing_times_text = (
-        "" if measured.times is not None else "; no times are known (--rate gives them), frames are numbered"
+        "" if measurement.times is not None else "; no times are known (--rate gives them), frames are numbered"
     )
-    console.print(f"\n{frames}{frame_rate_text}, {report['refused']} refused{missing_times_text}")
-    for number, reason in sorted(sequence.reasons.items())[:_MAX_PRINTED_FRAMES]:
-        console.print(f"  frame {number}: refused. {reason}", soft_wrap=True, markup=False)
-    if (num_more := len(sequence.reasons) - _MAX_PRINTED_FRAMES) > 0:
-        console.print(f"  {num_more} more are in report.json.")
+    console.print(f"\n{frames_text}{frame_rate_text}, {report['refused']} refused{missing_times_text}")
+    for frame_number, reason in sorted(sequence.reasons.items())[:_MAX_PRINTED_FRAMES]:
+        console.print(f"  frame {frame_number}: refused. {reason}", soft_wrap=True, markup=False)
+    if (num_unprinted_frames := len(sequence.reasons) - _MAX_PRINTED_FRAMES) > 0:
+        console.print(f"  {num_unprinted_frames} more are in report.json.")
     for note in dict.fromkeys(
         (*sequence.prepared.measurement.notes, *(() if reference_measurement is None else reference_measurement.notes))
     ):
         console.print(f"  {note}", style="dim")
     for doubt in sequence.doubts:
         console.print(f"  doubt: {doubt}", soft_wrap=True, markup=False)
-    for entry in report["oscillations"]:
-        console.print(f"{entry['frequency']:.4g} Hz (resolution {entry['resolution']:.2g} Hz):")
-        for name, component in entry["regions"].items():
-            sizes = f"{format_with_unit(component['amplitude'], unit)} ± {format_with_unit(component['noise'], unit)}"
-            console.print(f"  {name}: amplitude {sizes}, phase {component['phase_degrees']:.0f}°", markup=False)
-    print_written_files(console, output / "series.png", "series.npz", "regions.csv", "report.json", *films)
+    for oscillation_report in report["oscillations"]:
+        console.print(
+            f"{oscillation_report['frequency']:.4g} Hz (resolution {oscillation_report['resolution']:.2g} Hz):"
+        )
+        for name, region_report in oscillation_report["regions"].items():
+            amplitude_text = (
+                f"{format_with_unit(region_report['amplitude'], unit)} ± "
+                f"{format_with_unit(region_report['noise'], unit)}"
+            )
+            console.print(
+                f"  {name}: amplitude {amplitude_text}, phase {region_report['phase_degrees']:.0f}°", markup=False
+            )
+    print_written_files(console, output / "series.png", "series.npz", "regions.csv", "report.json", *film_names)
 
 
 def _parse_band(text: str) -> "float | tuple[float, float]":
-    """A frequency, or a band of frequencies, in hertz. Raises `ValueError` for an invalid text."""
+    """Parse a frequency, or a band of frequencies, in hertz. Raises `ValueError` for an invalid text."""
     number_texts = text.split("-")
     try:
         numbers = [float(number_text) for number_text in number_texts]
@@ -172,27 +181,32 @@ def _parse_band(text: str) -> "float | tuple[float, float]":
 
 
 def _parse_region(text: str) -> tuple[str, list[float]]:
-    """The shape and the numbers of a region of interest, such as "ball:0,0,0.02". Raises `ValueError` for an invalid
-    text."""
-    name, _, numbers_text = text.partition(":")
+    """Parse the shape and the numbers of a region of interest, such as "ball:0,0,0.02". Raises `ValueError` for an
+    invalid text."""
+    shape, _, numbers_text = text.partition(":")
     try:
-        return name, [float(number_text) for number_text in numbers_text.split(",")]
+        return shape, [float(number_text) for number_text in numbers_text.split(",")]
     except ValueError:
         raise ValueError(f"--region: {text[:40]!r} is no shape and numbers, such as ball:0.02,0,0.01.") from None
 
 
-def _region_mask(text: str, parsed: tuple[str, list[float]], mesh: "Mesh"):
-    """Mask of the mesh's cells in a region of interest. Raises `ValueError` if the region does not fit the mesh."""
+def _region_mask(text: str, shape_and_numbers: tuple[str, list[float]], mesh: "Mesh"):
+    """Mask of the cells of the mesh that lie in a region of interest. Raises `ValueError` if the region does not fit
+    the mesh."""
     from jeit.image import ball_region, box_region, half_region
 
-    (name, numbers), d = parsed, mesh.dimension
-    num_expected = {"ball": d + 1, "box": 2 * d, "half": d}
-    if num_expected.get(name) != len(numbers):
-        example = "ball:0.02,0,0.01" if d == 2 else "ball:0.02,0,0.05,0.01"
-        raise ValueError(f"--region: {text[:40]!r} is none of a body of {d} dimensions; give {example}, box: or half:.")
+    (shape, numbers), dimension = shape_and_numbers, mesh.dimension
+    num_numbers_by_shape = {"ball": dimension + 1, "box": 2 * dimension, "half": dimension}
+    if num_numbers_by_shape.get(shape) != len(numbers):
+        example = "ball:0.02,0,0.01" if dimension == 2 else "ball:0.02,0,0.05,0.01"
+        raise ValueError(
+            f"--region: {text[:40]!r} is none of a body of {dimension} dimensions; give {example}, box: or half:."
+        )
     try:
-        if name == "ball":
-            return ball_region(mesh, numbers[:d], numbers[d])
-        return box_region(mesh, numbers[:d], numbers[d:]) if name == "box" else half_region(mesh, numbers)
+        if shape == "ball":
+            return ball_region(mesh, numbers[:dimension], numbers[dimension])
+        return (
+            box_region(mesh, numbers[:dimension], numbers[dimension:]) if shape == "box" else half_region(mesh, numbers)
+        )
     except ValueError as error:
         raise ValueError(f"--region {text[:40]!r}: {error}") from None

@@ -146,15 +146,15 @@ def stream(
         settings = StreamSettings(**{name: value for name, value in setting_values.items() if value is not None})
     film_name = None if film == "none" else film
     with naming_options_in_errors({"film": "--film"}):
-        films = () if film_name is None else (check_film(film_name),)
+        film_names = () if film_name is None else (check_film(film_name),)
     if reference is None and (reference_frames is None or data == "-"):
         raise ValueError(
             "--reference is missing: give a measured file of the undisturbed body"
             + ("." if data == "-" else ", or --reference-frames, the frames of DATA that are of it, such as 0-17.")
         )
     console = plain_console()
-    with StreamStopper() as stopping:
-        make_folder(output, ("frames.csv", "images.npz", "frames.png", *films))
+    with StreamStopper() as stream_stopper:
+        make_folder(output, ("frames.csv", "images.npz", "frames.png", *film_names))
         with Steps(console, quiet=quiet) as step:
             step("read")
             if data == "-":
@@ -166,28 +166,30 @@ def stream(
                     if reference_frames is None
                     else reference_of_frames(reference_measurement, reference_frames)
                 )
-                measured = reference_measurement
+                measurement = reference_measurement
             else:
-                keys = (key, reference_key)
-                measured, base_measurement = read_pair(
-                    Path(data), reference, reference_frames, format, description, keys
+                array_keys = (key, reference_key)
+                measurement, separate_reference = read_pair(
+                    Path(data), reference, reference_frames, format, description, array_keys
                 )
-                reference_measurement = measured if base_measurement is None else base_measurement
-            imager, calibration = prepare_imager(reference_measurement, settings, measurement=measured, progress=step)
+                reference_measurement = measurement if separate_reference is None else separate_reference
+            imager, calibration = prepare_imager(
+                reference_measurement, settings, measurement=measurement, progress=step
+            )
         if data == "-":
             frames, num_frames = (
                 read_lines(getattr(sys.stdin, "buffer", sys.stdin), LineParser(description, reference_measurement)),
                 None,
             )
         else:
-            measured = measured if settings.as_is else mask_spikes(measured, reference_measurement)
-            frames, num_frames = frames_of(measured), measured.num_frames
-            rate = measured.frame_rate if rate is None else rate
-        notes = (*measured.notes, *reference_measurement.notes, *([calibration.note] if calibration.note else []))
+            measurement = measurement if settings.as_is else mask_spikes(measurement, reference_measurement)
+            frames, num_frames = frames_of(measurement), measurement.num_frames
+            rate = measurement.frame_rate if rate is None else rate
+        notes = (*measurement.notes, *reference_measurement.notes, *([calibration.note] if calibration.note else []))
         for note in () if quiet else dict.fromkeys(notes):
             console.print(f"  note: {note}", soft_wrap=True, markup=False)
-        base_frame = reference_measurement.mean_frame()
-        for doubt in () if quiet else doubts_of_data(base_frame, base_frame, calibration):
+        reference_frame = reference_measurement.mean_frame()
+        for doubt in () if quiet else doubts_of_data(reference_frame, reference_frame, calibration):
             console.print(f"  doubt: {doubt}", soft_wrap=True, markup=False)
         with naming_options_in_errors({"rate": "--rate"}), Steps(console, quiet=quiet) as step:
             step("image")
@@ -200,18 +202,20 @@ def stream(
                         f"  frame {frame_image.number}: {frame_image.status}. {frame_image.reason}", soft_wrap=True
                     )
 
-            def show_movement(number: int, change) -> None:
+            def show_movement(frame_number: int, electrode_change) -> None:
                 if not quiet:
-                    console.print(f"  doubt: from frame {number} on, {change.doubt}", soft_wrap=True, markup=False)
+                    console.print(
+                        f"  doubt: from frame {frame_number} on, {electrode_change.doubt}", soft_wrap=True, markup=False
+                    )
 
-            drawing = stopping.drawing_reporter(PICTURES, step)
-            arriving_frames = stopping.frames_until_signal(frames)
+            report_drawing = stream_stopper.drawing_reporter(PICTURES, step)
+            arriving_frames = stream_stopper.frames_until_signal(frames)
             images = (
                 stream_as_is(imager, arriving_frames)
                 if settings.as_is
                 else image_stream(imager, calibration, arriving_frames, show_movement)
             )
-            with stopping.exit_after_signal(frame_counter, "frames.csv", "images.npz"):
+            with stream_stopper.exit_after_signal(frame_counter, "frames.csv", "images.npz"):
                 written_stream = write_stream(
                     images,
                     calibration,
@@ -220,7 +224,7 @@ def stream(
                     film=film_name,
                     rate=rate,
                     progress=show_frame,
-                    drawing=drawing,
+                    drawing=report_drawing,
                 )
     if not written_stream.latency.size:
         raise ValueError(
@@ -234,6 +238,6 @@ def stream(
         float(calibration.conductivity), "S" if calibration.model.mesh.dimension == 2 else "S/m"
     )
     console.print(f"\n{counted(written_stream.number, 'frame')}: {counts_text}; background {background}")
-    median, upper_quantile = 1e3 * np.quantile(written_stream.latency, (0.5, 0.99))
-    console.print(f"latency: median {median:.2f} ms, 99 % within {upper_quantile:.2f} ms")
-    print_written_files(console, output / "frames.csv", "images.npz", "frames.png", *films)
+    median_latency, latency_quantile_99 = 1e3 * np.quantile(written_stream.latency, (0.5, 0.99))
+    console.print(f"latency: median {median_latency:.2f} ms, 99 % within {latency_quantile_99:.2f} ms")
+    print_written_files(console, output / "frames.csv", "images.npz", "frames.png", *film_names)

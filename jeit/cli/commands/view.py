@@ -48,33 +48,35 @@ def view(
     from jeit.report.saved_image import VIEW_FILES, drawn_values
 
     camera, levels = Camera(azimuth, elevation), tuple(level or (0.5,))
-    planes = [_plane(text) for text in plane_mm or ()]
-    console, saved = plain_console(), read_image(image)
-    if output is None and saved.mesh.dimension == 3 and not planes:
-        if not (reason := interactive.can_view()):
-            values, scale = drawn_values(saved)
-            options = {"inclusions": saved.inclusions, "levels": levels, "scale": scale}
-            interactive.view_solid(saved.mesh, values, saved.electrodes, **options).show()
+    planes = [_parse_plane(text) for text in plane_mm or ()]
+    console, saved_image = plain_console(), read_image(image)
+    if output is None and saved_image.mesh.dimension == 3 and not planes:
+        if not (unavailable_reason := interactive.can_view()):
+            cell_values, colour_scale = drawn_values(saved_image)
+            plot_options = {"inclusions": saved_image.inclusions, "levels": levels, "scale": colour_scale}
+            interactive.view_solid(saved_image.mesh, cell_values, saved_image.electrodes, **plot_options).show()
             return
         if not quiet:
-            console.print(f"  pictures, not a window: {reason}", highlight=False, markup=False)
+            console.print(f"  pictures, not a window: {unavailable_reason}", highlight=False, markup=False)
     folder = image.parent / "view" if output is None else output
     make_folder(folder, VIEW_FILES)
     with naming_options_in_errors({"levels": "--level", "at": "--slices", "plane": "--plane-mm"}):
-        names = write_views(saved, folder, camera=camera, levels=levels, planes=planes, axis=axis, slices=slices)
+        picture_names = write_views(
+            saved_image, folder, camera=camera, levels=levels, planes=planes, axis=axis, slices=slices
+        )
     if not quiet:
-        print_written_files(console, folder / names[0], *names[1:])
+        print_written_files(console, folder / picture_names[0], *picture_names[1:])
 
 
-def _plane(text: str):
-    """The slicing plane that `text` specifies, in millimetres. Raises `ValueError` for an invalid text."""
+def _parse_plane(text: str):
+    """Parse a plane that slices a solid, with coordinates in millimetres. Raises `ValueError` for an invalid text."""
     from jeit.arguments import describe
     from jeit.image import Plane
 
     try:
         if "=" in text:
-            axis, _, value = text.partition("=")
-            return Plane.at(axis.strip(), float(value) / 1e3)
+            axis, _, position_text = text.partition("=")
+            return Plane.at(axis.strip(), float(position_text) / 1e3)
         point, normal = ([float(number) for number in vector.split(",")] for vector in text.split("/"))
         return Plane.through([coordinate / 1e3 for coordinate in point], normal)
     except ValueError:
