@@ -118,12 +118,12 @@ class ImageSeries:
 
 
 Window = Literal["hann", "none"]
-# Resolution of each window in units of 1 / T; number of trial frequencies per resolution in the search for the
-# strongest frequency.
-_RESOLUTION_OF_WINDOW = {"hann": 2.0, "none": 1.0}
+# Frequency resolution of each window in units of 1 / T, where T is the measured time; number of trial frequencies per
+# frequency resolution in the search for the strongest frequency.
+_WINDOW_RESOLUTION = {"hann": 2.0, "none": 1.0}
 _FREQUENCIES_PER_RESOLUTION = 8
-# Minimum number of periods in the measured time.
-_MIN_PERIODS = 1.0
+# Minimum number of periods of an oscillation in the measured time.
+_MIN_MEASURED_PERIODS = 1.0
 
 
 @dataclass(frozen=True)
@@ -179,40 +179,44 @@ def oscillation(
     breath.frequency, breath.amplitude
     ```
     """
-    finite_values, finite_times = _finite_rows(values, times)
-    check_name("window", window, _RESOLUTION_OF_WINDOW)
-    duration = float(finite_times[-1] - finite_times[0])
-    resolution = _RESOLUTION_OF_WINDOW[window] / duration
-    min_frequency, max_frequency = _check_band(frequency)
-    rate = (len(finite_times) - 1) / duration
-    if max_frequency >= rate / 2:
+    finite_values, finite_times = _frames_without_nan(values, times)
+    check_name("window", window, _WINDOW_RESOLUTION)
+    measured_duration = float(finite_times[-1] - finite_times[0])
+    frequency_resolution = _WINDOW_RESOLUTION[window] / measured_duration
+    min_frequency, max_frequency = _frequency_band(frequency)
+    frame_rate = (len(finite_times) - 1) / measured_duration
+    if max_frequency >= frame_rate / 2:
         raise ValueError(
-            f"frequency: {max_frequency:g} Hz is not below half the frame rate of {rate:.4g} Hz, and would be another."
+            f"frequency: {max_frequency:g} Hz is not below half the frame rate of {frame_rate:.4g} Hz, and would be "
+            "another."
         )
-    if max_frequency * duration < _MIN_PERIODS:
+    if max_frequency * measured_duration < _MIN_MEASURED_PERIODS:
         raise ValueError(
-            f"frequency: {max_frequency:g} Hz has no whole period in the {duration:.3g} s measured; measure longer."
+            f"frequency: {max_frequency:g} Hz has no whole period in the {measured_duration:.3g} s measured; measure "
+            "longer."
         )
-    min_frequency = max(min_frequency, _MIN_PERIODS / duration)
-    weights = _window_weights(finite_times, window)
+    min_frequency = max(min_frequency, _MIN_MEASURED_PERIODS / measured_duration)
+    frame_weights = _window_weights(finite_times, window)
     flat_values = finite_values.reshape(len(finite_values), -1)
     best_frequency = (
         min_frequency
         if min_frequency == max_frequency
-        else _strongest_frequency(flat_values, finite_times, weights, (min_frequency, max_frequency, resolution))
+        else _strongest_frequency(
+            flat_values, finite_times, frame_weights, (min_frequency, max_frequency, frequency_resolution)
+        )
     )
     coefficients, residual_variance, coefficient_variances = _fit_sinusoid(
-        flat_values, finite_times, weights, best_frequency
+        flat_values, finite_times, frame_weights, best_frequency
     )
-    shape = finite_values.shape[1:]
-    cosine, sine = coefficients[2], coefficients[3]
-    noise = np.sqrt(residual_variance) * np.sqrt((coefficient_variances[2] + coefficient_variances[3]) / 2)
+    value_shape = finite_values.shape[1:]
+    cosine_coefficient, sine_coefficient = coefficients[2], coefficients[3]
+    amplitude_noise = np.sqrt(residual_variance) * np.sqrt((coefficient_variances[2] + coefficient_variances[3]) / 2)
     return Oscillation(
         best_frequency,
-        np.hypot(cosine, sine).reshape(shape),
-        np.arctan2(-sine, cosine).reshape(shape),
-        noise.reshape(shape),
-        resolution,
+        np.hypot(cosine_coefficient, sine_coefficient).reshape(value_shape),
+        np.arctan2(-sine_coefficient, cosine_coefficient).reshape(value_shape),
+        amplitude_noise.reshape(value_shape),
+        frequency_resolution,
     )
 
 
@@ -237,95 +241,116 @@ def amplitude_spectrum(
     frequencies, amplitudes = amplitude_spectrum(changes.mean(axis=1), times)
     ```
     """
-    finite_values, finite_times = _finite_rows(values, times)
-    check_name("window", window, _RESOLUTION_OF_WINDOW)
-    duration = float(finite_times[-1] - finite_times[0])
+    finite_values, finite_times = _frames_without_nan(values, times)
+    check_name("window", window, _WINDOW_RESOLUTION)
+    measured_duration = float(finite_times[-1] - finite_times[0])
     frequencies = np.arange(
-        1 / duration, (len(finite_times) - 1) / duration / 2, _RESOLUTION_OF_WINDOW[window] / duration / 2
+        1 / measured_duration,
+        (len(finite_times) - 1) / measured_duration / 2,
+        _WINDOW_RESOLUTION[window] / measured_duration / 2,
     )
-    weight = _window_weights(finite_times, window)
-    centred = finite_values - np.tensordot(weight, finite_values, 1) / weight.sum()
-    phase_factors = weight * np.exp(-2j * np.pi * frequencies[:, None] * (finite_times - finite_times[0]))
-    return frequencies, 2 * np.abs(np.tensordot(phase_factors, centred, 1)) / weight.sum()
+    frame_weights = _window_weights(finite_times, window)
+    centred_values = finite_values - np.tensordot(frame_weights, finite_values, 1) / frame_weights.sum()
+    weighted_phase_factors = frame_weights * np.exp(
+        -2j * np.pi * frequencies[:, None] * (finite_times - finite_times[0])
+    )
+    return frequencies, 2 * np.abs(np.tensordot(weighted_phase_factors, centred_values, 1)) / frame_weights.sum()
 
 
-def _check_band(frequency) -> tuple[float, float]:
+def _frequency_band(frequency) -> tuple[float, float]:
     """The lowest and the highest frequency in hertz, which are equal if `frequency` is a number."""
-    band = (frequency, frequency) if is_number(frequency) else frequency
+    frequency_band = (frequency, frequency) if is_number(frequency) else frequency
     if not (
-        isinstance(band, tuple | list)
-        and len(band) == 2
-        and all(is_number(band_limit) and band_limit > 0 for band_limit in band)
+        isinstance(frequency_band, tuple | list)
+        and len(frequency_band) == 2
+        and all(is_number(band_limit) and band_limit > 0 for band_limit in frequency_band)
     ):
         raise ValueError(f"frequency must be positive hertz, or a band (lowest, highest); it is {describe(frequency)}.")
-    if band[0] > band[1]:
-        raise ValueError(f"frequency: the band from {band[0]:g} to {band[1]:g} Hz is the wrong way round.")
-    return float(band[0]), float(band[1])
-
-
-def _finite_rows(values, times) -> tuple[np.ndarray, np.ndarray]:
-    """Frames (rows) without NaN as real numbers, and their times."""
-    rows, row_times = np.asarray(values), np.asarray(times, float)
-    if rows.ndim < 1 or rows.dtype.kind not in "iuf" or row_times.shape != rows.shape[:1]:
+    if frequency_band[0] > frequency_band[1]:
         raise ValueError(
-            f"values are {rows.dtype} of shape {rows.shape}, times {row_times.shape}; give a row for each time."
+            f"frequency: the band from {frequency_band[0]:g} to {frequency_band[1]:g} Hz is the wrong way round."
         )
-    if not np.isfinite(row_times).all() or (np.diff(row_times) <= 0).any():
+    return float(frequency_band[0]), float(frequency_band[1])
+
+
+def _frames_without_nan(frame_values, frame_times) -> tuple[np.ndarray, np.ndarray]:
+    """Return the frames (rows) without NaN as real numbers, and the times of these frames."""
+    value_array, time_array = np.asarray(frame_values), np.asarray(frame_times, float)
+    if value_array.ndim < 1 or value_array.dtype.kind not in "iuf" or time_array.shape != value_array.shape[:1]:
+        raise ValueError(
+            f"values are {value_array.dtype} of shape {value_array.shape}, times {time_array.shape}; give a row for "
+            "each time."
+        )
+    if not np.isfinite(time_array).all() or (np.diff(time_array) <= 0).any():
         raise ValueError("times must be finite and rise, in seconds.")
-    is_finite = np.isfinite(rows.reshape(len(rows), -1)).all(axis=1)
-    if is_finite.sum() < 5:
-        raise ValueError(f"values: {int(is_finite.sum())} frames without NaN; an oscillation takes five at least.")
-    return rows[is_finite].astype(float), row_times[is_finite]
+    is_finite_frame = np.isfinite(value_array.reshape(len(value_array), -1)).all(axis=1)
+    if is_finite_frame.sum() < 5:
+        raise ValueError(
+            f"values: {int(is_finite_frame.sum())} frames without NaN; an oscillation takes five at least."
+        )
+    return value_array[is_finite_frame].astype(float), time_array[is_finite_frame]
 
 
 def _window_weights(times: np.ndarray, window: Window) -> np.ndarray:
-    """Weight of each frame. Hann's window is shifted so that the first and last frames have nonzero weights."""
+    """Return the weight of each frame in a window. Hann's window is shifted so that the first and last frames have
+    nonzero weights."""
     if window == "none":
         return np.ones(len(times))
-    step = (times[-1] - times[0]) / (len(times) - 1)
-    return np.sin(np.pi * (times - times[0] + step / 2) / (times[-1] - times[0] + step)) ** 2
+    mean_frame_interval = (times[-1] - times[0]) / (len(times) - 1)
+    return (
+        np.sin(np.pi * (times - times[0] + mean_frame_interval / 2) / (times[-1] - times[0] + mean_frame_interval)) ** 2
+    )
 
 
-def _fit_sinusoid(values: np.ndarray, times: np.ndarray, weight: np.ndarray, frequency: float):
+def _fit_sinusoid(frame_values: np.ndarray, frame_times: np.ndarray, frame_weights: np.ndarray, frequency: float):
     """Fit mean, drift, cosine and sine to n series. Returns coefficients (4, n), residual variances (n,), and the
     variance of each coefficient (4,) for noise of unit variance."""
-    angle = 2 * np.pi * frequency * times
-    centred_times = times - times.mean()
-    design = np.stack([np.ones(len(times)), centred_times / centred_times[-1], np.cos(angle), np.sin(angle)], axis=1)
-    inverse = np.linalg.pinv(np.sqrt(weight)[:, None] * design) * np.sqrt(weight)
-    coefficients = inverse @ values
-    residual_variance = ((values - design @ coefficients) ** 2).sum(axis=0) / max(len(times) - 4, 1)
-    return coefficients, residual_variance, (inverse**2).sum(axis=1)
+    phase_angle = 2 * np.pi * frequency * frame_times
+    centred_times = frame_times - frame_times.mean()
+    design_matrix = np.stack(
+        [np.ones(len(frame_times)), centred_times / centred_times[-1], np.cos(phase_angle), np.sin(phase_angle)], axis=1
+    )
+    weighted_pseudoinverse = np.linalg.pinv(np.sqrt(frame_weights)[:, None] * design_matrix) * np.sqrt(frame_weights)
+    sinusoid_coefficients = weighted_pseudoinverse @ frame_values
+    residual_variance = ((frame_values - design_matrix @ sinusoid_coefficients) ** 2).sum(axis=0) / max(
+        len(frame_times) - 4, 1
+    )
+    return sinusoid_coefficients, residual_variance, (weighted_pseudoinverse**2).sum(axis=1)
 
 
 def _strongest_frequency(
-    values: np.ndarray, times: np.ndarray, weight: np.ndarray, band: tuple[float, float, float]
+    frame_values: np.ndarray,
+    frame_times: np.ndarray,
+    frame_weights: np.ndarray,
+    searched_band: tuple[float, float, float],
 ) -> float:
-    """The frequency in a band (lowest, highest, resolution) at which the power summed over all values is largest."""
-    min_frequency, max_frequency, resolution = band
+    """Return the frequency in a band (lowest, highest, resolution) at which the power summed over all values is
+    largest."""
+    min_frequency, max_frequency, frequency_resolution = searched_band
     # The power is computed from the first eight principal components of the values.
-    centred = values - values.mean(axis=0)
+    centred_values = frame_values - frame_values.mean(axis=0)
     left_vectors, singular_values, _ = np.linalg.svd(
-        centred @ centred.T if centred.shape[1] > len(centred) else centred, full_matrices=False
+        centred_values @ centred_values.T if centred_values.shape[1] > len(centred_values) else centred_values,
+        full_matrices=False,
     )
-    singular_values = np.sqrt(singular_values) if centred.shape[1] > len(centred) else singular_values
-    components = left_vectors[:, :8] * singular_values[:8]
+    singular_values = np.sqrt(singular_values) if centred_values.shape[1] > len(centred_values) else singular_values
+    principal_components = left_vectors[:, :8] * singular_values[:8]
 
-    def power(frequency: float) -> float:
-        coefficients, _, _ = _fit_sinusoid(components, times, weight, frequency)
-        return -float((coefficients[2:] ** 2).sum())
+    def negative_power(frequency: float) -> float:
+        sinusoid_coefficients, _, _ = _fit_sinusoid(principal_components, frame_times, frame_weights, frequency)
+        return -float((sinusoid_coefficients[2:] ** 2).sum())
 
     trial_frequencies = np.linspace(
         min_frequency,
         max_frequency,
-        max(int(np.ceil((max_frequency - min_frequency) / resolution * _FREQUENCIES_PER_RESOLUTION)), 2) + 1,
+        max(int(np.ceil((max_frequency - min_frequency) / frequency_resolution * _FREQUENCIES_PER_RESOLUTION)), 2) + 1,
     )
-    best_index = int(np.argmin([power(frequency) for frequency in trial_frequencies]))
+    best_index = int(np.argmin([negative_power(frequency) for frequency in trial_frequencies]))
     search_interval = (
         trial_frequencies[max(best_index - 1, 0)],
         trial_frequencies[min(best_index + 1, len(trial_frequencies) - 1)],
     )
-    result: Any = scipy.optimize.minimize_scalar(
-        power, bounds=search_interval, method="bounded", options={"xatol": 1e-9}
+    refined_maximum: Any = scipy.optimize.minimize_scalar(
+        negative_power, bounds=search_interval, method="bounded", options={"xatol": 1e-9}
     )
-    return float(result.x)
+    return float(refined_maximum.x)

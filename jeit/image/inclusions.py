@@ -16,9 +16,10 @@ from jeit_solvers.module import Module
 if TYPE_CHECKING:
     from jeit.image.plane import TriangleSurface
 
+# Numbers of columns and rows of quadrilaterals on the drawn surface of an ellipsoid; a column has three rows.
 _SURFACE_COLUMNS, _SURFACE_ROWS = 48, 24
 # Level of the image at the edge of the strongest region, as a share of the region's peak.
-_RELATIVE_REGION_THRESHOLD = 0.5
+_STRONGEST_REGION_LEVEL = 0.5
 
 
 class SolidForm(Module):
@@ -43,26 +44,27 @@ class SolidForm(Module):
         """Closed surface of the ellipsoid or column, as triangles."""
         from jeit.image.plane import TriangleSurface
 
-        polar_angle = np.linspace(0, np.pi, _SURFACE_ROWS + 1)
-        radius, height = np.sin(polar_angle), -np.cos(polar_angle)
+        polar_angles = np.linspace(0, np.pi, _SURFACE_ROWS + 1)
+        ring_radii, ring_heights = np.sin(polar_angles), -np.cos(polar_angles)
         if self.column:
-            radius, height = np.array([0.0, 1.0, 1.0, 0.0]), np.array([-1.0, -1.0, 1.0, 1.0])
-        angle = 2 * np.pi * np.arange(_SURFACE_COLUMNS) / _SURFACE_COLUMNS
-        circles = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            ring_radii, ring_heights = np.array([0.0, 1.0, 1.0, 0.0]), np.array([-1.0, -1.0, 1.0, 1.0])
+        ring_angles = 2 * np.pi * np.arange(_SURFACE_COLUMNS) / _SURFACE_COLUMNS
+        ring_points = ring_radii[:, None, None] * np.stack([np.cos(ring_angles), np.sin(ring_angles)], axis=1)
         unit_points = np.concatenate(
-            [circles, np.broadcast_to(height[:, None, None], (len(height), _SURFACE_COLUMNS, 1))], axis=2
+            [ring_points, np.broadcast_to(ring_heights[:, None, None], (len(ring_heights), _SURFACE_COLUMNS, 1))],
+            axis=2,
         )
-        axes = np.array(self.axes)
-        axes[0] *= np.sign(np.linalg.det(axes))  # a right-handed system, so that all normals point outward
-        lower_ring_nodes = _SURFACE_COLUMNS * np.arange(len(height) - 1)[:, None] + np.arange(_SURFACE_COLUMNS)
+        semi_axes = np.array(self.axes)
+        semi_axes[0] *= np.sign(np.linalg.det(semi_axes))  # a right-handed system, so that all normals point outward
+        lower_ring_nodes = _SURFACE_COLUMNS * np.arange(len(ring_heights) - 1)[:, None] + np.arange(_SURFACE_COLUMNS)
         next_lower_nodes = np.roll(lower_ring_nodes, -1, axis=1)
         upper_ring_nodes, next_upper_nodes = lower_ring_nodes + _SURFACE_COLUMNS, next_lower_nodes + _SURFACE_COLUMNS
-        corners = [
+        triangle_corners = [
             np.stack([lower_ring_nodes, next_lower_nodes, upper_ring_nodes], axis=-1),
             np.stack([next_lower_nodes, next_upper_nodes, upper_ring_nodes], axis=-1),
         ]
         return TriangleSurface(
-            unit_points.reshape(-1, 3) @ axes + np.array(self.centre), np.stack(corners).reshape(-1, 3)
+            unit_points.reshape(-1, 3) @ semi_axes + np.array(self.centre), np.stack(triangle_corners).reshape(-1, 3)
         )
 
 
@@ -189,27 +191,33 @@ class StrongestRegion:
     """
 
     def __init__(self, mesh: Mesh):
-        shared = np.asarray(mesh.cells if mesh.dimension == 3 else shared_facets(mesh))
-        rows, columns = np.nonzero(shared >= 0)  # facets of the boundary are not shared
-        matrix_entries = np.ones(len(rows), np.float32), (rows, shared[rows, columns])
-        self._incidence = sparse.csr_array(matrix_entries, shape=(len(shared), int(shared.max()) + 1))
-        self._transposed = sparse.csr_array(self._incidence.T)
-        self._measures, self._centroids = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
+        shared_indices = np.asarray(mesh.cells if mesh.dimension == 3 else shared_facets(mesh))
+        cell_rows, index_columns = np.nonzero(shared_indices >= 0)  # facets of the boundary are not shared
+        incidence_entries = np.ones(len(cell_rows), np.float32), (cell_rows, shared_indices[cell_rows, index_columns])
+        self._incidence = sparse.csr_array(
+            incidence_entries, shape=(len(shared_indices), int(shared_indices.max()) + 1)
+        )
+        self._transposed_incidence = sparse.csr_array(self._incidence.T)
+        self._cell_measures, self._cell_centroids = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
 
     def __call__(self, change: Float[np.ndarray, " m"]) -> tuple[Float[np.ndarray, " d"], float]:
         """Return the centroid of the strongest region, in metres, and the signed peak of a `change` (m,) per cell."""
-        peak = int(np.abs(change).argmax())
-        relative = change / change[peak] if change[peak] else np.zeros_like(change)
-        candidates = relative >= _RELATIVE_REGION_THRESHOLD
-        region = np.zeros(len(change), np.float32)
-        region[peak] = 1
-        count = 0
-        while count != (count := int(region.sum())):
-            region = ((self._incidence @ (self._transposed @ region) > 0) & candidates).astype(np.float32)
-            region[peak] = 1
-        cells = region > 0
-        weight = self._measures[cells] * np.maximum(relative[cells], _RELATIVE_REGION_THRESHOLD)
-        return weight @ self._centroids[cells] / weight.sum(), float(change[peak])
+        peak_cell = int(np.abs(change).argmax())
+        relative_change = change / change[peak_cell] if change[peak_cell] else np.zeros_like(change)
+        exceeds_threshold = relative_change >= _STRONGEST_REGION_LEVEL
+        region_indicator = np.zeros(len(change), np.float32)
+        region_indicator[peak_cell] = 1
+        num_region_cells = 0
+        while num_region_cells != (num_region_cells := int(region_indicator.sum())):
+            region_indicator = (
+                (self._incidence @ (self._transposed_incidence @ region_indicator) > 0) & exceeds_threshold
+            ).astype(np.float32)
+            region_indicator[peak_cell] = 1
+        region_cells = region_indicator > 0
+        centroid_weights = self._cell_measures[region_cells] * np.maximum(
+            relative_change[region_cells], _STRONGEST_REGION_LEVEL
+        )
+        return centroid_weights @ self._cell_centroids[region_cells] / centroid_weights.sum(), float(change[peak_cell])
 
 
 def inclusion_regions(
@@ -225,45 +233,59 @@ def inclusion_regions(
 ) -> list[tuple[Inclusion, Bool[np.ndarray, " m"]]]:
     """Return the inclusions of `find_inclusions`, each with a mask (m,) of the cells of its region. Raises `ValueError`
     as `find_inclusions` does."""
-    values = np.asarray(image)
-    if values.shape != (mesh.num_cells,):
-        raise ValueError(f"image has shape {values.shape}; give one value for each of the {mesh.num_cells} cells.")
-    if np.iscomplexobj(values):
+    image_values = np.asarray(image)
+    if image_values.shape != (mesh.num_cells,):
+        raise ValueError(
+            f"image has shape {image_values.shape}; give one value for each of the {mesh.num_cells} cells."
+        )
+    if np.iscomplexobj(image_values):
         raise ValueError("image is complex; look for inclusions in its real or imaginary part.")
     if not (0 < level < 1 and 0 <= least_peak <= 1):
         raise ValueError(f"level must lie between 0 and 1 and least_peak too; they are {level} and {least_peak}.")
-    if not np.isfinite(values).all():
+    if not np.isfinite(image_values).all():
         raise ValueError("image has NaN or infinite values; reconstruct it from unmasked channels first.")
-    if noise is not None and np.shape(noise) != values.shape:
+    if noise is not None and np.shape(noise) != image_values.shape:
         raise ValueError(f"noise has shape {np.shape(noise)}; give one value for each of the {mesh.num_cells} cells.")
-    max_change = np.abs(values).max()
+    max_change = np.abs(image_values).max()
     if max_change == 0:
         return []
     cell_measures, cell_centres = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
     # In solids, cells that share a node count as neighbours, because a tetrahedron shares facets with only some of the
     # adjacent cells of higher value.
-    shared = np.asarray(mesh.cells) if mesh.dimension == 3 else shared_facets(mesh)
+    shared_indices = np.asarray(mesh.cells) if mesh.dimension == 3 else shared_facets(mesh)
     if least_area is None:
         least_area = _MIN_RELATIVE_AREA[mesh.dimension]
-    inclusions = []
+    inclusions_with_regions = []
     for sign in (1, -1):
-        change = sign * values
+        signed_change = sign * image_values
         basin_indices = watershed_basins(
-            change, shared, min_value=level * least_peak * max_change, least_prominence=least_prominence
+            signed_change, shared_indices, min_value=level * least_peak * max_change, least_prominence=least_prominence
         )
-        for label in np.unique(basin_indices[basin_indices >= 0]):
-            peak = change[label]
-            region = (basin_indices == label) & (change >= level * peak)
-            if noise is not None and peak < least_significance * noise[label]:
+        for peak_cell in np.unique(basin_indices[basin_indices >= 0]):
+            peak_change = signed_change[peak_cell]
+            region_cells = (basin_indices == peak_cell) & (signed_change >= level * peak_change)
+            if noise is not None and peak_change < least_significance * noise[peak_cell]:
                 continue
-            if peak < least_peak * max_change or cell_measures[region].sum() < least_area * cell_measures.sum():
+            if (
+                peak_change < least_peak * max_change
+                or cell_measures[region_cells].sum() < least_area * cell_measures.sum()
+            ):
                 continue
-            weight = (cell_measures * change)[region]
-            centroid = tuple(float(value) for value in weight @ cell_centres[region] / weight.sum())
-            inclusions.append(
+            centroid_weights = (cell_measures * signed_change)[region_cells]
+            centroid = tuple(
+                float(coordinate)
+                for coordinate in centroid_weights @ cell_centres[region_cells] / centroid_weights.sum()
+            )
+            inclusions_with_regions.append(
                 (
-                    Inclusion(sign, centroid, float(cell_measures[region].sum()), float(sign * peak), mesh.is_surface),
-                    region,
+                    Inclusion(
+                        sign,
+                        centroid,
+                        float(cell_measures[region_cells].sum()),
+                        float(sign * peak_change),
+                        mesh.is_surface,
+                    ),
+                    region_cells,
                 )
             )
-    return sorted(inclusions, key=lambda inclusion_and_region: -abs(inclusion_and_region[0].peak))
+    return sorted(inclusions_with_regions, key=lambda inclusion_and_region: -abs(inclusion_and_region[0].peak))

@@ -19,21 +19,21 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind, describe, is_number
 from jeit.mesh import Mesh, measures
 
-# For a tetrahedron with nodes sorted from the highest to the lowest value: the end nodes of the edges that the level
-# crosses, in order around the polygon. The keys are numbers of nodes above the level.
+# End nodes of the edges of a tetrahedron that the level crosses, in order around the polygon of intersection. Nodes are
+# sorted from the highest to the lowest value. The keys are numbers of nodes above the level.
 _CROSSED_EDGES = {
     1: [[0, 1], [0, 2], [0, 3], [0, 3]],
     2: [[0, 2], [0, 3], [1, 3], [1, 2]],
     3: [[0, 3], [1, 3], [2, 3], [2, 3]],
 }
-# For a triangle: the corners of the part above the level, each given by the end nodes of its edge; a corner at a node
-# has this node as both ends.
-_CORNERS_ABOVE = {
+# Corners of the part of a triangle above the level. Each corner is given by the end nodes of the edge on which it lies;
+# a corner at a node has this node as both end nodes.
+_CORNERS_ABOVE_LEVEL = {
     1: [[0, 0], [0, 1], [0, 2], [0, 2]],
     2: [[0, 0], [1, 1], [1, 2], [0, 2]],
     3: [[0, 0], [1, 1], [2, 2], [2, 2]],
 }
-_CROSSED_SIDES = [[0, 1], [0, 2]]
+_CROSSED_TRIANGLE_SIDES = [[0, 1], [0, 2]]
 
 
 class CutPieces(NamedTuple):
@@ -66,27 +66,31 @@ def cut_above_level(
 ) -> CutPieces:
     """The part of a surface of triangles on which the field with the `values` (n,) at the nodes is at or above
     `level`."""
-    return _cut_cells(triangles, values, level, _CORNERS_ABOVE)
+    return _cut_cells(triangles, values, level, _CORNERS_ABOVE_LEVEL)
 
 
 def crossed_edges(triangles: Int[np.ndarray, "b 3"], values: Float[np.ndarray, " n"], level: float = 0.0) -> CutPieces:
     """The lines on a surface of triangles along which the field with the `values` (n,) at the nodes equals `level`:
     pieces with two corners."""
-    return _cut_cells(triangles, values, level, {1: _CROSSED_SIDES, 2: [[0, 2], [1, 2]]})
+    return _cut_cells(triangles, values, level, {1: _CROSSED_TRIANGLE_SIDES, 2: [[0, 2], [1, 2]]})
 
 
-def _cut_cells(cells, values, level: float, corners_by_number: dict[int, list[list[int]]]) -> CutPieces:
-    num_nodes_above = (values[cells] >= level).sum(axis=1)
+def _cut_cells(cells, field_values, level: float, corner_edges_by_count: dict[int, list[list[int]]]) -> CutPieces:
+    num_nodes_above = (field_values[cells] >= level).sum(axis=1)
     piece_arrays = []
-    for num_corners_above, corners in corners_by_number.items():
-        cell = np.flatnonzero(num_nodes_above == num_corners_above)
-        sort_order = np.argsort(-values[cells[cell]], axis=1, kind="stable")
-        end_nodes = np.take_along_axis(cells[cell], sort_order, axis=1)[:, np.array(corners)]
-        high, low = values[end_nodes[..., 0]], values[end_nodes[..., 1]]
+    for num_corners_above, corner_edges in corner_edges_by_count.items():
+        cut_cells = np.flatnonzero(num_nodes_above == num_corners_above)
+        sort_order = np.argsort(-field_values[cells[cut_cells]], axis=1, kind="stable")
+        end_nodes = np.take_along_axis(cells[cut_cells], sort_order, axis=1)[:, np.array(corner_edges)]
+        higher_values, lower_values = field_values[end_nodes[..., 0]], field_values[end_nodes[..., 1]]
         with np.errstate(invalid="ignore"):
-            edge_fractions = np.where(high > low, (high - level) / np.where(high > low, high - low, 1), 0)
-        piece_arrays.append((end_nodes, edge_fractions, cell))
-    return CutPieces(*(np.concatenate(arrays) for arrays in zip(*piece_arrays, strict=True)))
+            edge_fractions = np.where(
+                higher_values > lower_values,
+                (higher_values - level) / np.where(higher_values > lower_values, higher_values - lower_values, 1),
+                0,
+            )
+        piece_arrays.append((end_nodes, edge_fractions, cut_cells))
+    return CutPieces(*(np.concatenate(joined_arrays) for joined_arrays in zip(*piece_arrays, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -131,22 +135,22 @@ def node_values(mesh: Mesh, image: Float[np.ndarray, "..."]) -> Float[np.ndarray
     smooth = node_values(mesh, image)
     ```
     """
-    values = np.asarray(image)
-    if values.shape not in ((mesh.num_cells,), (mesh.num_points,)):
+    image_values = np.asarray(image)
+    if image_values.shape not in ((mesh.num_cells,), (mesh.num_points,)):
         raise ValueError(
-            f"values has shape {values.shape}; give one for each of the {mesh.num_cells} cells or the "
+            f"values has shape {image_values.shape}; give one for each of the {mesh.num_cells} cells or the "
             f"{mesh.num_points} nodes."
         )
-    if np.iscomplexobj(values):
+    if np.iscomplexobj(image_values):
         raise ValueError("values are complex; take their real or imaginary part.")
-    if not np.isfinite(values).all():
+    if not np.isfinite(image_values).all():
         raise ValueError("values must be finite to be drawn.")
-    if values.shape == (mesh.num_points,):
-        return values.astype(float)
-    cells, weight = np.asarray(mesh.cells), np.asarray(measures(mesh))
-    corners = cells.shape[1]
-    total = np.bincount(cells.ravel(), np.repeat(weight * values, corners), mesh.num_points)
-    return total / np.bincount(cells.ravel(), np.repeat(weight, corners), mesh.num_points)
+    if image_values.shape == (mesh.num_points,):
+        return image_values.astype(float)
+    cells, cell_measures = np.asarray(mesh.cells), np.asarray(measures(mesh))
+    nodes_per_cell = cells.shape[1]
+    weighted_sums = np.bincount(cells.ravel(), np.repeat(cell_measures * image_values, nodes_per_cell), mesh.num_points)
+    return weighted_sums / np.bincount(cells.ravel(), np.repeat(cell_measures, nodes_per_cell), mesh.num_points)
 
 
 def isosurface_of(mesh: Mesh, values: Float[np.ndarray, "..."], level: float) -> TriangleSurface:
@@ -173,46 +177,54 @@ def isosurface_of(mesh: Mesh, values: Float[np.ndarray, "..."], level: float) ->
     check_solid(mesh)
     if not is_number(level) or level == 0:
         raise ValueError(f"level must be a value of the image, above or below zero; it is {describe(level)}.")
-    sign = 1.0 if level > 0 else -1.0
-    height = sign * node_values(mesh, values) - abs(level)
+    level_sign = 1.0 if level > 0 else -1.0
+    height_above_level = level_sign * node_values(mesh, values) - abs(level)
     points = np.asarray(mesh.points)
     inner_surface, wall_surface = (
-        crossed_cells(np.asarray(mesh.cells), height),
-        cut_above_level(np.asarray(mesh.facets), height),
+        crossed_cells(np.asarray(mesh.cells), height_above_level),
+        cut_above_level(np.asarray(mesh.facets), height_above_level),
     )
     end_nodes, edge_fractions = (
         np.concatenate([inner_surface.ends, wall_surface.ends]),
         np.concatenate([inner_surface.share, wall_surface.share]),
     )
-    # One point for each crossed edge and each node of the wall, shared between cells.
+    # Cells share one point for each crossed edge and for each node of the wall.
     end_nodes = np.where(
         ((edge_fractions == 0) | (edge_fractions == 1))[..., None],
         np.where(edge_fractions == 1, end_nodes[..., 1], end_nodes[..., 0])[..., None],
         end_nodes,
     )
     edge_fractions = np.where(end_nodes[..., 0] == end_nodes[..., 1], 0.0, edge_fractions)
-    low = end_nodes.min(axis=-1).astype(np.int64)
-    key = low * len(points) + end_nodes.max(axis=-1)
-    _, first_indices, number = np.unique(key, return_index=True, return_inverse=True)
-    end_nodes, edge_fractions, number = (
+    lower_nodes = end_nodes.min(axis=-1).astype(np.int64)
+    edge_keys = lower_nodes * len(points) + end_nodes.max(axis=-1)
+    _, first_indices, point_indices = np.unique(edge_keys, return_index=True, return_inverse=True)
+    end_nodes, edge_fractions, point_indices = (
         end_nodes.reshape(-1, 2)[first_indices],
         edge_fractions.reshape(-1)[first_indices],
-        number.reshape(-1, 4),
+        point_indices.reshape(-1, 4),
     )
     points_on_edges = (1 - edge_fractions)[:, None] * points[end_nodes[:, 0]] + edge_fractions[:, None] * points[
         end_nodes[:, 1]
     ]
     # Normals point from values above the level to values below; facets of the wall have outward normals already.
     inward_directions = points[inner_surface.ends[..., 1]].sum(axis=1) - points[inner_surface.ends[..., 0]].sum(axis=1)
-    outward = np.concatenate([inward_directions, _normals(points[np.asarray(mesh.facets)[wall_surface.cell]])])
-    triangles = np.concatenate([number[:, [0, 1, 2]], number[:, [0, 2, 3]]])
-    needs_flip = np.sum(_normals(points_on_edges[triangles]) * np.concatenate([outward, outward]), axis=1) < 0
+    outward_directions = np.concatenate(
+        [inward_directions, _triangle_normals(points[np.asarray(mesh.facets)[wall_surface.cell]])]
+    )
+    triangles = np.concatenate([point_indices[:, [0, 1, 2]], point_indices[:, [0, 2, 3]]])
+    needs_flip = (
+        np.sum(
+            _triangle_normals(points_on_edges[triangles]) * np.concatenate([outward_directions, outward_directions]),
+            axis=1,
+        )
+        < 0
+    )
     triangles[needs_flip] = triangles[needs_flip][:, ::-1]
     a, b, c = triangles.T
     return TriangleSurface(points_on_edges, triangles[(a != b) & (b != c) & (a != c)])
 
 
-def _normals(corners: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3"]:
+def _triangle_normals(corners: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3"]:
     """Normals of triangles with the given corners; each normal is as long as twice the triangle's area."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
@@ -258,25 +270,26 @@ class Plane:
         point, normal = np.zeros(3), np.zeros(3)
         point[AXES.index(axis)] = value
         normal[AXES.index(axis)] = -1.0 if axis == "y" else 1.0
-        return cls(point, normal, *_page_axes(normal), f"{axis} = {_millimetres(float(value))} mm")
+        return cls(point, normal, *_page_axes(normal), f"{axis} = {_millimetres_text(float(value))} mm")
 
     @classmethod
     def through(cls, point: ArrayLike, normal: ArrayLike) -> "Plane":
         """The plane through `point` (3,), in metres, perpendicular to `normal` (3,), which points towards the viewer.
         Raises `ValueError` unless point and normal are three finite numbers each and the normal is not zero."""
         point_array, normal_array = (np.asarray(values, dtype=object) for values in (point, normal))
-        for name, value in (("point", point_array), ("normal", normal_array)):
-            if value.shape != (3,) or not all(is_number(coordinate) for coordinate in value):
+        for argument_name, argument_value in (("point", point_array), ("normal", normal_array)):
+            if argument_value.shape != (3,) or not all(is_number(coordinate) for coordinate in argument_value):
                 raise ValueError(
-                    f"{name} must be three finite numbers; it is {describe(point if name == 'point' else normal)}."
+                    f"{argument_name} must be three finite numbers; it is "
+                    f"{describe(point if argument_name == 'point' else normal)}."
                 )
         point_array, normal_array = point_array.astype(float), normal_array.astype(float)
-        length = float(np.linalg.norm(normal_array))
-        if length == 0:
+        normal_length = float(np.linalg.norm(normal_array))
+        if normal_length == 0:
             raise ValueError("normal is zero; give the direction in which the plane is looked at, such as (0, 0, 1).")
-        unit_normal = normal_array / length
-        point_text = ", ".join(_millimetres(value) for value in point_array)
-        normal_text = ", ".join(f"{value:.2g}" for value in unit_normal).replace("-", "−")
+        unit_normal = normal_array / normal_length
+        point_text = ", ".join(_millimetres_text(coordinate) for coordinate in point_array)
+        normal_text = ", ".join(f"{component:.2g}" for component in unit_normal).replace("-", "−")
         return cls(
             point_array, unit_normal, *_page_axes(unit_normal), f"through ({point_text}) mm across ({normal_text})"
         )
@@ -341,17 +354,17 @@ def cut_by_plane(mesh: Mesh, plane: Plane) -> Cut:
     check_solid(mesh)
     check_kind("plane", plane, Plane, "a Plane, such as Plane.at('z', 0.02)")
     points, cells, facets = (np.asarray(values) for values in (mesh.points, mesh.cells, mesh.facets))
-    height = plane.distance(points)
-    size = float(np.ptp(points, axis=0).max())
-    height = np.where(np.abs(height) < _IN_PLANE_TOLERANCE * size, 0.0, height)
-    cut_pieces, edges = crossed_cells(cells, height), crossed_edges(facets, height)
+    signed_distances = plane.distance(points)
+    body_size = float(np.ptp(points, axis=0).max())
+    signed_distances = np.where(np.abs(signed_distances) < _IN_PLANE_TOLERANCE * body_size, 0.0, signed_distances)
+    cut_pieces, outline_pieces = crossed_cells(cells, signed_distances), crossed_edges(facets, signed_distances)
     if len(cut_pieces.cell) == 0:
-        cut_pieces, edges = crossed_cells(cells, -height), crossed_edges(facets, -height)
+        cut_pieces, outline_pieces = crossed_cells(cells, -signed_distances), crossed_edges(facets, -signed_distances)
     if len(cut_pieces.cell) == 0:
-        min_height, max_height = (1e3 * value for value in (height.min(), height.max()))
-        distance_text = f"{min_height:.3g} mm before" if min_height > 0 else f"{-max_height:.3g} mm behind"
+        min_distance, max_distance = (1e3 * distance for distance in (signed_distances.min(), signed_distances.max()))
+        distance_text = f"{min_distance:.3g} mm before" if min_distance > 0 else f"{-max_distance:.3g} mm behind"
         raise ValueError(f"plane {plane.name} misses the body, which lies {distance_text} it; are both in metres?")
-    polygons, outline = plane.on_page(cut_pieces.at_corners(points)), plane.on_page(edges.at_corners(points))
+    polygons, outline = plane.on_page(cut_pieces.at_corners(points)), plane.on_page(outline_pieces.at_corners(points))
     return Cut(polygons, cut_pieces.cell, outline[np.ptp(outline, axis=1).max(axis=1) > 0])
 
 
@@ -364,17 +377,17 @@ def check_solid(mesh: Mesh) -> None:
 
 def _page_axes(view_direction) -> tuple[np.ndarray, np.ndarray]:
     """Unit vectors to the right and up on the page, for a plane viewed from the direction `view_direction`."""
-    reference = (
+    page_reference = (
         np.array([0.0, 0.0, 1.0])
         if abs(view_direction[2]) < 1 - 1e-9
         else np.array([0.0, math.copysign(1, view_direction[2]), 0.0])
     )
-    upward_axis = reference - (reference @ view_direction) * view_direction
+    upward_axis = page_reference - (page_reference @ view_direction) * view_direction
     upward_axis /= np.linalg.norm(upward_axis)
     return np.cross(upward_axis, view_direction) + 0.0, upward_axis + 0.0
 
 
-def _millimetres(value: float) -> str:
-    # The value is rounded to a tenth of a millimetre, or for small values to three digits.
-    text = f"{1e3 * value:.1f}".removesuffix(".0") if abs(value) >= 0.0095 else f"{1e3 * value:.3g}"
-    return text.replace("-", "−") if abs(value) > 5e-10 else "0"
+def _millimetres_text(length: float) -> str:
+    # The length in millimetres is rounded to a tenth, or to three digits if it is below 9.5 mm.
+    length_text = f"{1e3 * length:.1f}".removesuffix(".0") if abs(length) >= 0.0095 else f"{1e3 * length:.3g}"
+    return length_text.replace("-", "−") if abs(length) > 5e-10 else "0"

@@ -53,20 +53,28 @@ class Raster(Module):
         half of its height. Raises `ValueError` for an empty extent, and for a surface in space."""
         check_flat(mesh, "rasters")
         points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
-        low, high = points.min(axis=0), points.max(axis=0)
+        lower_corner, upper_corner = points.min(axis=0), points.max(axis=0)
         if extent is None:
-            centre, half_side = (low + high)[:2] / 2, (high - low)[:2].max() / 2
-            extent = (centre[0] - half_side, centre[0] + half_side, centre[1] - half_side, centre[1] + half_side)
+            square_centre, half_side = (
+                (lower_corner + upper_corner)[:2] / 2,
+                (upper_corner - lower_corner)[:2].max() / 2,
+            )
+            extent = (
+                square_centre[0] - half_side,
+                square_centre[0] + half_side,
+                square_centre[1] - half_side,
+                square_centre[1] + half_side,
+            )
         x_min, x_max, y_min, y_max = (float(value) for value in extent)
         if not (x_max > x_min and y_max > y_min) or min(shape) < 1:
             raise ValueError(f"extent {extent} must be (x_min, x_max, y_min, y_max) in metres, and shape positive.")
-        rows, columns = shape
-        x = x_min + (np.arange(columns) + 0.5) * (x_max - x_min) / columns
-        y = y_max - (np.arange(rows) + 0.5) * (y_max - y_min) / rows
+        num_rows, num_columns = shape
+        x = x_min + (np.arange(num_columns) + 0.5) * (x_max - x_min) / num_columns
+        y = y_max - (np.arange(num_rows) + 0.5) * (y_max - y_min) / num_rows
         if mesh.dimension == 3:
-            height = (low[2] + high[2]) / 2 if height is None else float(height)
-        cell = _cells_of_pixels(points, cells, x, y, height if mesh.dimension == 3 else None)
-        return cls(as_array(cell, np.int32), (x_min, x_max, y_min, y_max))
+            height = (lower_corner[2] + upper_corner[2]) / 2 if height is None else float(height)
+        cell_of_pixel = _cells_of_pixels(points, cells, x, y, height if mesh.dimension == 3 else None)
+        return cls(as_array(cell_of_pixel, np.int32), (x_min, x_max, y_min, y_max))
 
     @property
     def pixel_area(self) -> float:
@@ -76,57 +84,74 @@ class Raster(Module):
 
     def pixel_centres(self) -> np.ndarray:
         """Centres of the pixels (rows, columns, 2) in metres."""
-        rows, columns = self.cell.shape
+        num_rows, num_columns = self.cell.shape
         x_min, x_max, y_min, y_max = self.extent
-        x = x_min + (np.arange(columns) + 0.5) * (x_max - x_min) / columns
-        y = y_max - (np.arange(rows) + 0.5) * (y_max - y_min) / rows
+        x = x_min + (np.arange(num_columns) + 0.5) * (x_max - x_min) / num_columns
+        y = y_max - (np.arange(num_rows) + 0.5) * (y_max - y_min) / num_rows
         return np.stack(np.meshgrid(x, y), axis=-1)
 
     def sample(self, image: Inexact[Array, "*frames m"]) -> Float[Array, "*frames rows columns"]:
         """Values at the pixels of one image (m,) or several images (frames, m) on m cells; NaN outside the mesh."""
-        return _sample(self.cell, image)
+        return _sample_at_pixels(self.cell, image)
 
 
 @numpy_or_compiled
-def _sample(cell, image):
-    xp = namespace(cell, image)
-    return xp.where(cell >= 0, image[..., xp.maximum(cell, 0)], xp.nan)
+def _sample_at_pixels(cell_of_pixel, cell_values):
+    xp = namespace(cell_of_pixel, cell_values)
+    return xp.where(cell_of_pixel >= 0, cell_values[..., xp.maximum(cell_of_pixel, 0)], xp.nan)
 
 
 def _cells_of_pixels(points, cells, x, y, height: float | None) -> Int[np.ndarray, "rows columns"]:
     """Index of the cell that contains each pixel centre (`x` ascending, `y` descending and, in a solid, `height`,
-    metres), or -1 outside all cells. Of several cells that meet at a pixel, the cell with the nearest centroid is
-    taken.
+    metres), or -1 outside all cells. If several cells meet at a pixel centre, the cell with the nearest centroid is
+    used.
 
     Every cell is tested at the pixels in the rectangle around it.
     """
     corners = points[cells]
-    low, high, tolerance = corners.min(axis=1), corners.max(axis=1), 1e-9 * np.ptp(points, axis=0).max()
-    # First pixel, and number of pixels, in the rectangle around every cell, along rows and columns.
-    first_row = np.searchsorted(-y, -high[:, 1] - tolerance)
-    first_column = np.searchsorted(x, low[:, 0] - tolerance)
-    num_rows = np.searchsorted(-y, -low[:, 1] + tolerance, side="right") - first_row
-    num_columns = np.searchsorted(x, high[:, 0] + tolerance, side="right") - first_column
+    lower_corners, upper_corners, tolerance = (
+        corners.min(axis=1),
+        corners.max(axis=1),
+        1e-9 * np.ptp(points, axis=0).max(),
+    )
+    # Index of the first pixel and number of pixels, along rows and columns, in the rectangle around every cell.
+    first_row = np.searchsorted(-y, -upper_corners[:, 1] - tolerance)
+    first_column = np.searchsorted(x, lower_corners[:, 0] - tolerance)
+    num_rows = np.searchsorted(-y, -lower_corners[:, 1] + tolerance, side="right") - first_row
+    num_columns = np.searchsorted(x, upper_corners[:, 0] + tolerance, side="right") - first_column
     num_pixels = num_rows * num_columns
     if height is not None:
-        num_pixels[(low[:, 2] > height + tolerance) | (high[:, 2] < height - tolerance)] = 0
+        num_pixels[(lower_corners[:, 2] > height + tolerance) | (upper_corners[:, 2] < height - tolerance)] = 0
     cells_with_pixels = np.flatnonzero(num_pixels)
-    inverse, centroid = np.zeros((len(cells), *corners[0, 1:].shape)), corners.mean(axis=1)
-    inverse[cells_with_pixels] = np.linalg.inv(
+    barycentric_matrices, cell_centroids = np.zeros((len(cells), *corners[0, 1:].shape)), corners.mean(axis=1)
+    barycentric_matrices[cells_with_pixels] = np.linalg.inv(
         np.swapaxes(corners[cells_with_pixels, 1:] - corners[cells_with_pixels, :1], 1, 2)
     )
-    cell = np.repeat(np.arange(len(cells)), num_pixels)
-    pixel = np.arange(len(cell)) - np.repeat(np.cumsum(num_pixels) - num_pixels, num_pixels)
-    row, column = np.divmod(pixel, num_columns[cell])
-    row, column = row + first_row[cell], column + first_column[cell]
-    position = [x[column], y[row]] if height is None else [x[column], y[row], np.full(len(cell), height)]
-    offset = [coordinate - corners[cell, 0, axis] for axis, coordinate in enumerate(position)]
-    barycentric = [sum(inverse[cell, i, j] * offset[j] for j in range(len(offset))) for i in range(len(offset))]
-    is_inside = np.minimum(np.minimum.reduce(barycentric), 1 - sum(barycentric)) > -1e-9
-    distance = np.sum([(coordinate - centroid[cell, axis]) ** 2 for axis, coordinate in enumerate(position)], axis=0)
-    sort_order = np.argsort(-distance[is_inside], kind="stable")  # the nearest cell of a pixel is assigned last
+    candidate_cells = np.repeat(np.arange(len(cells)), num_pixels)
+    pixel_in_rectangle = np.arange(len(candidate_cells)) - np.repeat(np.cumsum(num_pixels) - num_pixels, num_pixels)
+    pixel_rows, pixel_columns = np.divmod(pixel_in_rectangle, num_columns[candidate_cells])
+    pixel_rows, pixel_columns = pixel_rows + first_row[candidate_cells], pixel_columns + first_column[candidate_cells]
+    pixel_positions = (
+        [x[pixel_columns], y[pixel_rows]]
+        if height is None
+        else [x[pixel_columns], y[pixel_rows], np.full(len(candidate_cells), height)]
+    )
+    corner_offsets = [coordinate - corners[candidate_cells, 0, axis] for axis, coordinate in enumerate(pixel_positions)]
+    barycentric_coordinates = [
+        sum(barycentric_matrices[candidate_cells, i, j] * corner_offsets[j] for j in range(len(corner_offsets)))
+        for i in range(len(corner_offsets))
+    ]
+    is_inside = np.minimum(np.minimum.reduce(barycentric_coordinates), 1 - sum(barycentric_coordinates)) > -1e-9
+    squared_distances = np.sum(
+        [(coordinate - cell_centroids[candidate_cells, axis]) ** 2 for axis, coordinate in enumerate(pixel_positions)],
+        axis=0,
+    )
+    # Cells are sorted by decreasing distance, so that the nearest cell of a pixel is assigned last.
+    sort_order = np.argsort(-squared_distances[is_inside], kind="stable")
     cell_of_pixel = np.full((len(y), len(x)), -1)
-    cell_of_pixel[row[is_inside][sort_order], column[is_inside][sort_order]] = cell[is_inside][sort_order]
+    cell_of_pixel[pixel_rows[is_inside][sort_order], pixel_columns[is_inside][sort_order]] = candidate_cells[is_inside][
+        sort_order
+    ]
     return cell_of_pixel
 
 
@@ -180,12 +205,13 @@ class FiguresOfMerit(Module):
         return object_text(self._summary_text, self)
 
     def _summary_text(self) -> str:
-        medians = {name: float(np.median(np.asarray(value))) for name, value in vars(self).items()}
-        targets = f"medians of {np.size(self.distance)} targets: " if np.ndim(self.distance) else ""
+        median_figures = {name: float(np.median(np.asarray(value))) for name, value in vars(self).items()}
+        targets_text = f"medians of {np.size(self.distance)} targets: " if np.ndim(self.distance) else ""
         return (
-            f"FiguresOfMerit({targets}amplitude response {medians['amplitude_response']:.3g}, position error "
-            f"{1e3 * medians['position_error']:.3g} mm,\n  resolution {medians['resolution']:.3g}, shape deformation "
-            f"{medians['shape_deformation']:.3g}, ringing {medians['ringing']:.3g})"
+            f"FiguresOfMerit({targets_text}amplitude response {median_figures['amplitude_response']:.3g}, position "
+            f"error {1e3 * median_figures['position_error']:.3g} mm,\n  resolution "
+            f"{median_figures['resolution']:.3g}, shape deformation "
+            f"{median_figures['shape_deformation']:.3g}, ringing {median_figures['ringing']:.3g})"
         )
 
     def _repr_png_(self) -> bytes | None:
@@ -229,72 +255,88 @@ def figures_of_merit(
     if jnp.iscomplexobj(raster) or jnp.iscomplexobj(change):
         raise ValueError("raster and change must be real; judge the real and the imaginary part of an image apart.")
     raster, position, area, change = (jnp.asarray(values, float) for values in (raster, position, area, change))
-    _check_arguments(raster, extent, position, area, change)
+    _check_merit_arguments(raster, extent, position, area, change)
     return _figures_of_merit(raster, jnp.asarray(extent, float), position, area, change)
 
 
 @jax.jit
-def _figures_of_merit(raster, extent, position, area, change):
+def _figures_of_merit(raster, extent, target_position, target_area, target_change):
     if raster.ndim == 2:
-        return _figures_of_one_image(raster, extent, position, area, change)
-    area, change = jnp.broadcast_to(area, len(raster)), jnp.broadcast_to(change, len(raster))
-    return jax.vmap(_figures_of_one_image, in_axes=(0, None, 0, 0, 0))(raster, extent, position, area, change)
+        return _figures_of_one_image(raster, extent, target_position, target_area, target_change)
+    target_area, target_change = (
+        jnp.broadcast_to(target_area, len(raster)),
+        jnp.broadcast_to(target_change, len(raster)),
+    )
+    return jax.vmap(_figures_of_one_image, in_axes=(0, None, 0, 0, 0))(
+        raster, extent, target_position, target_area, target_change
+    )
 
 
-def _figures_of_one_image(raster, extent, position, area, change):
-    rows, columns = raster.shape
+def _figures_of_one_image(raster, extent, target_position, target_area, target_change):
+    num_rows, num_columns = raster.shape
     x_min, x_max, y_min, y_max = extent
-    x = x_min + (jnp.arange(columns) + 0.5) * (x_max - x_min) / columns
-    y = (y_max - (jnp.arange(rows) + 0.5) * (y_max - y_min) / rows)[:, None]
+    x = x_min + (jnp.arange(num_columns) + 0.5) * (x_max - x_min) / num_columns
+    y = (y_max - (jnp.arange(num_rows) + 0.5) * (y_max - y_min) / num_rows)[:, None]
     pixel_area = (x_max - x_min) * (y_max - y_min) / raster.size
     is_body_pixel = jnp.isfinite(raster)
-    value = jnp.where(is_body_pixel, raster, 0) / change  # positive values have the target's sign
-    max_value = value.max()
-    target_pixels = is_body_pixel & (value >= _RELATIVE_TARGET_THRESHOLD * max_value) & (max_value > 0)
+    relative_change = jnp.where(is_body_pixel, raster, 0) / target_change  # positive values have the target's sign
+    max_relative_change = relative_change.max()
+    target_pixels = (
+        is_body_pixel
+        & (relative_change >= _RELATIVE_TARGET_THRESHOLD * max_relative_change)
+        & (max_relative_change > 0)
+    )
     body_centre, body_size = _centre_of_gravity(is_body_pixel, x, y), jnp.sum(is_body_pixel)
     target_centre, target_size = _centre_of_gravity(target_pixels, x, y), jnp.sum(target_pixels)
     is_in_circle = (x - target_centre[0]) ** 2 + (y - target_centre[1]) ** 2 <= target_size * pixel_area / jnp.pi
-    distance = jnp.hypot(*(position - body_centre))
-    circle_sum = jnp.sum(jnp.where(is_in_circle, value, 0))
-    negative_sum = -jnp.sum(jnp.where(is_in_circle, 0, jnp.minimum(value, 0)))
+    target_distance = jnp.hypot(*(target_position - body_centre))
+    change_in_circle = jnp.sum(jnp.where(is_in_circle, relative_change, 0))
+    opposite_change_outside = -jnp.sum(jnp.where(is_in_circle, 0, jnp.minimum(relative_change, 0)))
     return FiguresOfMerit(
-        amplitude_response=jnp.sum(value) * pixel_area / area,
-        position_error=distance - jnp.hypot(*(target_centre - body_centre)),
+        amplitude_response=jnp.sum(relative_change) * pixel_area / target_area,
+        position_error=target_distance - jnp.hypot(*(target_centre - body_centre)),
         resolution=jnp.sqrt(jnp.where(target_size > 0, target_size, jnp.nan) / body_size),
         shape_deformation=jnp.sum(target_pixels & ~is_in_circle) / target_size,
-        ringing=jnp.where(target_size > 0, jnp.where(circle_sum > 0, negative_sum / circle_sum, jnp.inf), jnp.nan),
-        distance=distance,
+        ringing=jnp.where(
+            target_size > 0,
+            jnp.where(change_in_circle > 0, opposite_change_outside / change_in_circle, jnp.inf),
+            jnp.nan,
+        ),
+        distance=target_distance,
         body_radius=jnp.sqrt(body_size * pixel_area / jnp.pi),
     )
 
 
 def _centre_of_gravity(is_inside, x, y):
     """Centre of gravity of the pixels in the mask `is_inside`; NaN for an empty mask."""
-    size = jnp.sum(is_inside)
-    return jnp.stack([jnp.sum(jnp.where(is_inside, x, 0)), jnp.sum(jnp.where(is_inside, y, 0))]) / size
+    num_pixels = jnp.sum(is_inside)
+    return jnp.stack([jnp.sum(jnp.where(is_inside, x, 0)), jnp.sum(jnp.where(is_inside, y, 0))]) / num_pixels
 
 
-def _check_arguments(raster, extent, position, area, change) -> None:
+def _check_merit_arguments(raster, extent, target_position, target_area, target_change) -> None:
     if raster.ndim not in (2, 3):
         raise ValueError(
             f"raster has shape {raster.shape}; give one image (rows, columns) or many (targets, rows, columns)."
         )
-    targets = raster.shape[:-2]
-    if position.shape != (*targets, 2):
+    targets_shape = raster.shape[:-2]
+    if target_position.shape != (*targets_shape, 2):
         raise ValueError(
-            f"position has shape {position.shape}; give (x, y) in metres of the target of each image, {(*targets, 2)}."
+            f"position has shape {target_position.shape}; give (x, y) in metres of the target of each image, "
+            f"{(*targets_shape, 2)}."
         )
-    for name, values in (("area", area), ("change", change)):
-        if values.shape not in ((), targets):
-            raise ValueError(f"{name} has shape {values.shape}; give one number, or one for each of the images.")
+    for argument_name, argument_values in (("area", target_area), ("change", target_change)):
+        if argument_values.shape not in ((), targets_shape):
+            raise ValueError(
+                f"{argument_name} has shape {argument_values.shape}; give one number, or one for each of the images."
+            )
     x_min, x_max, y_min, y_max = extent
-    if not has_values(raster, position, area, change, extent):
+    if not has_values(raster, target_position, target_area, target_change, extent):
         return
     if not (x_max > x_min and y_max > y_min):
         raise ValueError(f"extent {tuple(extent)} must be (x_min, x_max, y_min, y_max) in metres; see Raster.extent.")
-    if not (np.isfinite(area) & (np.asarray(area) > 0)).all():
+    if not (np.isfinite(target_area) & (np.asarray(target_area) > 0)).all():
         raise ValueError("area of the targets must be positive, in square metres.")
-    if not (np.isfinite(change) & (np.asarray(change) != 0)).all():
+    if not (np.isfinite(target_change) & (np.asarray(target_change) != 0)).all():
         raise ValueError("change of the targets must be finite and not zero, in siemens; negative where it falls.")
     is_body = np.isfinite(raster)
     if not is_body.any(axis=(-2, -1)).all():
@@ -304,16 +346,18 @@ def _check_arguments(raster, extent, position, area, change) -> None:
             "raster: the images are NaN at different pixels; NaN stands for outside the body, which is the same for "
             "all. Was a reconstruction given NaN voltages?"
         )
-    positions = np.asarray(position)
-    if not ((positions >= [x_min, y_min]) & (positions <= [x_max, y_max])).all():
+    position_array = np.asarray(target_position)
+    if not ((position_array >= [x_min, y_min]) & (position_array <= [x_max, y_max])).all():
         raise ValueError(
             f"position: a target lies outside the raster, whose extent is {tuple(extent)}; are both in metres?"
         )
 
 
-_WINDOW_DEVIATION = 80
-_WINDOW_HALF_WIDTH = 160
-_C1, _C2 = 1e-4, 9e-4
+# Standard deviation and half-width of the Gaussian windows of the SSIM, in pixels, and constants that stabilise its
+# quotients.
+_SSIM_WINDOW_DEVIATION = 80
+_SSIM_WINDOW_HALF_WIDTH = 160
+_SSIM_C1, _SSIM_C2 = 1e-4, 9e-4
 RESISTIVE, CONDUCTIVE = 1, 2
 
 
@@ -329,32 +373,48 @@ def challenge_score(labels: Int[np.ndarray, "256 256"], truth: Int[np.ndarray, "
     10.5281/zenodo.8252370.
     """
     labels, truth = np.asarray(labels), np.asarray(truth)
-    for name, image in (("labels", labels), ("truth", truth)):
-        if image.shape != (256, 256) or not np.isin(image, (0, RESISTIVE, CONDUCTIVE)).all():
+    for argument_name, label_image in (("labels", labels), ("truth", truth)):
+        if label_image.shape != (256, 256) or not np.isin(label_image, (0, RESISTIVE, CONDUCTIVE)).all():
             raise ValueError(
-                f"{name}: the score is for 256 × 256 pixels of 0 (background), 1 (resistive) and 2 (conductive); "
-                f"got shape {image.shape} with values {np.unique(image)[:5].tolist()}."
+                f"{argument_name}: the score is for 256 × 256 pixels of 0 (background), 1 (resistive) and 2 "
+                f"(conductive); got shape {label_image.shape} with values {np.unique(label_image)[:5].tolist()}."
             )
-    return float(np.mean([_structural_similarity(labels == kind, truth == kind) for kind in (CONDUCTIVE, RESISTIVE)]))
+    return float(
+        np.mean(
+            [
+                _structural_similarity(labels == class_label, truth == class_label)
+                for class_label in (CONDUCTIVE, RESISTIVE)
+            ]
+        )
+    )
 
 
-def _structural_similarity(first_image: np.ndarray, second_image: np.ndarray) -> float:
+def _structural_similarity(first_mask: np.ndarray, second_mask: np.ndarray) -> float:
     """Structural similarity (SSIM) of two masks, averaged over the pixels. Wang et al., IEEE Trans. Image Process. 13
     (2004)."""
-    window = _gaussian_window(first_image.shape[0])
-    # A mask equals its own square.
-    a, b, product = (
-        window @ image.astype(float) @ window.T for image in (first_image, second_image, first_image & second_image)
+    gaussian_window = _gaussian_window(first_mask.shape[0])
+    # The square of a mask equals the mask, so the local mean of its square equals its local mean.
+    first_mean, second_mean, product_mean = (
+        gaussian_window @ mask.astype(float) @ gaussian_window.T
+        for mask in (first_mask, second_mask, first_mask & second_mask)
     )
-    variance_a, variance_b, covariance = a - a**2, b - b**2, product - a * b
-    luminance = (2 * a * b + _C1) / (a**2 + b**2 + _C1)
-    return float(np.mean(luminance * (2 * covariance + _C2) / (variance_a + variance_b + _C2)))
+    first_variance, second_variance, covariance = (
+        first_mean - first_mean**2,
+        second_mean - second_mean**2,
+        product_mean - first_mean * second_mean,
+    )
+    luminance = (2 * first_mean * second_mean + _SSIM_C1) / (first_mean**2 + second_mean**2 + _SSIM_C1)
+    return float(np.mean(luminance * (2 * covariance + _SSIM_C2) / (first_variance + second_variance + _SSIM_C2)))
 
 
 @functools.cache
-def _gaussian_window(size: int) -> np.ndarray:
+def _gaussian_window(image_size: int) -> np.ndarray:
     """Matrix (size, size) of normalised Gaussian weights along one image axis, one row per pixel. The two-dimensional
     window is the product of two such matrices."""
-    distance = np.arange(size)[:, None] - np.arange(size)
-    weight = np.where(np.abs(distance) <= _WINDOW_HALF_WIDTH, np.exp(-(distance**2) / (2 * _WINDOW_DEVIATION**2)), 0)
-    return weight / weight.sum(axis=1, keepdims=True)
+    pixel_distance = np.arange(image_size)[:, None] - np.arange(image_size)
+    gaussian_weights = np.where(
+        np.abs(pixel_distance) <= _SSIM_WINDOW_HALF_WIDTH,
+        np.exp(-(pixel_distance**2) / (2 * _SSIM_WINDOW_DEVIATION**2)),
+        0,
+    )
+    return gaussian_weights / gaussian_weights.sum(axis=1, keepdims=True)

@@ -33,8 +33,10 @@ def ball_region(mesh: Mesh, centre: ArrayLike, radius: float) -> Bool[np.ndarray
     """
     if not (is_number(radius) and radius > 0):
         raise ValueError(f"radius must be a positive number of metres; it is {describe(radius)}.")
-    distance = np.linalg.norm(_offsets_from_point(mesh, centre, "centre"), axis=1)
-    return _check_not_empty(mesh, distance <= radius, "no centroid of a cell is so near to centre; make radius larger")
+    centroid_distances = np.linalg.norm(_offsets_from_point(mesh, centre, "centre"), axis=1)
+    return _check_region_not_empty(
+        mesh, centroid_distances <= radius, "no centroid of a cell is so near to centre; make radius larger"
+    )
 
 
 def box_region(mesh: Mesh, lower: ArrayLike, upper: ArrayLike) -> Bool[np.ndarray, " m"]:
@@ -61,7 +63,7 @@ def box_region(mesh: Mesh, lower: ArrayLike, upper: ArrayLike) -> Bool[np.ndarra
     if not (np.asarray(lower, float) < np.asarray(upper, float)).all():
         raise ValueError("upper must be larger than lower in every coordinate.")
     is_inside_box = (offsets_from_lower >= 0).all(axis=1) & (offsets_from_upper <= 0).all(axis=1)
-    return _check_not_empty(mesh, is_inside_box, "no centroid of a cell lies between lower and upper")
+    return _check_region_not_empty(mesh, is_inside_box, "no centroid of a cell lies between lower and upper")
 
 
 def half_region(mesh: Mesh, direction: ArrayLike, point: ArrayLike | None = None) -> Bool[np.ndarray, " m"]:
@@ -81,45 +83,52 @@ def half_region(mesh: Mesh, direction: ArrayLike, point: ArrayLike | None = None
     region = half_region(mesh, [1.0, 0.0])
     ```
     """
-    normal = np.asarray(direction, float)
-    if normal.shape != (mesh.dimension,) or not np.isfinite(normal).all() or not normal.any():
+    plane_normal = np.asarray(direction, float)
+    if plane_normal.shape != (mesh.dimension,) or not np.isfinite(plane_normal).all() or not plane_normal.any():
         raise ValueError(f"direction must be {mesh.dimension} finite numbers, not all zero; it is {direction!r}.")
     cell_sizes = np.asarray(measures(mesh))
-    origin = cell_sizes @ np.asarray(centroids(mesh)) / cell_sizes.sum() if point is None else point
-    return _check_not_empty(
-        mesh, _offsets_from_point(mesh, origin, "point") @ normal > 0, "no cell lies in direction of point"
+    plane_point = cell_sizes @ np.asarray(centroids(mesh)) / cell_sizes.sum() if point is None else point
+    return _check_region_not_empty(
+        mesh, _offsets_from_point(mesh, plane_point, "point") @ plane_normal > 0, "no cell lies in direction of point"
     )
 
 
-def _offsets_from_point(mesh: Mesh, point: ArrayLike, name: str) -> Float[np.ndarray, "m d"]:
+def _offsets_from_point(mesh: Mesh, point: ArrayLike, argument_name: str) -> Float[np.ndarray, "m d"]:
     """Vectors (m, d) from a `point` to the centroids of the cells. Raises `ValueError` for a point with the wrong
     number of coordinates."""
-    coordinates = np.asarray(point, float)
-    if coordinates.shape != (mesh.dimension,) or not np.isfinite(coordinates).all():
-        raise ValueError(f"{name} must be {mesh.dimension} finite numbers in metres; it has shape {coordinates.shape}.")
-    return np.asarray(centroids(mesh)) - coordinates
+    point_coordinates = np.asarray(point, float)
+    if point_coordinates.shape != (mesh.dimension,) or not np.isfinite(point_coordinates).all():
+        raise ValueError(
+            f"{argument_name} must be {mesh.dimension} finite numbers in metres; it has shape "
+            f"{point_coordinates.shape}."
+        )
+    return np.asarray(centroids(mesh)) - point_coordinates
 
 
-def _check_not_empty(mesh: Mesh, region, message: str) -> Bool[np.ndarray, " m"]:
-    if not region.any():
-        points = np.asarray(mesh.points)
+def _check_region_not_empty(mesh: Mesh, region_cells, failure_text: str) -> Bool[np.ndarray, " m"]:
+    if not region_cells.any():
+        node_positions = np.asarray(mesh.points)
         lower_text, upper_text = (
             ", ".join(f"{coordinate:.2g}" for coordinate in corner)
-            for corner in (points.min(axis=0), points.max(axis=0))
+            for corner in (node_positions.min(axis=0), node_positions.max(axis=0))
         )
-        raise ValueError(f"the region is empty: {message}. The body spans [{lower_text}] to [{upper_text}], metres.")
-    return np.asarray(region)
+        raise ValueError(
+            f"the region is empty: {failure_text}. The body spans [{lower_text}] to [{upper_text}], metres."
+        )
+    return np.asarray(region_cells)
 
 
 def shared_facets(mesh: Mesh) -> Int[np.ndarray, "m k"]:
     """Indices (m, k) of the k facets of each cell that are shared with another cell, -1 for facets on the boundary."""
-    pairs, _ = interior_facets(mesh)
-    cell, facet = pairs.T.ravel(), np.tile(np.arange(len(pairs)), 2)
-    sort_order = np.argsort(cell, kind="stable")
-    cell, facet = cell[sort_order], facet[sort_order]
-    shared = np.full((mesh.num_cells, mesh.dimension + 1), -1)
-    shared[cell, np.arange(len(cell)) - np.searchsorted(cell, cell)] = facet
-    return shared
+    cell_pairs, _ = interior_facets(mesh)
+    adjacent_cells, facet_indices = cell_pairs.T.ravel(), np.tile(np.arange(len(cell_pairs)), 2)
+    sort_order = np.argsort(adjacent_cells, kind="stable")
+    adjacent_cells, facet_indices = adjacent_cells[sort_order], facet_indices[sort_order]
+    facets_of_cells = np.full((mesh.num_cells, mesh.dimension + 1), -1)
+    facets_of_cells[
+        adjacent_cells, np.arange(len(adjacent_cells)) - np.searchsorted(adjacent_cells, adjacent_cells)
+    ] = facet_indices
+    return facets_of_cells
 
 
 def watershed_basins(
@@ -136,27 +145,31 @@ def watershed_basins(
     share, -1 for none. Where two basins meet, the basin with the lower peak is merged into the other basin, unless the
     lower peak exceeds the value at the meeting point by at least `least_prominence` times its own value.
     """
-    peak = np.full(len(change), -1)
-    label_of_place: dict[int, int] = {}
-    merged_labels: dict[int, int] = {}
+    peak_of_cell = np.full(len(change), -1)
+    basin_of_index: dict[int, int] = {}
+    merged_basins: dict[int, int] = {}
 
-    def find_root(label: int) -> int:
-        while label in merged_labels:
-            label = merged_labels[label]
-        return label
+    def find_merged_basin(basin: int) -> int:
+        while basin in merged_basins:
+            basin = merged_basins[basin]
+        return basin
 
-    cells = np.flatnonzero(change > min_value)
-    for cell in cells[np.argsort(-change[cells], kind="stable")].tolist():
-        neighbours = [neighbour for neighbour in shared[cell].tolist() if neighbour >= 0]
-        labels = {find_root(label_of_place[neighbour]) for neighbour in neighbours if neighbour in label_of_place}
-        highest = max(labels, key=lambda label: change[label], default=cell)
-        for label in labels - {highest}:
-            if change[label] - change[cell] < least_prominence * change[label]:
-                merged_labels[label] = highest
-        peak[cell] = highest
-        label_of_place.update(dict.fromkeys(neighbours, highest))
-    peak[cells] = [find_root(label) for label in peak[cells].tolist()]
-    return peak
+    cells_above = np.flatnonzero(change > min_value)
+    for cell in cells_above[np.argsort(-change[cells_above], kind="stable")].tolist():
+        shared_indices = [shared_index for shared_index in shared[cell].tolist() if shared_index >= 0]
+        adjacent_basins = {
+            find_merged_basin(basin_of_index[shared_index])
+            for shared_index in shared_indices
+            if shared_index in basin_of_index
+        }
+        highest_basin = max(adjacent_basins, key=lambda basin: change[basin], default=cell)
+        for basin in adjacent_basins - {highest_basin}:
+            if change[basin] - change[cell] < least_prominence * change[basin]:
+                merged_basins[basin] = highest_basin
+        peak_of_cell[cell] = highest_basin
+        basin_of_index.update(dict.fromkeys(shared_indices, highest_basin))
+    peak_of_cell[cells_above] = [find_merged_basin(basin) for basin in peak_of_cell[cells_above].tolist()]
+    return peak_of_cell
 
 
 def segment(
@@ -187,26 +200,28 @@ def segment(
     labels = segment(raster.sample(image))
     ```
     """
-    values = np.asarray(image)
-    if values.ndim != 2 or np.iscomplexobj(values):
-        raise ValueError(f"image must be real, (rows, columns); it has shape {values.shape} of {values.dtype}.")
+    image_values = np.asarray(image)
+    if image_values.ndim != 2 or np.iscomplexobj(image_values):
+        raise ValueError(
+            f"image must be real, (rows, columns); it has shape {image_values.shape} of {image_values.dtype}."
+        )
     if not (0 < level < 1 and 0 <= least_peak <= 1 and 0 <= least_area < 1):
         raise ValueError(
             f"level, least_peak and least_area are shares, from 0 to 1: {level}, {least_peak}, {least_area}."
         )
-    is_inside = np.isfinite(values)
-    if not is_inside.any():
+    is_inside_body = np.isfinite(image_values)
+    if not is_inside_body.any():
         raise ValueError("image: no pixel lies inside the body; all are NaN.")
-    values = np.where(is_inside, values, 0)
-    max_value = np.abs(values).max()
-    labels = np.zeros(values.shape, np.uint8)
-    for sign, label in ((1, CONDUCTIVE), (-1, RESISTIVE)):
-        peak = (sign * values).max()
-        if peak <= 0 or peak < least_peak * max_value:
+    image_values = np.where(is_inside_body, image_values, 0)
+    max_deviation = np.abs(image_values).max()
+    pixel_labels = np.zeros(image_values.shape, np.uint8)
+    for sign, sign_label in ((1, CONDUCTIVE), (-1, RESISTIVE)):
+        sign_peak = (sign * image_values).max()
+        if sign_peak <= 0 or sign_peak < least_peak * max_deviation:
             continue
-        connected_regions = np.zeros(values.shape, np.int32)
-        ndimage.label(sign * values > level * peak, output=connected_regions)
+        connected_regions = np.zeros(image_values.shape, np.int32)
+        ndimage.label(sign * image_values > level * sign_peak, output=connected_regions)
         region_sizes = np.bincount(connected_regions.ravel())
         region_sizes[0] = 0
-        labels[region_sizes[connected_regions] >= max(1, least_area * is_inside.sum())] = label
-    return labels
+        pixel_labels[region_sizes[connected_regions] >= max(1, least_area * is_inside_body.sum())] = sign_label
+    return pixel_labels

@@ -19,9 +19,9 @@ from jeit.inverse.shapes import ShapeReconstruction
 from jeit_solvers import results_on_cores
 from jeit_solvers.engines import as_array
 
-# Changes of conductivity relative to the background above which voltages are not linear in conductivity: in general,
-# and for noisy data, whose images show far less than the true change. Data are noisy if the share of noise in the
-# voltage difference exceeds `_MIN_NOISY_NOISE_SHARE`.
+# Changes of conductivity, relative to the background, above which voltages are not linear in conductivity. The second
+# value applies to noisy data, whose images show far less than the true change. Data are noisy if the share of noise in
+# the voltage difference exceeds `_MIN_NOISY_NOISE_SHARE`.
 _STRONG_CONDUCTIVITY_CHANGE, _STRONG_CONDUCTIVITY_CHANGE_IN_NOISE, _MIN_NOISY_NOISE_SHARE = 0.3, 0.1, 0.3
 # A linear image has a fault if the voltages computed from it leave too large a share of the voltage difference
 # unexplained: more than `_LARGE_MISFIT`, and more than `_MAX_MISFIT_RATIO` times the share that linearised voltages
@@ -31,9 +31,9 @@ _MAX_MISFIT_RATIO, _LARGE_MISFIT = 1.1, 0.1
 _MIN_CONDUCTIVITY = 0.01
 # Bodies are fitted in a solid if the largest change of conductivity in an image exceeds this share of the background.
 _MIN_RELATIVE_BODY_CHANGE = 0.05
-# Fitted bodies, a few numbers, are preferred to a smooth image, which has many, unless their misfit is so many times
-# larger. On simulated tanks where it exceeds one standard deviation, it was 1.0 to 1.2 times as large for homogeneous
-# bodies, and 2.2 to 18 times for smooth conductivity.
+# Maximum ratio of the misfit of fitted bodies to the misfit of the smooth image. Up to this ratio, fitted bodies are
+# preferred, since they have far fewer parameters. In simulated tanks in which the misfit of the bodies exceeded one
+# standard deviation, the ratio was 1.0 to 1.2 for homogeneous bodies and 2.2 to 18 for smooth conductivity.
 _MAX_SHAPE_MISFIT_RATIO = 1.5
 # Step along the linear image for the finite difference that approximates the derivative of the voltages.
 _DERIVATIVE_STEP = 1e-4
@@ -58,85 +58,95 @@ def image_automatically(prepared: PreparedDifference, options: MethodOptions, se
     default λ, not the requested λ. If the image is to be `segmented` and no shapes were fitted, total variation is
     used.
     """
-    imaged = _image_with_method("one-step", prepared, options)
+    one_step_image = _image_with_method("one-step", prepared, options)
     if np.iscomplexobj(prepared.difference):
-        return ChosenMethod("one-step", "images of complex voltages are linear.", imaged)
-    fault, uses_own_prior = (
-        linear_image_fault(prepared, imaged[1]),
+        return ChosenMethod("one-step", "images of complex voltages are linear.", one_step_image)
+    image_fault, has_custom_prior = (
+        linear_image_fault(prepared, one_step_image[1]),
         prepared.mesh.dimension == 3 and options.prior != MEASURED_DATA_PRIOR,
     )
-    if fault:
+    if image_fault:
         try:
-            gauss_newton = _image_for_bodies(prepared, options)
+            gauss_newton_image = _smooth_image_for_bodies(prepared, options)
         except ValueError as error:
-            return ChosenMethod("one-step", f"{fault}; but Gauss-Newton found no image. {error}", imaged)
-        assert isinstance(gauss_newton[0], Reconstruction)
-        shapes, outline_note = (None, "") if uses_own_prior else _fit_shapes(prepared, gauss_newton[0], options)
-        if shapes is not None or not segmented:
-            return _add_bodies(
-                prepared, f"{fault}: solved for conductivity itself{outline_note}.", gauss_newton, shapes
+            return ChosenMethod("one-step", f"{image_fault}; but Gauss-Newton found no image. {error}", one_step_image)
+        assert isinstance(gauss_newton_image[0], Reconstruction)
+        fitted_shapes, outline_note = (
+            (None, "") if has_custom_prior else _fit_shapes(prepared, gauss_newton_image[0], options)
+        )
+        if fitted_shapes is not None or not segmented:
+            return _result_with_bodies(
+                prepared,
+                f"{image_fault}: solved for conductivity itself{outline_note}.",
+                gauss_newton_image,
+                fitted_shapes,
             )
-    elif not (segmented or uses_own_prior) and (bodies := _bodies_in_solid(prepared, options, imaged[1])):
-        return bodies
+    elif not (segmented or has_custom_prior) and (
+        image_with_bodies := _fit_bodies_in_solid(prepared, options, one_step_image[1])
+    ):
+        return image_with_bodies
     if segmented:
-        reason = f"{fault or 'bodies are weak'}: cut up an image of few pieces."
-        return ChosenMethod("total-variation", reason, _image_with_method("total-variation", prepared, options))
+        choice_reason = f"{image_fault or 'bodies are weak'}: cut up an image of few pieces."
+        return ChosenMethod("total-variation", choice_reason, _image_with_method("total-variation", prepared, options))
     return ChosenMethod(
-        "one-step", "the linear image is sound: changes are small, and it explains the voltages.", imaged
+        "one-step", "the linear image is sound: changes are small, and it explains the voltages.", one_step_image
     )
 
 
-def _image_with_method(name: str, prepared: PreparedDifference, options: MethodOptions) -> Imaged:
-    """Image a difference by the method `name` with the method's default λ."""
-    method = METHODS[name]
-    return method.image(prepared, options._replace(hyperparameter=method.hyperparameter))
+def _image_with_method(method_name: str, prepared: PreparedDifference, options: MethodOptions) -> Imaged:
+    """Image a difference by the method `method_name` with the method's default λ."""
+    imaging_method = METHODS[method_name]
+    return imaging_method.image(prepared, options._replace(hyperparameter=imaging_method.hyperparameter))
 
 
-def _image_for_bodies(prepared: PreparedDifference, options: MethodOptions) -> Imaged:
-    """Gauss-Newton image, from which bodies are fitted. In a solid, the accuracy of the difference, which their fit
-    needs, is computed at the same time."""
+def _smooth_image_for_bodies(prepared: PreparedDifference, options: MethodOptions) -> Imaged:
+    """Compute the Gauss-Newton image from which bodies are fitted. In a solid, the accuracy of the voltage difference,
+    which the fit of bodies needs, is computed in parallel."""
     if prepared.mesh.dimension < 3:
         return _image_with_method("gauss-newton", prepared, options)
-    functions = [lambda: _image_with_method("gauss-newton", prepared, options), lambda: prepared.accuracy]
-    return results_on_cores(lambda job: job(), functions)[0]
+    computations = [lambda: _image_with_method("gauss-newton", prepared, options), lambda: prepared.accuracy]
+    return results_on_cores(lambda computation: computation(), computations)[0]
 
 
-def _bodies_in_solid(
-    prepared: PreparedDifference, options: MethodOptions, change: Float[Array, " m"]
+def _fit_bodies_in_solid(
+    prepared: PreparedDifference, options: MethodOptions, conductivity_change: Float[Array, " m"]
 ) -> ChosenMethod | None:
     """Fit bodies to the data of a solid. Returns None for sheets, weak changes (see `_MIN_RELATIVE_BODY_CHANGE`) and
     noisy data, and if no bodies explain the voltages."""
-    noise = prepared.quality.difference_noise
-    max_change = np.abs(np.asarray(change)).max() / float(prepared.calibration.conductivity)
+    difference_noise = prepared.quality.difference_noise
+    max_relative_change = np.abs(np.asarray(conductivity_change)).max() / float(prepared.calibration.conductivity)
     if (
         prepared.mesh.dimension < 3
-        or max_change < _MIN_RELATIVE_BODY_CHANGE
-        or (noise is not None and noise.relative > _MIN_NOISY_NOISE_SHARE)
+        or max_relative_change < _MIN_RELATIVE_BODY_CHANGE
+        or (difference_noise is not None and difference_noise.relative > _MIN_NOISY_NOISE_SHARE)
     ):
         return None
     try:
-        smooth_image = _image_for_bodies(prepared, options)
+        smooth_image = _smooth_image_for_bodies(prepared, options)
     except ValueError:
         return None
     assert isinstance(smooth_image[0], Reconstruction)
-    shapes, _ = _fit_shapes(prepared, smooth_image[0], options)
-    reason = f"the voltages show bodies, which a linear image of a solid blurs: their {_edges(prepared)} were fitted."
-    return shapes and _add_bodies(prepared, reason, smooth_image, shapes)
+    fitted_shapes, _ = _fit_shapes(prepared, smooth_image[0], options)
+    choice_reason = (
+        "the voltages show bodies, which a linear image of a solid blurs: their "
+        f"{_word_for_edges(prepared)} were fitted."
+    )
+    return fitted_shapes and _result_with_bodies(prepared, choice_reason, smooth_image, fitted_shapes)
 
 
-def _add_bodies(
-    prepared: PreparedDifference, reason: str, smooth_image: Imaged, shapes: ShapeReconstruction | None
+def _result_with_bodies(
+    prepared: PreparedDifference, choice_reason: str, smooth_image: Imaged, fitted_shapes: ShapeReconstruction | None
 ) -> ChosenMethod:
-    """Result with fitted bodies: for a sheet, the smooth image and the outlines; for a solid, the image of the bodies
-    and of the smooth field around them. In a solid, a smooth image alone shows strong bodies at a tenth of their
-    contrast, with artefacts about as strong."""
-    if shapes is None or prepared.mesh.dimension < 3:
-        return ChosenMethod("gauss-newton", reason, smooth_image, shapes)
-    return ChosenMethod("shapes", reason, conductivity_change_of_shapes(prepared, shapes), shapes)
+    """Return the result with fitted bodies: for a sheet, the smooth image and the outlines of the bodies; for a solid,
+    the image of the bodies and of the smooth field around them. In a solid, a smooth image alone shows strong bodies at
+    a tenth of their contrast, with artefacts about as strong."""
+    if fitted_shapes is None or prepared.mesh.dimension < 3:
+        return ChosenMethod("gauss-newton", choice_reason, smooth_image, fitted_shapes)
+    return ChosenMethod("shapes", choice_reason, conductivity_change_of_shapes(prepared, fitted_shapes), fitted_shapes)
 
 
-def _edges(prepared: PreparedDifference) -> str:
-    """Word for the boundaries of bodies, for messages: surfaces in a solid, outlines in a sheet."""
+def _word_for_edges(prepared: PreparedDifference) -> str:
+    """Return the word for the boundaries of bodies in messages: surfaces in a solid, outlines in a sheet."""
     return "surfaces" if prepared.mesh.dimension == 3 else "outlines"
 
 
@@ -146,30 +156,33 @@ def _fit_shapes(
     """Fit the bodies of a smooth image as shapes. Returns the shapes and a clause for the message. Returns None and the
     reason if no bodies are found, or if the misfit of the shapes exceeds both one standard deviation of
     `PreparedDifference.sharp_noise` and `_MAX_SHAPE_MISFIT_RATIO` times the misfit of the smooth image."""
-    shapes, edges = shapes_in(prepared, smooth_image, options), _edges(prepared)
-    if not shapes.bodies:
-        return None, f"; no body's {edges[:-1]} explains the voltages better than errors of the model do"
+    fitted_shapes, edge_word = shapes_in(prepared, smooth_image, options), _word_for_edges(prepared)
+    if not fitted_shapes.bodies:
+        return None, f"; no body's {edge_word[:-1]} explains the voltages better than errors of the model do"
     # Where the noise is not known, it is estimated so that the smooth image has a misfit of at most 1.
     smooth_misfit = float(smooth_image.misfit) if prepared.noise is not None else min(float(smooth_image.misfit), 1.0)
-    if (misfit := float(shapes.misfit)) > (max_misfit := max(1.0, _MAX_SHAPE_MISFIT_RATIO * smooth_misfit)):
+    if (shape_misfit := float(fitted_shapes.misfit)) > (
+        max_misfit := max(1.0, _MAX_SHAPE_MISFIT_RATIO * smooth_misfit)
+    ):
         return (
             None,
-            f"; {edges} of bodies miss the voltages by {misfit:.2g} standard deviations, {max_misfit:.2g} at most",
+            f"; {edge_word} of bodies miss the voltages by {shape_misfit:.2g} standard deviations, {max_misfit:.2g} "
+            "at most",
         )
-    return shapes, f", and its bodies' {edges} fitted"
+    return fitted_shapes, f", and its bodies' {edge_word} fitted"
 
 
 def linear_image_fault(prepared: PreparedDifference, change: Float[Array, " m"]) -> str:
-    """Describe the fault of a linear image, the `change` of conductivity per cell in S/m (2-D: S); empty if the image
-    has no fault."""
-    background, relative_change = float(prepared.calibration.conductivity), np.asarray(change)
-    relative_change = relative_change / background
+    """Describe the fault of a linear image with the `change` of conductivity per cell in S/m (2-D: S). Returns an empty
+    string if the image has no fault."""
+    background_conductivity, relative_change = float(prepared.calibration.conductivity), np.asarray(change)
+    relative_change = relative_change / background_conductivity
     min_change, max_change = float(relative_change.min()), float(relative_change.max())
     if min_change < -1:
         return f"the linear image falls to {percent(min_change)} of the background, below -100 %"
     is_difference_noisy = (
-        quality := prepared.quality.difference_noise
-    ) is not None and quality.relative > _MIN_NOISY_NOISE_SHARE
+        difference_noise := prepared.quality.difference_noise
+    ) is not None and difference_noise.relative > _MIN_NOISY_NOISE_SHARE
     if max(-min_change, max_change) > (
         _STRONG_CONDUCTIVITY_CHANGE_IN_NOISE if is_difference_noisy else _STRONG_CONDUCTIVITY_CHANGE
     ):
@@ -177,13 +190,14 @@ def linear_image_fault(prepared: PreparedDifference, change: Float[Array, " m"])
         return (
             f"the linear image reaches {percent(extreme_change)} of the background, where voltages are no longer linear"
         )
-    linear_misfit, misfit = (
-        _unexplained_share(prepared, background, relative_change, step) for step in (_DERIVATIVE_STEP, 1.0)
+    linear_misfit, nonlinear_misfit = (
+        _unexplained_share(prepared, background_conductivity, relative_change, step_width)
+        for step_width in (_DERIVATIVE_STEP, 1.0)
     )
-    if misfit > max(_MAX_MISFIT_RATIO * linear_misfit, _LARGE_MISFIT):
+    if nonlinear_misfit > max(_MAX_MISFIT_RATIO * linear_misfit, _LARGE_MISFIT):
         return (
-            f"the linear image's own voltages miss {percent(misfit)} of the difference, {percent(linear_misfit)} if "
-            "linear"
+            f"the linear image's own voltages miss {percent(nonlinear_misfit)} of the difference, "
+            f"{percent(linear_misfit)} if linear"
         )
     return ""
 
@@ -194,27 +208,40 @@ def estimate_unexplained_noise(
     """Copy of the difference whose noise, if it is not known, is estimated from what its linear image, the `change` of
     conductivity per cell in S/m (2-D: S), leaves unexplained.
 
-    An image explains a part of noise, too, which is estimated from the image of random noise, and leaves errors of the
-    linear model unexplained. The doubt allows for the first; inclusions have to exceed what is left unexplained only,
-    so that strong bodies are listed."""
+    An image also explains a part of the noise, which is estimated from the image of random noise, and it leaves errors
+    of the linear model unexplained. The share of noise that a doubt states is corrected for the explained part. The
+    noise that inclusions must exceed is not corrected, so that strong bodies are listed."""
     if prepared.noise is not None:
         return prepared
-    background, relative_noise = float(prepared.calibration.conductivity), np.asarray(prepared.relative_noise)
-    is_used, difference = np.asarray(prepared.mask), np.asarray(prepared.difference)
-    size, unexplained_difference, modelled_difference = (
-        float(np.sqrt(np.mean((np.asarray(volts) / relative_noise)[is_used] ** 2)))
-        for volts in (difference, difference - prepared.common_change, prepared.modelled_noise)
+    background_conductivity, relative_noise = (
+        float(prepared.calibration.conductivity),
+        np.asarray(prepared.relative_noise),
     )
-    random = np.where(is_used, size * relative_noise * np.random.default_rng(0).standard_normal(is_used.size), 0)
-    unexplained, unexplained_noise = (
-        _unexplained_share(pair, background, np.asarray(image) / background, _DERIVATIVE_STEP)
-        for pair, image in (
+    usable_channels, difference = np.asarray(prepared.mask), np.asarray(prepared.difference)
+    difference_rms, rms_without_common, modelled_noise_rms = (
+        float(np.sqrt(np.mean((np.asarray(channel_voltages) / relative_noise)[usable_channels] ** 2)))
+        for channel_voltages in (difference, difference - prepared.common_change, prepared.modelled_noise)
+    )
+    random_difference = np.where(
+        usable_channels,
+        difference_rms * relative_noise * np.random.default_rng(0).standard_normal(usable_channels.size),
+        0,
+    )
+    unexplained_share, unexplained_noise_share = (
+        _unexplained_share(
+            compared_difference,
+            background_conductivity,
+            np.asarray(conductivity_image) / background_conductivity,
+            _DERIVATIVE_STEP,
+        )
+        for compared_difference, conductivity_image in (
             (prepared, change),
-            (replace(prepared, difference=as_array(random)), reconstruction.image(random)),
+            (replace(prepared, difference=as_array(random_difference)), reconstruction.image(random_difference)),
         )
     )
     return prepared.with_noise_from(
-        unexplained * size / modelled_difference, unexplained / unexplained_noise * size / unexplained_difference
+        unexplained_share * difference_rms / modelled_noise_rms,
+        unexplained_share / unexplained_noise_share * difference_rms / rms_without_common,
     )
 
 
@@ -223,21 +250,29 @@ def change_and_noise(
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Values per cell (m,) of a linear image in which inclusions are found, and their noise, S/m (2-D: S): the real
     part of the `change` of conductivity without a change common to all voltages."""
-    noise = reconstruction.image_noise(np.where(prepared.mask, prepared.modelled_noise, 0))
+    noise_per_cell = reconstruction.image_noise(np.where(prepared.mask, prepared.modelled_noise, 0))
     conductivity_change = np.real(change)
     if not np.iscomplexobj(change):
         conductivity_change = conductivity_change - np.asarray(reconstruction.image(prepared.common_change))
-    return as_array(conductivity_change), as_array(noise)
+    return as_array(conductivity_change), as_array(noise_per_cell)
 
 
-def _unexplained_share(prepared: PreparedDifference, background: float, change: np.ndarray, step: float) -> float:
+def _unexplained_share(
+    prepared: PreparedDifference, background_conductivity: float, relative_change: np.ndarray, step_width: float
+) -> float:
     """Share of the measured voltage difference that the model leaves unexplained: what remains after the derivative of
-    the modelled voltages in the direction of the `change` is subtracted, with the derivative computed as a
-    difference quotient of width `step`. Channels are divided by their noise."""
-    model, is_used = prepared.model, np.asarray(prepared.mask)
-    conductivity = background * np.maximum(1 + step * change, _MIN_CONDUCTIVITY)
-    predicted_difference = (np.asarray(model.voltages(conductivity)) - np.asarray(model.voltages(background))) / step
-    noise, difference = np.asarray(prepared.relative_noise)[is_used], np.asarray(prepared.difference)[is_used]
+    the modelled voltages in the direction of the `relative_change` is subtracted, with the derivative computed as a
+    difference quotient of width `step_width`. Channels are divided by their noise."""
+    model, usable_channels = prepared.model, np.asarray(prepared.mask)
+    conductivity = background_conductivity * np.maximum(1 + step_width * relative_change, _MIN_CONDUCTIVITY)
+    predicted_difference = (
+        np.asarray(model.voltages(conductivity)) - np.asarray(model.voltages(background_conductivity))
+    ) / step_width
+    channel_noise, measured_difference = (
+        np.asarray(prepared.relative_noise)[usable_channels],
+        np.asarray(prepared.difference)[usable_channels],
+    )
     return float(
-        np.linalg.norm((predicted_difference[is_used] - difference) / noise) / np.linalg.norm(difference / noise)
+        np.linalg.norm((predicted_difference[usable_channels] - measured_difference) / channel_noise)
+        / np.linalg.norm(measured_difference / channel_noise)
     )

@@ -1,5 +1,5 @@
-"""Mesh of a body, and calibration of a forward model on a frame of the undisturbed body, with timing of the steps. The
-last calibration is kept for the next frame."""
+"""Creation of the mesh of a body, and calibration of a forward model on a frame of the undisturbed body, with timing of
+the steps. The result of the last calibration is stored and reused for the next frame."""
 
 from __future__ import annotations
 
@@ -28,36 +28,42 @@ from jeit_solvers.engines import as_array
 
 # Default number of mesh nodes for a solid and for a sheet.
 DEFAULT_SOLID_NUM_POINTS, DEFAULT_SHEET_NUM_POINTS = 10_000, 2000
-# Misfit of the model to the reference up to which the described electrode positions are used. Above it, estimated
-# positions are used if the ratios of the misfit with estimated to the misfit with described positions are below these
-# limits: with each channel relative to its noise, and with equal weights.
-_MAX_MISFIT_OF_DESCRIBED_POSITIONS, _MAX_RELATIVE_RATIO, _MAX_MISFIT_RATIO = 0.01, 0.7, 2.0
+# Misfit of the model to the reference frame up to which the described electrode positions are used. If the misfit is
+# larger, estimated positions are used, provided that they reduce the misfit: the ratio of the misfit with estimated to
+# the misfit with described positions must be below a limit both for channels divided by their noise and for equally
+# weighted channels.
+_MAX_MISFIT_OF_DESCRIBED_POSITIONS, _MAX_WEIGHTED_MISFIT_RATIO, _MAX_UNWEIGHTED_MISFIT_RATIO = 0.01, 0.7, 2.0
 
 
-_Arguments = ParamSpec("_Arguments")
-_Result = TypeVar("_Result")
+_FunctionArguments = ParamSpec("_FunctionArguments")
+_FunctionResult = TypeVar("_FunctionResult")
 
 
-def keep_last_result(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+def keep_last_result(
+    function: Callable[_FunctionArguments, _FunctionResult],
+) -> Callable[_FunctionArguments, _FunctionResult]:
     """Decorator: store the result of the last call of a function, and return it for equal arguments.
 
-    For frames that are imaged one after the other, mesh and calibration are thus computed once per reference. Arguments
-    are compared by value, with copies of arrays of NumPy, which the caller may modify.
+    Mesh and calibration are thus computed once per reference if several frames are imaged in succession. Arguments are
+    compared by value. NumPy arrays are copied, because the caller may modify them.
     """
     last_call: tuple | None = None
 
     @functools.wraps(function)
-    def call_or_reuse(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+    def call_or_reuse(*args: _FunctionArguments.args, **kwargs: _FunctionArguments.kwargs) -> _FunctionResult:
         nonlocal last_call
-        leaves, structure = jax.tree.flatten((args, kwargs))
+        argument_leaves, argument_structure = jax.tree.flatten((args, kwargs))
         stored_call = last_call
         if (
             stored_call is None
-            or stored_call[1] != structure
-            or not all(map(_are_equal_arguments, stored_call[0], leaves))
+            or stored_call[1] != argument_structure
+            or not all(map(_are_equal_arguments, stored_call[0], argument_leaves))
         ):
-            copied_leaves = [leaf.copy() if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
-            last_call = stored_call = copied_leaves, structure, function(*args, **kwargs)
+            copied_leaves = [
+                argument_leaf.copy() if isinstance(argument_leaf, np.ndarray) else argument_leaf
+                for argument_leaf in argument_leaves
+            ]
+            last_call = stored_call = copied_leaves, argument_structure, function(*args, **kwargs)
         return stored_call[2]
 
     return call_or_reuse
@@ -87,9 +93,9 @@ class StepTimer:
     def __call__(self, step: str):
         if self.progress is not None:
             self.progress(step)
-        start = time.perf_counter()
+        start_time = time.perf_counter()
         yield
-        self.seconds[step] = time.perf_counter() - start
+        self.seconds[step] = time.perf_counter() - start_time
 
 
 def imaging_mesh(
@@ -151,30 +157,34 @@ def calibrated_model(
     """
     clock = StepTimer(None) if clock is None else clock
     with clock("calibrate"), one_thread_of_blas():
-        return _calibrate(model, base, contact)
+        return _calibrate_on_reference(model, base, contact)
 
 
 @keep_last_result
-def _calibrate(model: ForwardModel, base: Measurement, contact: str | None) -> tuple[Calibration, str]:
+def _calibrate_on_reference(
+    model: ForwardModel, reference: Measurement, requested_contact: str | None
+) -> tuple[Calibration, str]:
     """Calibrate the forward model, see `calibrated_model`."""
-    contact_method = contact or default_contact(base)
-    voltages, mask = np.asarray(base.voltages)[0], np.asarray(base.mask)[0]
-    calibration = calibrate(model, voltages, mask=mask, contact=contact_method)
-    if contact is None and contact_method == "each" and not calibration.distinguishes_contacts:
+    contact_method = requested_contact or default_contact(reference)
+    reference_voltages, channel_mask = np.asarray(reference.voltages)[0], np.asarray(reference.mask)[0]
+    calibration = calibrate(model, reference_voltages, mask=channel_mask, contact=contact_method)
+    if requested_contact is None and contact_method == "each" and not calibration.distinguishes_contacts:
         contact_method = "common"  # the data do not determine one impedance per electrode
-        calibration = calibrate(model, voltages, mask=mask, contact=contact_method)
-    position = (base.uncertainty or Uncertainty()).position_on(model.mesh)
-    calibration = _estimate_positions(calibration, model, voltages, mask, position)
+        calibration = calibrate(model, reference_voltages, mask=channel_mask, contact=contact_method)
+    position_deviation = (reference.uncertainty or Uncertainty()).position_on(model.mesh)
+    calibration = _with_estimated_positions(calibration, model, reference_voltages, channel_mask, position_deviation)
     calibration = jax.block_until_ready(calibration)
     if not np.isfinite(calibration.misfit):
         raise ValueError(
-            f"'{base.name}': calibration on it failed ({calibration.reason}); is this a frame of the empty body, "
+            f"'{reference.name}': calibration on it failed ({calibration.reason}); is this a frame of the empty body, "
             "and are geometry and protocol right?"
         )
     return calibration, contact_method
 
 
-def _estimate_positions(calibration: Calibration, model: ForwardModel, voltages, mask, deviation: float) -> Calibration:
+def _with_estimated_positions(
+    calibration: Calibration, model: ForwardModel, reference_voltages, channel_mask, position_deviation: float
+) -> Calibration:
     """The calibration with estimated electrode positions, if these positions explain the reference frame far better.
 
     The described positions are used if they explain the reference, or if the misfit has other causes: for example,
@@ -183,23 +193,29 @@ def _estimate_positions(calibration: Calibration, model: ForwardModel, voltages,
     mainly to the largest voltages, those at the driven electrodes, the background would follow the errors of a
     two-dimensional model at these electrodes.
     """
-    described_misfit = relative_misfit(calibration.voltages, voltages, mask)
+    described_misfit = relative_misfit(calibration.voltages, reference_voltages, channel_mask)
     if (
         not described_misfit > _MAX_MISFIT_OF_DESCRIBED_POSITIONS
-        or (placement := estimated_positions(model, voltages, mask, deviation)) is None
+        or (placement := estimated_positions(model, reference_voltages, channel_mask, position_deviation)) is None
     ):
         return calibration
     predicted_voltages = np.asarray(placement.model.voltages(placement.conductivity))
-    misfit = float(np.linalg.norm((predicted_voltages - voltages)[mask]) / np.linalg.norm(voltages[mask]))
-    is_better = relative_misfit(predicted_voltages, voltages, mask) < _MAX_RELATIVE_RATIO * described_misfit
-    if not (is_better and misfit < _MAX_MISFIT_RATIO * float(calibration.misfit)):
+    estimated_misfit = float(
+        np.linalg.norm((predicted_voltages - reference_voltages)[channel_mask])
+        / np.linalg.norm(reference_voltages[channel_mask])
+    )
+    is_weighted_misfit_better = (
+        relative_misfit(predicted_voltages, reference_voltages, channel_mask)
+        < _MAX_WEIGHTED_MISFIT_RATIO * described_misfit
+    )
+    if not (is_weighted_misfit_better and estimated_misfit < _MAX_UNWEIGHTED_MISFIT_RATIO * float(calibration.misfit)):
         return replace(calibration, model_error=placement.error)
     return replace(
         calibration,
         model=placement.model,
         conductivity=as_array(placement.conductivity),
         voltages=as_array(predicted_voltages),
-        misfit=as_array(misfit),
+        misfit=as_array(estimated_misfit),
         contact_deviation=as_array(np.linalg.norm(placement.error.factor, axis=1)[placement.shift.size :]),
         shift=as_array(placement.shift),
         model_error=placement.error,
@@ -209,9 +225,9 @@ def _estimate_positions(calibration: Calibration, model: ForwardModel, voltages,
 def relative_misfit(predicted_voltages, measured, mask) -> float:
     """Norm of the errors of predicted voltages (M,), as a share of the norm of the measured voltages, with each channel
     divided by its expected noise."""
-    noise = np.asarray(relative_noise(measured, mask))[mask]
-    errors = (np.asarray(predicted_voltages) - measured)[mask]
-    return float(np.linalg.norm(errors / noise) / np.linalg.norm(measured[mask] / noise))
+    channel_noise = np.asarray(relative_noise(measured, mask))[mask]
+    voltage_errors = (np.asarray(predicted_voltages) - measured)[mask]
+    return float(np.linalg.norm(voltage_errors / channel_noise) / np.linalg.norm(measured[mask] / channel_noise))
 
 
 @keep_last_result

@@ -37,9 +37,9 @@ from jeit.mesh import Mesh
 from jeit_solvers import Status, one_thread_of_blas
 from jeit_solvers.engines import as_array
 
-_RELATIVE_SEGMENTATION_THRESHOLD = 0.5
+_SEGMENTATION_LEVEL = 0.5
 # Maximum misfit of an image's voltages, in standard deviations, that raises no doubt.
-_MAX_UNDOUBTED_MISFIT = 3.0
+_MAX_UNDOUBTED_IMAGE_MISFIT = 3.0
 
 
 @dataclass(frozen=True)
@@ -60,9 +60,9 @@ class ImagedDifference:
       complex voltages, the complex change of admittivity σ + iωε.
     - `raster`: `change` on a grid, NaN outside the mesh; `extent`: (x_min, x_max, y_min, y_max) in metres.
     - `inclusions`: regions of changed conductivity, strongest first; the `shapes` if there are any. Inclusions must
-      exceed the noise of the image. In linear images they are changes beside one common to all voltages. In
-      iterative images they are found in the logarithm of conductivity, which weights both signs alike; in complex
-      images in the real part.
+      exceed the noise of the image. In linear images, inclusions are found after a change common to all voltages is
+      removed. In iterative images, they are found in the logarithm of conductivity, which weights both signs equally;
+      in complex images, in the real part.
     - `unlike_electrodes`: electrodes, numbered from 0, whose channels the model fits far worse than those of the other
       electrodes, each with the ratio of the misfits. These channels have less weight.
     - `shapes`: fitted bodies with outlines; None if no bodies were fitted, or if they do not explain the voltages.
@@ -135,11 +135,13 @@ class ImagedDifference:
         """68 % interval of the change in each inclusion, S/m (2-D: S). Empty without fitted bodies, and if the data do
         not determine a limit of an interval."""
         background = float(np.real(self.calibration.conductivity))
-        intervals = [inclusion.contrast_interval or (None, None) for inclusion in self.inclusions]
-        ranges = [
-            (background * low, background * high) for low, high in intervals if low is not None and high is not None
+        contrast_intervals = [inclusion.contrast_interval or (None, None) for inclusion in self.inclusions]
+        change_ranges = [
+            (background * lowest_contrast, background * highest_contrast)
+            for lowest_contrast, highest_contrast in contrast_intervals
+            if lowest_contrast is not None and highest_contrast is not None
         ]
-        return tuple(ranges) if len(ranges) == len(intervals) else ()
+        return tuple(change_ranges) if len(change_ranges) == len(contrast_intervals) else ()
 
     @property
     def mesh(self) -> Mesh:
@@ -166,8 +168,8 @@ class ImagedDifference:
         """Reasons to doubt the image, in sentences: too few channels, noise, an implausible background, an iteration
         that did not converge, voltages not explained by the image, or bodies whose kind the data do not determine."""
         reconstruction = self.reconstruction
-        data = self.measurement, self.reference, self.calibration, self.quality
-        doubt_texts = doubts_of_data(*data, self.electrode_change)
+        checked_data = self.measurement, self.reference, self.calibration, self.quality
+        doubt_texts = doubts_of_data(*checked_data, self.electrode_change)
         if isinstance(reconstruction, LinearReconstruction):
             if self.lowest < -1:
                 doubt_texts.append(
@@ -180,17 +182,17 @@ class ImagedDifference:
                 f"the iteration did not converge ({reconstruction.status}): neither peaks nor places are to be "
                 "trusted. Take the default hyperparameter, or a larger one."
             )
-        if (misfit := float(reconstruction.misfit)) > _MAX_UNDOUBTED_MISFIT:
+        if (image_misfit := float(reconstruction.misfit)) > _MAX_UNDOUBTED_IMAGE_MISFIT:
             doubt_texts.append(
-                f"its voltages miss the data by {misfit:.2g} standard deviations: bodies may be missing, or shown "
-                "where none are."
+                f"its voltages miss the data by {image_misfit:.2g} standard deviations: bodies may be missing, or "
+                "shown where none are."
             )
         for body in reconstruction.alternatives if isinstance(reconstruction, ShapeReconstruction) else ():
             if body is not None:
                 x, y = 1e3 * body.centroid[:2]
-                kind = "a column through the whole height" if body.column else "no column but an ellipsoid"
+                body_kind = "a column through the whole height" if body.column else "no column but an ellipsoid"
                 doubt_texts.append(
-                    f"the body at x {x:.0f} mm, y {y:.0f} mm may as well be {kind}, of "
+                    f"the body at x {x:.0f} mm, y {y:.0f} mm may as well be {body_kind}, of "
                     f"{np.exp(body.sign * body.contrast):.2g} times the background and {1e6 * body.volume:.3g} cm³: "
                     "these electrodes do not determine which. If you know, bodies (--bodies) says so."
                 )
@@ -200,25 +202,25 @@ class ImagedDifference:
     def detectable_strength(self) -> Float[np.ndarray, " m"] | None:
         """Smallest strength with which a body in each cell (m,) of the calibrated model's mesh is detected, m² (3-D:
         m³), see `jeit.inverse.detectable_strength`; None for complex images, and if the noise is not known."""
-        return self._detectable(detectable_strength)
+        return self._detection_limits(detectable_strength)
 
     @property
     def detectable_diameters(self) -> DetectableDiameters | None:
         """Diameters of the smallest insulating bodies that are detected, see `jeit.inverse.detectable_diameters`; None
         for complex images, and if the noise is not known."""
-        return self._detectable(detectable_diameters)
+        return self._detection_limits(detectable_diameters)
 
-    def _detectable(self, compute: Callable[..., Any]) -> Any:
+    def _detection_limits(self, compute_limits: Callable[..., Any]) -> Any:
         if self.noise is None or self.is_complex or np.iscomplexobj(self.calibration.conductivity):
             return None
-        usable = np.asarray(self.measurement.mask)[0] & np.asarray(self.reference.mask)[0]
-        return compute(self.calibration.model, self.calibration.conductivity, self.noise, usable)
+        usable_channels = np.asarray(self.measurement.mask)[0] & np.asarray(self.reference.mask)[0]
+        return compute_limits(self.calibration.model, self.calibration.conductivity, self.noise, usable_channels)
 
     @property
     def level(self) -> float:
         """Level at which an inclusion ends, as a share of its peak: 0.5, the middle of its blurred edge, in segmented
         images, otherwise the level of the settings."""
-        return _RELATIVE_SEGMENTATION_THRESHOLD if self.settings.segment else self.settings.level
+        return _SEGMENTATION_LEVEL if self.settings.segment else self.settings.level
 
     @property
     def is_complex(self) -> bool:
@@ -241,8 +243,8 @@ class ImagedDifference:
 
 def _model_of_reconstruction(reconstruction, calibration: Calibration) -> ForwardModel:
     """Forward model on the mesh of a reconstruction."""
-    finer_mesh_image = reconstruction.finer if isinstance(reconstruction, ShapeReconstruction) else None
-    return calibration.model if finer_mesh_image is None else finer_mesh_image.model
+    image_on_finer_mesh = reconstruction.finer if isinstance(reconstruction, ShapeReconstruction) else None
+    return calibration.model if image_on_finer_mesh is None else image_on_finer_mesh.model
 
 
 def image_difference(
@@ -275,7 +277,7 @@ def image_difference(
     ```
     """
     settings = as_settings(settings)
-    clock = StepTimer(progress)
+    step_timer = StepTimer(progress)
     prepared = prepare_difference(
         measurement,
         reference,
@@ -283,33 +285,35 @@ def image_difference(
         contact=settings.contact,
         num_points=settings.num_points,
         as_is=settings.as_is,
-        clock=clock,
+        clock=step_timer,
     )
     calibration = prepared.calibration
     if prepared.mesh.dimension == 2 and settings.bodies != KINDS[0]:
         raise ValueError("bodies: ellipsoids and columns are of solids, and this is a sheet; leave it out.")
-    # Threads of the BLAS wait for each other: if another program occupies a core, images of solids take four times as
-    # long with them, and those of sheets ten times as long.
-    with clock("image"), one_thread_of_blas():
-        reason, shapes = "", None
-        options = MethodOptions(settings.prior, settings.hyperparameter, settings.bodies, progress)
+    # Imaging uses one thread of the BLAS, because several threads wait for each other: if another program occupies a
+    # core, images of solids take four times and images of sheets ten times as long with several threads.
+    with step_timer("image"), one_thread_of_blas():
+        method_reason, fitted_shapes = "", None
+        method_options = MethodOptions(settings.prior, settings.hyperparameter, settings.bodies, progress)
         if settings.method == AUTO:
-            method, reason, (reconstruction, change), shapes = image_automatically(prepared, options, settings.segment)
-            settings = replace(settings, method=method)
+            method_name, method_reason, (reconstruction, conductivity_change), fitted_shapes = image_automatically(
+                prepared, method_options, settings.segment
+            )
+            settings = replace(settings, method=method_name)
         else:
-            reconstruction, change = METHODS[settings.method].image(prepared, options)
-            shapes = reconstruction if isinstance(reconstruction, ShapeReconstruction) else None
-        max_change = float(np.abs(change).max())
-        if not max_change > 1e-9 * abs(complex(calibration.conductivity)):
+            reconstruction, conductivity_change = METHODS[settings.method].image(prepared, method_options)
+            fitted_shapes = reconstruction if isinstance(reconstruction, ShapeReconstruction) else None
+        max_conductivity_change = float(np.abs(conductivity_change).max())
+        if not max_conductivity_change > 1e-9 * abs(complex(calibration.conductivity)):
             raise ValueError(
                 f"'{prepared.measurement.name}': the image is empty, no change reaches a billionth of the background. "
                 f"The hyperparameter {float(reconstruction.hyperparameter):.3g} leaves nothing of the data: give "
                 "another, or a rule."
             )
-        if isinstance(reconstruction, LinearReconstruction) and not np.iscomplexobj(change):
-            prepared = estimate_unexplained_noise(prepared, reconstruction, change)
-    with clock("raster and inclusions"):
-        grid = Raster.create(_model_of_reconstruction(reconstruction, calibration).mesh, shape=settings.raster_shape)
+        if isinstance(reconstruction, LinearReconstruction) and not np.iscomplexobj(conductivity_change):
+            prepared = estimate_unexplained_noise(prepared, reconstruction, conductivity_change)
+    with step_timer("raster and inclusions"):
+        raster = Raster.create(_model_of_reconstruction(reconstruction, calibration).mesh, shape=settings.raster_shape)
         imaged = ImagedDifference(
             measurement=prepared.measurement,
             reference=prepared.reference,
@@ -317,106 +321,118 @@ def image_difference(
             settings=replace(settings, contact=prepared.contact),
             calibration=calibration,
             reconstruction=reconstruction,
-            change=change,
-            raster=_sample_on_raster(grid, change),
-            extent=grid.extent,
+            change=conductivity_change,
+            raster=_sample_on_raster(raster, conductivity_change),
+            extent=raster.extent,
             inclusions=(),
             wiring=prepared.wiring,
-            why=reason,
+            why=method_reason,
             unlike_electrodes=prepared.unlike_electrodes,
-            shapes=shapes,
-            timings=clock.seconds,
+            shapes=fitted_shapes,
+            timings=step_timer.seconds,
             frame=prepared.frame,
             num_frames=prepared.num_frames,
             electrode_change=prepared.electrode_change,
             noise=prepared.modelled_noise,
         )
-        inclusions, labels = _inclusions(imaged, grid, prepared)
-    return replace(imaged, inclusions=tuple(inclusions), labels=labels)
+        inclusions, pixel_labels = _inclusions_and_labels(imaged, raster, prepared)
+    return replace(imaged, inclusions=tuple(inclusions), labels=pixel_labels)
 
 
-def _inclusions(
-    imaged: ImagedDifference, grid: Raster, prepared: PreparedDifference
+def _inclusions_and_labels(
+    imaged: ImagedDifference, raster: Raster, prepared: PreparedDifference
 ) -> tuple[list[Inclusion], UInt8[np.ndarray, "rows columns"] | None]:
-    """Inclusions of an image, with the change of conductivity as their peak; and labels of the pixels, if requested.
-    Inclusions of smooth images must exceed the noise of the image. Those of linear images are found in the image of the
-    difference without a change common to all voltages."""
+    """Find the inclusions of an image, with the change of conductivity as their peak, and label the pixels if
+    requested. Inclusions of smooth images must exceed the noise of the image. Inclusions of linear images are found in
+    the image of the difference without a change common to all voltages."""
     settings, reconstruction, background = imaged.settings, imaged.reconstruction, imaged.calibration.conductivity
     if imaged.shapes is not None:
-        bodies = imaged.shapes.bodies
-        labels = _labels(imaged.mesh, bodies, grid) if settings.segment else None
-        return [_body_inclusion(body, float(background)) for body in bodies], labels
-    conductivity_change, noise = as_array(np.real(imaged.departure)), None
+        fitted_bodies = imaged.shapes.bodies
+        pixel_labels = _label_body_pixels(imaged.mesh, fitted_bodies, raster) if settings.segment else None
+        return [_inclusion_of_body(body, float(background)) for body in fitted_bodies], pixel_labels
+    conductivity_change, noise_per_cell = as_array(np.real(imaged.departure)), None
     if isinstance(reconstruction, Reconstruction) and reconstruction.inversion.penalty.is_standard_normal:
-        noise = as_array(image_noise(reconstruction))
+        noise_per_cell = as_array(image_noise(reconstruction))
     elif isinstance(reconstruction, LinearReconstruction):
-        conductivity_change, noise = change_and_noise(prepared, reconstruction, imaged.change)
-    regions = inclusion_regions(
-        imaged.mesh, conductivity_change, level=imaged.level, least_peak=settings.least_peak, noise=noise
+        conductivity_change, noise_per_cell = change_and_noise(prepared, reconstruction, imaged.change)
+    inclusions_with_regions = inclusion_regions(
+        imaged.mesh, conductivity_change, level=imaged.level, least_peak=settings.least_peak, noise=noise_per_cell
     )
-    inclusions = [_convert_peak(inclusion, background) if imaged.iterative else inclusion for inclusion, _ in regions]
-    return inclusions, _region_labels(regions, grid) if settings.segment else None
+    inclusions = [
+        _peak_from_logarithm(inclusion, background) if imaged.iterative else inclusion
+        for inclusion, _ in inclusions_with_regions
+    ]
+    return inclusions, _label_region_pixels(inclusions_with_regions, raster) if settings.segment else None
 
 
-def _body_inclusion(body: Star | Ellipsoid, background: float) -> Inclusion:
-    """A fitted body as an inclusion, with the intervals of its properties if they were estimated."""
+def _inclusion_of_body(body: Star | Ellipsoid, background: float) -> Inclusion:
+    """Convert a fitted body to an inclusion, with the credible intervals of its properties if they were estimated."""
     centroid = tuple(body.centroid.tolist())
-    if (quantities := body.quantities) is not None:
+    if (body_quantities := body.quantities) is not None:
         return Inclusion(
             body.sign,
             centroid,
-            quantities.measure,
-            background * quantities.change,
+            body_quantities.measure,
+            background * body_quantities.change,
             form=_solid_form(body),
-            contrast_interval=quantities.change_interval,
-            area_interval=quantities.measure_interval,
-            strength=quantities.strength,
-            strength_interval=quantities.strength_interval,
-            centroid_radius=quantities.centroid_radius,
+            contrast_interval=body_quantities.change_interval,
+            area_interval=body_quantities.measure_interval,
+            strength=body_quantities.strength,
+            strength_interval=body_quantities.strength_interval,
+            centroid_radius=body_quantities.centroid_radius,
         )
     inclusion = Inclusion(body.sign, centroid, body.measure, body.sign * body.contrast, form=_solid_form(body))
-    return _convert_peak(inclusion, background)
+    return _peak_from_logarithm(inclusion, background)
 
 
 def _solid_form(body: Star | Ellipsoid) -> SolidForm | None:
-    """Form of a body in a solid, for drawing; None for star shapes."""
+    """Return the form of a body in a solid, for drawing; None for star shapes."""
     if isinstance(body, Star):
         return None
-    axes = sorted(body.axes.tolist(), key=lambda axis: abs(axis[2])) if body.column else body.axes.tolist()
-    return SolidForm(tuple(body.centre.tolist()), tuple(map(tuple, axes)), body.column)
+    semi_axes = sorted(body.axes.tolist(), key=lambda axis: abs(axis[2])) if body.column else body.axes.tolist()
+    return SolidForm(tuple(body.centre.tolist()), tuple(map(tuple, semi_axes)), body.column)
 
 
-def _region_labels(regions, grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
+def _label_region_pixels(inclusions_with_regions, raster: Raster) -> UInt8[np.ndarray, "rows columns"]:
     """Label the pixels in the regions of resistive and conductive inclusions."""
-    cell = np.asarray(grid.cell)
-    labels = np.zeros(cell.shape, np.uint8)
-    for inclusion, region in regions:
-        labels[(cell >= 0) & region[cell]] = CONDUCTIVE if inclusion.sign > 0 else RESISTIVE
-    return labels
+    cell_of_pixel = np.asarray(raster.cell)
+    pixel_labels = np.zeros(cell_of_pixel.shape, np.uint8)
+    for inclusion, region_cells in inclusions_with_regions:
+        pixel_labels[(cell_of_pixel >= 0) & region_cells[cell_of_pixel]] = (
+            CONDUCTIVE if inclusion.sign > 0 else RESISTIVE
+        )
+    return pixel_labels
 
 
-def _labels(mesh: Mesh, bodies: Sequence[Star | Ellipsoid], grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
-    """Label the pixels in resistive and conductive bodies, in a solid at half its height. Where bodies overlap, the
-    first body of the list determines the label."""
-    centres, is_inside = grid.pixel_centres(), np.asarray(grid.cell) >= 0
+def _label_body_pixels(
+    mesh: Mesh, fitted_bodies: Sequence[Star | Ellipsoid], raster: Raster
+) -> UInt8[np.ndarray, "rows columns"]:
+    """Label the pixels in resistive and conductive bodies. In a solid, the section at half its height is labelled.
+    Where bodies overlap, the first body of the list determines the label."""
+    pixel_centres, is_inside = raster.pixel_centres(), np.asarray(raster.cell) >= 0
     if mesh.dimension == 3:
-        z = np.asarray(mesh.points)[:, 2]
-        centres = np.concatenate([centres, np.full((*is_inside.shape, 1), (z.min() + z.max()) / 2)], axis=-1)
-    labels = np.zeros(is_inside.shape, np.uint8)
-    for body in reversed(bodies):
-        labels[is_inside & body.holds(centres)] = CONDUCTIVE if body.sign > 0 else RESISTIVE
-    return labels
+        node_heights = np.asarray(mesh.points)[:, 2]
+        pixel_centres = np.concatenate(
+            [pixel_centres, np.full((*is_inside.shape, 1), (node_heights.min() + node_heights.max()) / 2)], axis=-1
+        )
+    pixel_labels = np.zeros(is_inside.shape, np.uint8)
+    for body in reversed(fitted_bodies):
+        pixel_labels[is_inside & body.holds(pixel_centres)] = CONDUCTIVE if body.sign > 0 else RESISTIVE
+    return pixel_labels
 
 
-def _sample_on_raster(grid: Raster, change) -> Inexact[Array, "rows columns"]:
+def _sample_on_raster(raster: Raster, conductivity_change) -> Inexact[Array, "rows columns"]:
     """Sample an image on a raster, real and imaginary part separately for complex images."""
-    if not np.iscomplexobj(change):
-        return grid.sample(change)
-    rasters = [np.asarray(grid.sample(as_array(values))) for values in (np.real(change), np.imag(change))]
-    return as_array(rasters[0] + 1j * rasters[1])
+    if not np.iscomplexobj(conductivity_change):
+        return raster.sample(conductivity_change)
+    sampled_parts = [
+        np.asarray(raster.sample(as_array(part_per_cell)))
+        for part_per_cell in (np.real(conductivity_change), np.imag(conductivity_change))
+    ]
+    return as_array(sampled_parts[0] + 1j * sampled_parts[1])
 
 
-def _convert_peak(inclusion: Inclusion, background) -> Inclusion:
+def _peak_from_logarithm(inclusion: Inclusion, background_conductivity) -> Inclusion:
     """Convert the peak of an inclusion from a change of log conductivity to a change of conductivity."""
-    peak = float(background * np.expm1(inclusion.peak))
-    return replace(inclusion, peak=peak)
+    conductivity_peak = float(background_conductivity * np.expm1(inclusion.peak))
+    return replace(inclusion, peak=conductivity_peak)

@@ -111,12 +111,12 @@ def compare_on_data(
     ```
     """
     settings = as_settings(settings)
-    names = list(dict.fromkeys(RULES if rules is None else rules))
-    for name in names:
-        check_name("rules", name, RULES)
-    if not names:
+    rule_names = list(dict.fromkeys(RULES if rules is None else rules))
+    for rule_name in rule_names:
+        check_name("rules", rule_name, RULES)
+    if not rule_names:
         raise ValueError(f"rules: none is named; give some of {', '.join(RULES)}.")
-    clock = StepTimer(progress)
+    step_timer = StepTimer(progress)
     prepared = prepare_difference(
         measurement,
         reference,
@@ -124,11 +124,11 @@ def compare_on_data(
         contact=settings.contact,
         num_points=settings.num_points,
         as_is=settings.as_is,
-        clock=clock,
+        clock=step_timer,
     )
     check_real(prepared.measurement)
     mesh = prepared.mesh
-    with clock("linearise"):
+    with step_timer("linearise"):
         linearisation = Linearisation.create(
             prepared.model,
             prepared.calibration.conductivity,
@@ -136,36 +136,48 @@ def compare_on_data(
             noise=prepared.relative_noise,
             mask=prepared.mask,
         )
-        data = linearisation.whiten(prepared.difference)
+        whitened_difference = linearisation.whiten(prepared.difference)
         jax.block_until_ready(linearisation.spectrum)
-    outcomes, refusal_reasons, prepared_with_noise = {}, {}, prepared
-    with clock("choose"):
-        noise_figure_choice = choose(linearisation.spectrum, "noise-figure", data, mesh)
-        for name in names:
+    rule_outcomes, refusal_reasons, prepared_with_noise = {}, {}, prepared
+    with step_timer("choose"):
+        noise_figure_choice = choose(linearisation.spectrum, "noise-figure", whitened_difference, mesh)
+        for rule_name in rule_names:
             try:
-                rule = noise_figure_choice if name == noise_figure_choice.rule else choose_rule(name, prepared)
-                choice = choose(linearisation.spectrum, rule, data, mesh)
+                rule = (
+                    noise_figure_choice if rule_name == noise_figure_choice.rule else choose_rule(rule_name, prepared)
+                )
+                hyperparameter_choice = choose(linearisation.spectrum, rule, whitened_difference, mesh)
             except ValueError as error:
-                if len(names) == 1:
+                if len(rule_names) == 1:
                     raise
-                refusal_reasons[name] = str(error)
+                refusal_reasons[rule_name] = str(error)
                 continue
-            factors = linearisation.factors(choice.hyperparameter)
-            fields = choice.hyperparameter, choice.rule, "one-step", choice
-            reconstruction = LinearReconstruction.of_factors(prepared.model, factors, *fields)
-            change = reconstruction.image(prepared.difference)
-            prepared_with_estimated_noise = estimate_unexplained_noise(prepared, reconstruction, change)
-            conductivity_change, noise = change_and_noise(prepared_with_estimated_noise, reconstruction, change)
-            regions = inclusion_regions(
-                mesh, conductivity_change, level=settings.level, least_peak=settings.least_peak, noise=noise
+            reconstruction_factors = linearisation.factors(hyperparameter_choice.hyperparameter)
+            reconstruction_fields = (
+                hyperparameter_choice.hyperparameter,
+                hyperparameter_choice.rule,
+                "one-step",
+                hyperparameter_choice,
             )
-            outcomes[name] = RuleOutcome(
-                choice,
-                choice.read(choice.residual) / float(jnp.linalg.norm(data)),
-                noise_figure_choice.read(noise_figure_choice.criterion, choice.hyperparameter),
-                change,
-                tuple(inclusion for inclusion, _ in regions),
+            reconstruction = LinearReconstruction.of_factors(
+                prepared.model, reconstruction_factors, *reconstruction_fields
             )
-            if name == DEFAULT_RULE or len(outcomes) == 1:
+            conductivity_change = reconstruction.image(prepared.difference)
+            prepared_with_estimated_noise = estimate_unexplained_noise(prepared, reconstruction, conductivity_change)
+            change_without_common, noise_per_cell = change_and_noise(
+                prepared_with_estimated_noise, reconstruction, conductivity_change
+            )
+            inclusions_with_regions = inclusion_regions(
+                mesh, change_without_common, level=settings.level, least_peak=settings.least_peak, noise=noise_per_cell
+            )
+            rule_outcomes[rule_name] = RuleOutcome(
+                hyperparameter_choice,
+                hyperparameter_choice.read(hyperparameter_choice.residual)
+                / float(jnp.linalg.norm(whitened_difference)),
+                noise_figure_choice.read(noise_figure_choice.criterion, hyperparameter_choice.hyperparameter),
+                conductivity_change,
+                tuple(inclusion for inclusion, _ in inclusions_with_regions),
+            )
+            if rule_name == DEFAULT_RULE or len(rule_outcomes) == 1:
                 prepared_with_noise = prepared_with_estimated_noise
-    return ComparedRules(prepared_with_noise, settings, outcomes, refusal_reasons)
+    return ComparedRules(prepared_with_noise, settings, rule_outcomes, refusal_reasons)

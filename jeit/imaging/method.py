@@ -95,9 +95,14 @@ class ImagingSettings:
                 object.__setattr__(self, "hyperparameter", METHODS[self.method].hyperparameter)
         else:
             check_hyperparameter(self.hyperparameter)
-            if isinstance(self.hyperparameter, str) and (number := METHODS[self.method].number) is not None:
-                name = self.method.replace("-", " ").replace("back ", "back-")
-                raise ValueError(f"hyperparameter: {name} takes a number such as {number:g}, not a rule.")
+            if (
+                isinstance(self.hyperparameter, str)
+                and (suggested_hyperparameter := METHODS[self.method].number) is not None
+            ):
+                method_text = self.method.replace("-", " ").replace("back ", "back-")
+                raise ValueError(
+                    f"hyperparameter: {method_text} takes a number such as {suggested_hyperparameter:g}, not a rule."
+                )
         if self.bodies != KINDS[0] and (self.method not in (AUTO, "shapes") or self.prior != MEASURED_DATA_PRIOR):
             raise ValueError(
                 "bodies: only methods 'auto' and 'shapes' with the default prior look for any; leave it out."
@@ -158,7 +163,7 @@ class MethodOptions(NamedTuple):
 
 # Fits of shapes start from the inclusions of a smooth image, some of which are artefacts: minimum peak and minimum area
 # of these inclusions, see `jeit.image.find_inclusions`, and their maximum number.
-_MIN_START_PEAK, _MIN_START_AREA, _MAX_SHAPE_STARTS = 0.15, 0.002, 8
+_MIN_START_PEAK, _MIN_START_AREA, _MAX_START_INCLUSIONS = 0.15, 0.002, 8
 
 
 @dataclass(frozen=True)
@@ -204,18 +209,18 @@ def choose_rule(name: str, prepared: PreparedDifference) -> Rule:
     return partial(discrepancy, noise=prepared.noise)
 
 
-def _number_or_rule(prepared: PreparedDifference, hyperparameter: NamedWeight) -> float | Rule:
+def _hyperparameter_or_rule(prepared: PreparedDifference, hyperparameter: NamedWeight) -> float | Rule:
     """Return λ as a number, or the rule that chooses it."""
     assert hyperparameter is not None
     return choose_rule(hyperparameter, prepared) if isinstance(hyperparameter, str) else hyperparameter
 
 
-def _one_step(prepared: PreparedDifference, options: MethodOptions) -> Imaged:
+def _one_step_image(prepared: PreparedDifference, options: MethodOptions) -> Imaged:
     reconstruction = one_step(
         prepared.model,
         prepared.calibration.conductivity,
         prior=prior_for(options.prior, prepared.domain),
-        hyperparameter=_number_or_rule(prepared, options.hyperparameter),
+        hyperparameter=_hyperparameter_or_rule(prepared, options.hyperparameter),
         difference=prepared.difference,
         noise=prepared.relative_noise,
         mask=prepared.mask,
@@ -223,13 +228,17 @@ def _one_step(prepared: PreparedDifference, options: MethodOptions) -> Imaged:
     return reconstruction, reconstruction.image(prepared.difference)
 
 
-def _back_projection(prepared: PreparedDifference, options: MethodOptions, *, filtered: bool) -> Imaged:
-    weight = options.hyperparameter
-    keywords = {"hyperparameter": weight} if isinstance(weight, (int, float)) else {}
+def _back_projection_image(prepared: PreparedDifference, options: MethodOptions, *, filtered: bool) -> Imaged:
+    requested_hyperparameter = options.hyperparameter
+    hyperparameter_keyword = (
+        {"hyperparameter": requested_hyperparameter} if isinstance(requested_hyperparameter, (int, float)) else {}
+    )
     # Equipotential lines are computed for the real part of the background; real and imaginary voltages are projected
     # separately.
-    conductivity = np.real(prepared.calibration.conductivity)
-    reconstruction = back_projection(prepared.model, conductivity, filtered=filtered, mask=prepared.mask, **keywords)
+    real_background = np.real(prepared.calibration.conductivity)
+    reconstruction = back_projection(
+        prepared.model, real_background, filtered=filtered, mask=prepared.mask, **hyperparameter_keyword
+    )
     return reconstruction, reconstruction.image(prepared.difference)
 
 
@@ -238,11 +247,11 @@ def _iterative_image(
     options: MethodOptions,
     *,
     solver: AbstractSolver,
-    given_prior: AbstractPrior | None = None,
+    method_prior: AbstractPrior | None = None,
 ) -> Imaged:
     """Estimate conductivity iteratively from the model's reference voltages plus the measured difference.
 
-    Model errors that are the same in the frame and its reference cancel. `given_prior`: a prior of the method that
+    Model errors that are the same in the frame and its reference cancel. `method_prior`: a prior of the method that
     replaces the requested prior. Raises `ValueError` if the solver fails, and for complex voltages.
     """
     model, background = prepared.model, prepared.calibration.conductivity
@@ -255,9 +264,9 @@ def _iterative_image(
         model,
         host.add(model.voltages(background), prepared.difference),
         background,
-        prior=prior_for(options.prior, prepared.domain) if given_prior is None else given_prior,
-        hyperparameter=_number_or_rule(prepared, options.hyperparameter),
-        noise=prepared.modelled_noise if given_prior is None else prepared.relative_noise,
+        prior=prior_for(options.prior, prepared.domain) if method_prior is None else method_prior,
+        hyperparameter=_hyperparameter_or_rule(prepared, options.hyperparameter),
+        noise=prepared.modelled_noise if method_prior is None else prepared.relative_noise,
         mask=prepared.mask,
         solver=solver,
     )
@@ -279,15 +288,17 @@ def shapes_in(
     prepared = prepared.with_noise_from(float(smooth_image.misfit))
     model, background = prepared.model, prepared.calibration.conductivity
     is_solid = prepared.mesh.dimension == 3
-    log_change = as_array(np.log(np.asarray(smooth_image.conductivity) / float(background)))
+    log_conductivity_change = as_array(np.log(np.asarray(smooth_image.conductivity) / float(background)))
     inclusions = find_inclusions(
-        prepared.mesh, log_change, level=0.5, least_peak=_MIN_START_PEAK, least_area=_MIN_START_AREA
+        prepared.mesh, log_conductivity_change, level=0.5, least_peak=_MIN_START_PEAK, least_area=_MIN_START_AREA
     )
     return reconstruct_shapes(
         model,
         host.add(model.voltages(background), prepared.difference),
         background,
-        start=[(inclusion.sign, inclusion.centroid, inclusion.radius) for inclusion in inclusions[:_MAX_SHAPE_STARTS]],
+        start=[
+            (inclusion.sign, inclusion.centroid, inclusion.radius) for inclusion in inclusions[:_MAX_START_INCLUSIONS]
+        ],
         noise=prepared.sharp_noise,
         mask=prepared.mask,
         prior=EllipsoidPrior(kinds=options.kinds) if is_solid else None,
@@ -299,9 +310,9 @@ def shapes_in(
     )
 
 
-def _image_shapes(prepared: PreparedDifference, options: MethodOptions) -> Imaged:
+def _shapes_image(prepared: PreparedDifference, options: MethodOptions) -> Imaged:
     smooth_image, _ = _iterative_image(
-        prepared, MethodOptions(MEASURED_DATA_PRIOR, GAUSS_NEWTON_HYPERPARAMETER), solver=_GAUSS_NEWTON
+        prepared, MethodOptions(MEASURED_DATA_PRIOR, GAUSS_NEWTON_HYPERPARAMETER), solver=_GAUSS_NEWTON_SOLVER
     )
     assert isinstance(smooth_image, Reconstruction)
     return conductivity_change_of_shapes(prepared, shapes_in(prepared, smooth_image, options))
@@ -309,29 +320,31 @@ def _image_shapes(prepared: PreparedDifference, options: MethodOptions) -> Image
 
 def conductivity_change_of_shapes(prepared: PreparedDifference, shapes: ShapeReconstruction) -> Imaged:
     """Return the shapes and their change of conductivity per cell; for a solid, per cell of the refined mesh."""
-    image = shapes if shapes.finer is None else shapes.finer
-    return shapes, image.conductivity - prepared.calibration.conductivity
+    conductivity_image = shapes if shapes.finer is None else shapes.finer
+    return shapes, conductivity_image.conductivity - prepared.calibration.conductivity
 
 
-_GAUSS_NEWTON, _LEVENBERG_MARQUARDT = GaussNewton(100, 1e-4), LevenbergMarquardt(100, 1e-4)
+_GAUSS_NEWTON_SOLVER, _LEVENBERG_MARQUARDT_SOLVER = GaussNewton(100, 1e-4), LevenbergMarquardt(100, 1e-4)
 METHODS: dict[str, Method] = {
-    "one-step": Method(_one_step, takes_prior=True, hyperparameter=DEFAULT_RULE),
-    "back-projection": Method(partial(_back_projection, filtered=False), takes_hyperparameter=False),
-    "filtered-back-projection": Method(partial(_back_projection, filtered=True), number=0.05),
+    "one-step": Method(_one_step_image, takes_prior=True, hyperparameter=DEFAULT_RULE),
+    "back-projection": Method(partial(_back_projection_image, filtered=False), takes_hyperparameter=False),
+    "filtered-back-projection": Method(partial(_back_projection_image, filtered=True), number=0.05),
     "gauss-newton": Method(
-        partial(_iterative_image, solver=_GAUSS_NEWTON), takes_prior=True, hyperparameter=GAUSS_NEWTON_HYPERPARAMETER
+        partial(_iterative_image, solver=_GAUSS_NEWTON_SOLVER),
+        takes_prior=True,
+        hyperparameter=GAUSS_NEWTON_HYPERPARAMETER,
     ),
     "levenberg-marquardt": Method(
-        partial(_iterative_image, solver=_LEVENBERG_MARQUARDT),
+        partial(_iterative_image, solver=_LEVENBERG_MARQUARDT_SOLVER),
         takes_prior=True,
         hyperparameter=GAUSS_NEWTON_HYPERPARAMETER,
     ),
     "total-variation": Method(
-        partial(_iterative_image, solver=_GAUSS_NEWTON, given_prior=TotalVariation()),
+        partial(_iterative_image, solver=_GAUSS_NEWTON_SOLVER, method_prior=TotalVariation()),
         prior="total variation",
         hyperparameter=EDGE_HYPERPARAMETER_PENALTY,
         number=EDGE_HYPERPARAMETER_PENALTY,
     ),
-    "shapes": Method(_image_shapes, prior="star shapes", takes_hyperparameter=False),
+    "shapes": Method(_shapes_image, prior="star shapes", takes_hyperparameter=False),
 }
 """Imaging methods by name, as used in Python and on the command line."""

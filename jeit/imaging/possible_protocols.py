@@ -24,13 +24,15 @@ from jeit.protocol import Protocol
 
 # Minimum and maximum number of electrodes of the protocols that are tried.
 MIN_ELECTRODES, MAX_ELECTRODES = 4, 64
-# Minimum number of channels for each electrode.
+# Minimum number of channels per electrode of a candidate protocol.
 _MIN_CHANNELS_PER_ELECTRODE = 2
-# Maximum number of frames of a file with which protocols are compared; of more frames, some at regular intervals.
-_MAX_FRAMES = 32
-# The order of the channels matters if voltages in a different order would leave so many times as much unexplained.
+# Maximum number of frames of a file with which protocols are compared. If a file has more frames, frames at regular
+# intervals are used.
+_MAX_COMPARED_FRAMES = 32
+# The order of the channels matters if the share that voltages in a different order would leave unexplained is at least
+# this many times larger.
 _MIN_MISFIT_RATIO_OF_OTHER_ORDER = 2.0
-# Layout of a table of numbers about which nothing is known.
+# Layout of a table of numbers without a description.
 _UNKNOWN_LAYOUT = TableLayout()
 
 
@@ -84,9 +86,9 @@ class Candidate:
         """Whether a uniform body would explain the voltages far worse if the channels were in a different order. On
         average, a share √(1 - r²) would then be unexplained, where r is the squared mean of the voltages divided by
         their mean square."""
-        values = np.asarray(self.measurement.voltages)[np.asarray(self.measurement.mask)]
-        mean_ratio = abs(values.mean()) ** 2 / np.mean(np.abs(values) ** 2)
-        return bool(_MIN_MISFIT_RATIO_OF_OTHER_ORDER * self.unexplained < np.sqrt(1 - mean_ratio**2))
+        usable_voltages = np.asarray(self.measurement.voltages)[np.asarray(self.measurement.mask)]
+        squared_mean_ratio = abs(usable_voltages.mean()) ** 2 / np.mean(np.abs(usable_voltages) ** 2)
+        return bool(_MIN_MISFIT_RATIO_OF_OTHER_ORDER * self.unexplained < np.sqrt(1 - squared_mean_ratio**2))
 
     @property
     def num_unread_channels(self) -> int:
@@ -106,8 +108,14 @@ class Candidate:
     @property
     def name(self) -> str:
         """Kind, number of electrodes and options of the protocol, in words."""
-        options = {key: value for key, value in self.protocol.items() if key not in ("kind", "number")}
-        option_text = ", ".join(f"{key} {str(value).lower()}" for key, value in options.items())
+        protocol_options = {
+            option_name: option_value
+            for option_name, option_value in self.protocol.items()
+            if option_name not in ("kind", "number")
+        }
+        option_text = ", ".join(
+            f"{option_name} {str(option_value).lower()}" for option_name, option_value in protocol_options.items()
+        )
         return f"{self.protocol['kind']}, {self.protocol['number']} electrodes{option_text and ', ' + option_text}"
 
 
@@ -128,91 +136,145 @@ class FileNumbers:
         """Read the numbers in a file; `key`: name of the array of frames; `excluded`: an array without frames. Raises
         `ValueError` for a file that cannot be read, or if the array of frames is not determined."""
         if path.suffix.lower() in (".mat", ".npz", ".npy"):
-            table, axis = _read_array(path, key, excluded)
-            shape = " × ".join(map(str, table.shape))
-            sizes = tuple(sorted({*table.shape, table.size}, reverse=True))
+            number_table, usual_frame_axis = _read_frame_array(path, key, excluded)
+            shape_text = " × ".join(map(str, number_table.shape))
+            frame_sizes = tuple(sorted({*number_table.shape, number_table.size}, reverse=True))
             return cls(
-                path, lambda counts: frames_in_table(table, counts, _UNKNOWN_LAYOUT, default_axis=axis), shape, sizes
+                path,
+                lambda possible_counts: frames_in_table(
+                    number_table, possible_counts, _UNKNOWN_LAYOUT, default_axis=usual_frame_axis
+                ),
+                shape_text,
+                frame_sizes,
             )
         if key is not None:
             raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
         if OpenEit.recognises(path):
-            table = OpenEit.numbers(path)[0]
-            shape, sizes = f"{counted(len(table), 'line')} of {table.shape[1]}", table.shape[1:]
-            return cls(path, lambda counts: frames_in_table(table, counts, _UNKNOWN_LAYOUT), shape, sizes)
-        text = read_text(path)
-        length, lines = int(text.lengths[0]), len(text.lengths)
-        total, shape = len(text.values), f"{counted(lines, 'line')} of {length}"
+            number_table = OpenEit.numbers(path)[0]
+            shape_text, frame_sizes = (
+                f"{counted(len(number_table), 'line')} of {number_table.shape[1]}",
+                number_table.shape[1:],
+            )
+            return cls(
+                path,
+                lambda possible_counts: frames_in_table(number_table, possible_counts, _UNKNOWN_LAYOUT),
+                shape_text,
+                frame_sizes,
+            )
+        file_text = read_text(path)
+        values_per_line, num_lines = int(file_text.lengths[0]), len(file_text.lengths)
+        num_values, shape_text = len(file_text.values), f"{counted(num_lines, 'line')} of {values_per_line}"
         # A frame that is wrapped over several lines ends with a line.
-        part_lengths = {total // k for k in range(1, 1 + total // max(length, 1)) if length < total // k}
-        part_lengths.intersection_update(np.cumsum(text.lengths).tolist())
-        table = text.values.reshape(lines, length) if total == lines * length else np.zeros((0, 0))
-        if text.separators.examples:  # a separator begins a frame or a part of one
+        part_sizes = {
+            num_values // num_parts
+            for num_parts in range(1, 1 + num_values // max(values_per_line, 1))
+            if values_per_line < num_values // num_parts
+        }
+        part_sizes.intersection_update(np.cumsum(file_text.lengths).tolist())
+        number_table = (
+            file_text.values.reshape(num_lines, values_per_line)
+            if num_values == num_lines * values_per_line
+            else np.zeros((0, 0))
+        )
+        if file_text.separators.examples:  # a separator begins a frame or a part of one
             try:
-                num_values_per_part = text.separators.complete(text.values, text.lengths, (), path.name).size
+                num_values_per_part = file_text.separators.complete(
+                    file_text.values, file_text.lengths, (), path.name
+                ).size
             except ValueError:
-                if text.separators.unreadable:
+                if file_text.separators.unreadable:
                     raise
                 # Parts have different sizes: lines are frames, or too many are missing.
-                part_lengths, num_values_per_part = set(), 1
-            part_lengths = {size for size in part_lengths if size % num_values_per_part == 0}
-        sizes = tuple({length, length - 1, lines, *part_lengths})
-        # Of one frame of reciprocal voltages, a symmetric matrix, rows and columns resemble each other alike.
-        if lines == length == len(table) and 2 * relative_deviation(table.T) < relative_deviation(table):
-            data = {"frames_in": "columns"}
-            return cls(path, lambda counts: frames_in_table(table.T, counts, _UNKNOWN_LAYOUT), shape, sizes, data)
-        return cls(path, lambda counts: frames_in_text(text, counts, _UNKNOWN_LAYOUT, path.name), shape, sizes)
+                part_sizes, num_values_per_part = set(), 1
+            part_sizes = {part_size for part_size in part_sizes if part_size % num_values_per_part == 0}
+        frame_sizes = tuple({values_per_line, values_per_line - 1, num_lines, *part_sizes})
+        # One frame of reciprocal voltages is a symmetric matrix, whose rows resemble each other as much as its columns.
+        if num_lines == values_per_line == len(number_table) and 2 * relative_deviation(
+            number_table.T
+        ) < relative_deviation(number_table):
+            data_entries = {"frames_in": "columns"}
+            return cls(
+                path,
+                lambda possible_counts: frames_in_table(number_table.T, possible_counts, _UNKNOWN_LAYOUT),
+                shape_text,
+                frame_sizes,
+                data_entries,
+            )
+        return cls(
+            path,
+            lambda possible_counts: frames_in_text(file_text, possible_counts, _UNKNOWN_LAYOUT, path.name),
+            shape_text,
+            frame_sizes,
+        )
 
 
 def relative_deviation(rows: np.ndarray) -> float:
     """Norm of the deviations of rows from their mean, divided by the norm of the rows."""
-    values = np.where(np.isfinite(rows), rows, 0)
-    values_norm = float(np.linalg.norm(values))
-    return float(np.linalg.norm(values - values.mean(axis=0))) / values_norm if values_norm else 0.0
+    finite_values = np.where(np.isfinite(rows), rows, 0)
+    values_norm = float(np.linalg.norm(finite_values))
+    return float(np.linalg.norm(finite_values - finite_values.mean(axis=0))) / values_norm if values_norm else 0.0
 
 
-def _read_array(path: Path, key: str | None, excluded: str | None) -> tuple[np.ndarray, str]:
-    """The array of frames in a file, and whether its frames are usually its "rows" or its "columns"."""
+def _read_frame_array(path: Path, requested_name: str | None, excluded_name: str | None) -> tuple[np.ndarray, str]:
+    """Return the array of frames in a file, and whether frames are usually "rows" or "columns" in files of this
+    format."""
     if path.suffix.lower() == ".npy":
         return np.atleast_2d(npy_array(path)), "rows"
     if path.suffix.lower() == ".mat":
-        sizes, axis = matlab.shapes(path), "columns"
+        shapes_by_name, usual_frame_axis = matlab.shapes(path), "columns"
     else:
-        sizes, axis = npz_shapes(path), "rows"
-    name = "voltages" if key is None and excluded != "voltages" and "voltages" in sizes else key  # as jeit writes
-    if name is None:
-        tables = [item for item, shape in sizes.items() if item != excluded and int(np.prod(shape)) > 3]
-        if not tables:
-            raise ValueError(f"{path.name} holds no array of numbers{f' besides {excluded!r}' if excluded else ''}.")
-        if len(tables) > 1:
-            names = names_text([f"{item} ({' × '.join(map(str, sizes[item]))})" for item in tables])
-            raise ValueError(f"{path.name}: arrays of numbers are {names}. Name that of the frames by key=.")
-        name = tables[0]
-    if name not in sizes:
+        shapes_by_name, usual_frame_axis = npz_shapes(path), "rows"
+    array_name = (
+        "voltages"
+        if requested_name is None and excluded_name != "voltages" and "voltages" in shapes_by_name
+        else requested_name
+    )  # as jeit writes
+    if array_name is None:
+        array_names = [
+            listed_name
+            for listed_name, array_shape in shapes_by_name.items()
+            if listed_name != excluded_name and int(np.prod(array_shape)) > 3
+        ]
+        if not array_names:
+            raise ValueError(
+                f"{path.name} holds no array of numbers{f' besides {excluded_name!r}' if excluded_name else ''}."
+            )
+        if len(array_names) > 1:
+            names_with_shapes = names_text(
+                [f"{listed_name} ({' × '.join(map(str, shapes_by_name[listed_name]))})" for listed_name in array_names]
+            )
+            raise ValueError(
+                f"{path.name}: arrays of numbers are {names_with_shapes}. Name that of the frames by key=."
+            )
+        array_name = array_names[0]
+    if array_name not in shapes_by_name:
         raise ValueError(
-            f"key: {path.name} has no array {name!r}{did_you_mean(name, sizes)}; it has {names_text(sizes)}."
+            f"key: {path.name} has no array {array_name!r}{did_you_mean(array_name, shapes_by_name)}; it has "
+            f"{names_text(shapes_by_name)}."
         )
     if path.suffix.lower() == ".npz":
-        return np.atleast_2d(npz_arrays(path, name)[name]), axis
-    table = matlab.numbers(matlab.load(path, name), name, path)
-    return table.reshape(-1, 1) if 1 in table.shape else table, axis
+        return np.atleast_2d(npz_arrays(path, array_name)[array_name]), usual_frame_axis
+    number_array = matlab.numbers(matlab.load(path, array_name), array_name, path)
+    return number_array.reshape(-1, 1) if 1 in number_array.shape else number_array, usual_frame_axis
 
 
-def _protocols(number: int) -> Iterator[dict[str, Any]]:
-    """Yield the table `[protocol]` of every common protocol for `number` electrodes."""
+def _common_protocol_tables(num_electrodes: int) -> Iterator[dict[str, Any]]:
+    """Yield the table `[protocol]` of every common protocol for `num_electrodes` electrodes."""
     shared_options = {"driven_electrodes": (False, True), "order": ("rotating", "fixed")}
-    for kind, options in (
+    for protocol_kind, option_choices in (
         ("adjacent", {**shared_options, "reciprocal": ("all", "half")}),
         ("two_terminal", {}),
         ("opposite", {**shared_options, "drives": ("distinct", "all")}),
-        *(("skip", {"skipped": (skipped,), **shared_options}) for skipped in range(1, number // 2)),
+        *(("skip", {"skipped": (num_skipped,), **shared_options}) for num_skipped in range(1, num_electrodes // 2)),
     ):
-        for values in product(*options.values()):
-            defaults = {"driven_electrodes": False, "reciprocal": "all", "drives": "distinct"}
-            table_entries = {
-                key: value for key, value in zip(options, values, strict=True) if defaults.get(key) != value
+        for option_values in product(*option_choices.values()):
+            default_options = {"driven_electrodes": False, "reciprocal": "all", "drives": "distinct"}
+            option_entries = {
+                option_name: option_value
+                for option_name, option_value in zip(option_choices, option_values, strict=True)
+                if default_options.get(option_name) != option_value
             }
-            yield {"kind": kind, "number": number, **table_entries}
+            yield {"kind": protocol_kind, "number": num_electrodes, **option_entries}
 
 
 def fitting_candidates(
@@ -224,77 +286,106 @@ def fitting_candidates(
     current: float,
 ) -> Iterator[Candidate]:
     """Yield candidates whose number of channels fits the file and its reference; of equal protocols, only the first."""
-    counts, yielded_protocols = set(numbers.sizes), set()
-    for number in [known_options["number"]] if "number" in known_options else range(MIN_ELECTRODES, MAX_ELECTRODES + 1):
-        if not any(number * (number - 4) / 4 <= count <= number**2 for count in counts):
+    possible_counts, yielded_protocols = set(numbers.sizes), set()
+    for num_electrodes in (
+        [known_options["number"]] if "number" in known_options else range(MIN_ELECTRODES, MAX_ELECTRODES + 1)
+    ):
+        if not any(
+            num_electrodes * (num_electrodes - 4) / 4 <= num_channels <= num_electrodes**2
+            for num_channels in possible_counts
+        ):
             continue
-        description, unsuitable_counts = None, set()
-        for table in _protocols(number):
-            if any(table.get(key, value) != value for key, value in known_options.items()):
+        description, unsuitable_options = None, set()
+        for protocol_table in _common_protocol_tables(num_electrodes):
+            if any(
+                protocol_table.get(option_name, option_value) != option_value
+                for option_name, option_value in known_options.items()
+            ):
                 continue
-            options_of_count = tuple((key, value) for key, value in table.items() if key != "order")
-            if options_of_count in unsuitable_counts:
+            options_without_order = tuple(
+                (option_name, option_value)
+                for option_name, option_value in protocol_table.items()
+                if option_name != "order"
+            )
+            if options_without_order in unsuitable_options:
                 continue
-            protocol = _protocol({**table, "current": current}, numbers.path)
-            count = 0 if protocol is None else protocol.num_measurements
-            if protocol is None or count not in counts or count < _MIN_CHANNELS_PER_ELECTRODE * number:
-                unsuitable_counts.add(options_of_count)
+            protocol = _parse_protocol({**protocol_table, "current": current}, numbers.path)
+            num_channels = 0 if protocol is None else protocol.num_measurements
+            if (
+                protocol is None
+                or num_channels not in possible_counts
+                or num_channels < _MIN_CHANNELS_PER_ELECTRODE * num_electrodes
+            ):
+                unsuitable_options.add(options_without_order)
                 continue
-            patterns = (np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement))
-            protocol_key = number, *(pattern.tobytes() for pattern in patterns)
+            channel_patterns = (np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement))
+            protocol_key = num_electrodes, *(channel_pattern.tobytes() for channel_pattern in channel_patterns)
             if protocol_key in yielded_protocols:
                 continue
             yielded_protocols.add(protocol_key)
-            description = description or _describe_body(geometry, electrodes, table, current)
-            num_frames, measurement = _create_measurement(numbers, description, protocol)
+            description = description or _description_of_body(geometry, electrodes, protocol_table, current)
+            num_frames, measurement = _measurement_of_file(numbers, description, protocol)
             reference_measurement = (
                 measurement
                 if reference_numbers is numbers
-                else _create_measurement(reference_numbers, description, protocol)[1]
+                else _measurement_of_file(reference_numbers, description, protocol)[1]
             )
             if measurement is not None and reference_measurement is not None:
                 empty_frame = reference_measurement.mean_frame()
                 deviation_of_rows = relative_deviation(np.asarray(reference_measurement.filled()))
-                yield Candidate(table, num_frames, deviation_of_rows, reciprocity_error(empty_frame), empty_frame)
+                yield Candidate(
+                    protocol_table, num_frames, deviation_of_rows, reciprocity_error(empty_frame), empty_frame
+                )
 
 
 def channel_counts(known_options: dict) -> list[int]:
     """Numbers of channels of protocols that have the `known_options` entries; empty without the number of
     electrodes."""
-    tables = _protocols(known_options["number"]) if "number" in known_options else ()
+    protocol_tables = _common_protocol_tables(known_options["number"]) if "number" in known_options else ()
     fitting_tables = [
-        table for table in tables if all(table.get(key, value) == value for key, value in known_options.items())
+        protocol_table
+        for protocol_table in protocol_tables
+        if all(
+            protocol_table.get(option_name, option_value) == option_value
+            for option_name, option_value in known_options.items()
+        )
     ]
-    protocols = [_protocol({**table, "current": 1.0}, Path("a")) for table in fitting_tables]
+    protocols = [_parse_protocol({**protocol_table, "current": 1.0}, Path("a")) for protocol_table in fitting_tables]
     return sorted({protocol.num_measurements for protocol in protocols if protocol is not None})
 
 
-def _describe_body(geometry: dict, electrodes: dict, protocol: dict, current: float) -> Description:
-    places = {"contact_impedance": 1.0, **electrodes, "number": protocol["number"]}
-    tables = {"geometry": geometry, "electrodes": places, "protocol": {**protocol, "current": current}}
-    return parse_description(tables, "the description")
+def _description_of_body(geometry: dict, electrodes: dict, protocol_table: dict, current: float) -> Description:
+    electrode_entries = {"contact_impedance": 1.0, **electrodes, "number": protocol_table["number"]}
+    description_tables = {
+        "geometry": geometry,
+        "electrodes": electrode_entries,
+        "protocol": {**protocol_table, "current": current},
+    }
+    return parse_description(description_tables, "the description")
 
 
-def _protocol(table: dict, path: Path) -> Protocol | None:
-    """The protocol of a description's table `[protocol]`; None if the protocol has no channels."""
+def _parse_protocol(protocol_table: dict, path: Path) -> Protocol | None:
+    """Create the protocol of a table `[protocol]` of a description; return None if the protocol has no channels."""
     try:
-        return parse_description({"protocol": table}, "the description").protocol(path)
+        return parse_description({"protocol": protocol_table}, "the description").protocol(path)
     except ValueError:  # none of its channels is left, or there are too few electrodes
         return None
 
 
-def _create_measurement(
-    numbers: FileNumbers, description: Description, protocol: Protocol
+def _measurement_of_file(
+    file_numbers: FileNumbers, description: Description, protocol: Protocol
 ) -> tuple[int, Measurement | None]:
-    """Number of frames of a file with `protocol`, and at most `_MAX_FRAMES` of them as a measurement; None if the
-    numbers do not fit the protocol."""
+    """Return the number of frames of a file read with `protocol`, and at most `_MAX_COMPARED_FRAMES` of them as a
+    measurement; None if the numbers do not fit the protocol."""
     try:
-        frames = numbers.frames([protocol.num_measurements])
-        if frames.table.shape[1] != protocol.num_measurements:
+        frame_table = file_numbers.frames([protocol.num_measurements])
+        if frame_table.table.shape[1] != protocol.num_measurements:
             return 0, None
-        num_frames = len(frames.table)
-        chosen = np.unique(np.linspace(0, num_frames - 1, _MAX_FRAMES).round().astype(int))
-        selected_frames = frames._replace(table=frames.table[chosen], times=None)
-        return num_frames, create_measurement_of_frames(numbers.path, description, selected_frames, [(protocol, "")])
+        num_frames = len(frame_table.table)
+        chosen_frames = np.unique(np.linspace(0, num_frames - 1, _MAX_COMPARED_FRAMES).round().astype(int))
+        selected_frames = frame_table._replace(table=frame_table.table[chosen_frames], times=None)
+        return num_frames, create_measurement_of_frames(
+            file_numbers.path, description, selected_frames, [(protocol, "")]
+        )
     except ValueError:
         return 0, None

@@ -46,21 +46,20 @@ def naming_frame_in_errors(measurement: Measurement, number: int) -> Iterator[No
     try:
         yield
     except ValueError as error:
-        name = f"'{measurement.name}'"
-        named = re.compile(f"(?<!reference ){re.escape(name)}")
-        if measurement.num_frames < 2 or not named.search(str(error)):
+        quoted_name = f"'{measurement.name}'"
+        name_pattern = re.compile(f"(?<!reference ){re.escape(quoted_name)}")
+        if measurement.num_frames < 2 or not name_pattern.search(str(error)):
             raise
-        raise ValueError(named.sub(lambda _: f"{name}, frame {number}", str(error), count=1)) from error
+        raise ValueError(name_pattern.sub(lambda _: f"{quoted_name}, frame {number}", str(error), count=1)) from error
 
 
 # Minimum share of a voltage difference that is assumed to remain unexplained by any model.
 _MIN_UNEXPLAINED_SHARE = 0.03
-# Factor by which the share of the voltage difference that the model does not explain is larger for images with sharp
-# outlines.
-_SHARP_OUTLINE_NOISE_FACTOR = 3.0
+# Factor by which the unexplained share of the voltage difference is larger for images with sharp outlines.
+_SHARP_OUTLINE_FACTOR = 3.0
 # Relative standard deviation, due to the discretisation, of the strengths of fitted bodies in a sheet and in a solid:
 # the cells of a solid are coarse relative to the bodies. Estimated on 23 bodies in simulated boxes and cylinders.
-_DISCRETISATION_DEVIATION = {2: 0.0, 3: 0.03}
+_DISCRETISATION_ERROR = {2: 0.0, 3: 0.03}
 # Misfit of an electrode, relative to that of the other electrodes, above which the electrode counts as unlike the
 # others. In sound tanks the ratio was at most 2.6.
 _MIN_UNLIKE_ELECTRODE_MISFIT = 3.0
@@ -119,8 +118,8 @@ class PreparedDifference:
     def doubts(self) -> tuple[str, ...]:
         """Reasons to doubt the data, in sentences: too few channels, noise, an implausible background, exchanged
         frames."""
-        data = self.measurement, self.reference, self.calibration, self.quality
-        return tuple(doubts_of_data(*data, self.electrode_change))
+        checked_data = self.measurement, self.reference, self.calibration, self.quality
+        return tuple(doubts_of_data(*checked_data, self.electrode_change))
 
     @property
     def uncertainty(self) -> Uncertainty:
@@ -134,7 +133,7 @@ class PreparedDifference:
         electrode."""
         noise = relative_noise(np.asarray(self.reference.voltages)[0], self.mask)
         is_measuring_electrode = np.asarray(self.model.protocol.channel_measurement) != 0
-        return as_array(noise * np.max(np.where(is_measuring_electrode, self._electrode_weights, 1), axis=1))
+        return as_array(noise * np.max(np.where(is_measuring_electrode, self._electrode_noise_factors, 1), axis=1))
 
     @property
     def unlike_electrodes(self) -> dict[int, float]:
@@ -143,20 +142,20 @@ class PreparedDifference:
         electrodes may be loose or displaced, or their gain may differ. Channels that measure on these electrodes have
         less weight."""
         return {
-            int(electrode): float(self._electrode_weights[electrode])
-            for electrode in np.flatnonzero(self._electrode_weights > 1)
+            int(electrode): float(self._electrode_noise_factors[electrode])
+            for electrode in np.flatnonzero(self._electrode_noise_factors > 1)
         }
 
     @functools.cached_property
-    def _electrode_weights(self) -> Float[np.ndarray, " L"]:
+    def _electrode_noise_factors(self) -> Float[np.ndarray, " L"]:
         """Relative misfit (L,) of each unlike electrode, by which the noise of its channels is multiplied; 1 for all
         other electrodes."""
         reference_voltages = np.asarray(self.reference.voltages)[0]
-        residual = np.asarray(self.calibration.voltages) - reference_voltages
-        misfits = electrode_misfits(
-            self.model.protocol, residual, relative_noise(reference_voltages, self.mask), self.mask
+        reference_residual = np.asarray(self.calibration.voltages) - reference_voltages
+        relative_misfits = electrode_misfits(
+            self.model.protocol, reference_residual, relative_noise(reference_voltages, self.mask), self.mask
         )
-        return np.where(misfits > _MIN_UNLIKE_ELECTRODE_MISFIT, misfits, 1)
+        return np.where(relative_misfits > _MIN_UNLIKE_ELECTRODE_MISFIT, relative_misfits, 1)
 
     @property
     def noise(self) -> float | None:
@@ -164,7 +163,7 @@ class PreparedDifference:
         `relative_noise`; None if the noise is not known."""
         if self.quality.trusted_noise is None:
             return None
-        relative_rounding = np.asarray(self._rounding)[self.mask] / np.asarray(self.relative_noise)[self.mask]
+        relative_rounding = np.asarray(self._rounding_deviation)[self.mask] / np.asarray(self.relative_noise)[self.mask]
         return float(np.hypot(self.quality.trusted_noise, np.sqrt(np.mean(relative_rounding**2))))
 
     @property
@@ -175,18 +174,18 @@ class PreparedDifference:
 
         If the noise is not known, 0.1 of the difference is used as noise, at most 1 in units of `relative_noise`.
         """
-        return self._noise_with_error_share(max(self._misfit, _MIN_UNEXPLAINED_SHARE))
+        return self._noise_with_error_share(max(self._reference_misfit, _MIN_UNEXPLAINED_SHARE))
 
     @property
     def sharp_noise(self) -> Float[Array, " M"]:
         """`modelled_noise` for bodies with sharp outlines, volts. The model error in it is three times larger, since
         bodies with sharp outlines, unlike smooth images, cannot adapt to model errors."""
-        return self._noise_with_error_share(_SHARP_OUTLINE_NOISE_FACTOR * max(self._misfit, _MIN_UNEXPLAINED_SHARE))
+        return self._noise_with_error_share(_SHARP_OUTLINE_FACTOR * max(self._reference_misfit, _MIN_UNEXPLAINED_SHARE))
 
     @property
     def common_change(self) -> Float[np.ndarray, " M"]:
         """The part of `difference` (M,), volts, that is a factor common to all voltages, as of a bath that has become
-        warmer or of a gain that has drifted; 0 if it is not most of the difference."""
+        warmer or of a gain that has drifted; 0 if this part is not most of the difference."""
         return self.quality.common_factor * np.where(self.mask, np.asarray(self.reference.voltages)[0], 0)
 
     def with_noise_from(self, misfit: float, noise_share: float | None = None) -> PreparedDifference:
@@ -194,34 +193,36 @@ class PreparedDifference:
         the noise is not known and the misfit exceeds 1. `noise_share`: see `FrameQuality`; default: from the misfit."""
         if self.noise is not None or misfit <= 1:
             return self
-        relative_noise, is_used = np.asarray(self.relative_noise), np.asarray(self.mask)
-        unexplained = misfit * np.sqrt(np.mean((np.asarray(self.modelled_noise) / relative_noise)[is_used] ** 2))
-        change = np.asarray(self.difference) - self.common_change
-        size = float(np.sqrt(np.mean(np.abs(change / relative_noise)[is_used] ** 2)))
-        quality = replace(
+        relative_noise, usable_channels = np.asarray(self.relative_noise), np.asarray(self.mask)
+        unexplained_noise = misfit * np.sqrt(
+            np.mean((np.asarray(self.modelled_noise) / relative_noise)[usable_channels] ** 2)
+        )
+        change_without_common = np.asarray(self.difference) - self.common_change
+        difference_rms = float(np.sqrt(np.mean(np.abs(change_without_common / relative_noise)[usable_channels] ** 2)))
+        updated_quality = replace(
             self.quality,
-            trusted_noise=float(unexplained),
-            noise_share=min(1.0, float(unexplained) / size if noise_share is None else noise_share),
+            trusted_noise=float(unexplained_noise),
+            noise_share=min(1.0, float(unexplained_noise) / difference_rms if noise_share is None else noise_share),
             noise_source="what the image leaves unexplained",
         )
-        return replace(self, quality=quality)
+        return replace(self, quality=updated_quality)
 
     @functools.cached_property
     def electrode_changes(self) -> ElectrodeChanges | None:
         """Estimator of changes of electrodes on the edge of a sheet; None for other electrodes and complex voltages."""
         if np.iscomplexobj(self.difference):
             return None
-        noise, background = np.asarray(self.relative_noise), float(self.calibration.conductivity)
-        return ElectrodeChanges.on_edge(self.model, background, noise, np.asarray(self.mask))
+        channel_noise, background_conductivity = np.asarray(self.relative_noise), float(self.calibration.conductivity)
+        return ElectrodeChanges.on_edge(self.model, background_conductivity, channel_noise, np.asarray(self.mask))
 
     def without_electrode_change(self) -> PreparedDifference:
         """Copy of the difference without the part that a change of the electrodes explains, if that is a large part."""
         estimator, difference = self.electrode_changes, np.asarray(self.difference)
         if estimator is None or (change := estimator.find(difference)) is None:
             return self
-        rest = as_array(difference - change.voltages)
-        quality = self.quality.of_rest(change.rest)
-        return replace(self, difference=rest, quality=quality, electrode_change=change)
+        remaining_difference = as_array(difference - change.voltages)
+        remaining_quality = self.quality.of_rest(change.rest)
+        return replace(self, difference=remaining_difference, quality=remaining_quality, electrode_change=change)
 
     @functools.cached_property
     def accuracy(self) -> Accuracy:
@@ -233,17 +234,19 @@ class PreparedDifference:
         """
         model_error = self.calibration.model_error
         if model_error is None:  # the described positions are uncertain even if they explain the reference
-            reference = np.asarray(self.reference.voltages)[0]
-            deviation = self.uncertainty.position_on(self.mesh)
-            placement = estimated_positions(self.model, reference, self.mask, deviation)
+            reference_voltages = np.asarray(self.reference.voltages)[0]
+            position_deviation = self.uncertainty.position_on(self.mesh)
+            placement = estimated_positions(self.model, reference_voltages, self.mask, position_deviation)
             model_error = placement and placement.error
         uncertainty = self.uncertainty
         model_error = model_error and model_error._replace(drift=uncertainty.drift)
-        share = max(self._misfit, uncertainty.other)
-        strength = float(np.hypot(self._field_error, _DISCRETISATION_DEVIATION[self.mesh.dimension]))
+        error_share = max(self._reference_misfit, uncertainty.other)
+        strength_error = float(np.hypot(self._field_error, _DISCRETISATION_ERROR[self.mesh.dimension]))
         # How far electrodes move does not depend on how well their positions in the reference are known.
-        movement = Uncertainty().position_on(self.mesh)
-        return Accuracy(self._noise_with_error_share(share), model_error, uncertainty.size, strength, movement)
+        shift_deviation = Uncertainty().position_on(self.mesh)
+        return Accuracy(
+            self._noise_with_error_share(error_share), model_error, uncertainty.size, strength_error, shift_deviation
+        )
 
     @property
     def modelled_share(self) -> float:
@@ -254,39 +257,43 @@ class PreparedDifference:
         )
         return 1 - (0 if self.noise is None else self.noise**2 / float(np.mean(sharp_to_smooth_noise_ratios**2)))
 
-    def _noise_with_error_share(self, share: float) -> Float[Array, " M"]:
-        """Root of the sum of squares of noise, rounding, and an error that is a `share` of the measured difference,
+    def _noise_with_error_share(self, error_share: float) -> Float[Array, " M"]:
+        """Root of the sum of squares of noise, rounding, and a share of the measured difference,
         volts."""
-        relative_noise, is_used = np.asarray(self.relative_noise), np.asarray(self.mask)
-        change = self.electrode_change
-        change_due_to_electrodes, relative_error = (
-            (np.zeros(len(is_used)), 0.0) if change is None else (change.voltages, change.relative_error)
+        relative_noise, usable_channels = np.asarray(self.relative_noise), np.asarray(self.mask)
+        electrode_change = self.electrode_change
+        change_due_to_electrodes, change_error_share = (
+            (np.zeros(len(usable_channels)), 0.0)
+            if electrode_change is None
+            else (electrode_change.voltages, electrode_change.relative_error)
         )
-        relative_size, electrode_size = (
-            np.sqrt(np.mean(np.abs(voltages[is_used] / relative_noise[is_used]) ** 2))
+        difference_rms, electrode_change_rms = (
+            np.sqrt(np.mean(np.abs(voltages[usable_channels] / relative_noise[usable_channels]) ** 2))
             for voltages in (np.asarray(self.difference) + change_due_to_electrodes, change_due_to_electrodes)
         )
-        noise = min(1.0, 0.1 * relative_size) if self.noise is None else self.quality.trusted_noise
-        error = np.hypot(share * relative_size, relative_error * electrode_size)
-        return as_array(np.hypot(relative_noise * np.hypot(noise, error), self._rounding))
+        noise_level = min(1.0, 0.1 * difference_rms) if self.noise is None else self.quality.trusted_noise
+        error_level = np.hypot(error_share * difference_rms, change_error_share * electrode_change_rms)
+        return as_array(np.hypot(relative_noise * np.hypot(noise_level, error_level), self._rounding_deviation))
 
     @functools.cached_property
-    def _misfit(self) -> float:
+    def _reference_misfit(self) -> float:
         """Relative misfit of the model to the reference, with equally weighted channels or with channels weighted by
         their noise, whichever misfit is smaller."""
-        reference = np.asarray(self.reference.voltages)[0], np.asarray(self.reference.mask)[0]
-        return min(float(self.calibration.misfit), relative_misfit(self.calibration.voltages, *reference))
+        voltages_and_mask = np.asarray(self.reference.voltages)[0], np.asarray(self.reference.mask)[0]
+        return min(float(self.calibration.misfit), relative_misfit(self.calibration.voltages, *voltages_and_mask))
 
     @property
     def _field_error(self) -> float:
         """Relative error of the model's fields: the part of the misfit of the reference that noise does not explain."""
-        measured, is_used = np.asarray(self.reference.voltages)[0], np.asarray(self.mask)
-        size = np.sqrt(np.mean(np.abs(measured[is_used] / np.asarray(self.relative_noise)[is_used]) ** 2))
-        noise = 0.0 if self.noise is None else self.noise / np.sqrt(2) / size
-        return float(np.sqrt(max(self._misfit**2 - noise**2, 0.0)))
+        reference_voltages, usable_channels = np.asarray(self.reference.voltages)[0], np.asarray(self.mask)
+        reference_rms = np.sqrt(
+            np.mean(np.abs(reference_voltages[usable_channels] / np.asarray(self.relative_noise)[usable_channels]) ** 2)
+        )
+        noise_share = 0.0 if self.noise is None else self.noise / np.sqrt(2) / reference_rms
+        return float(np.sqrt(max(self._reference_misfit**2 - noise_share**2, 0.0)))
 
     @functools.cached_property
-    def _rounding(self) -> Float[np.ndarray, " M"]:
+    def _rounding_deviation(self) -> Float[np.ndarray, " M"]:
         """Standard deviation of the rounding of the difference, volts."""
         return rounding_of_difference(self.measurement, self.reference)
 
@@ -322,28 +329,28 @@ def prepare_difference(
     ```
     """
     clock = StepTimer(None) if clock is None else clock
-    frame_data, reference_frame = select_frames(measurement, reference, frame)
-    number = selected_frame_number(measurement, frame)
-    with clock("check"), naming_frame_in_errors(measurement, number):
-        check_same_setup(frame_data, reference_frame)
+    imaged_frame, reference_frame = select_frames(measurement, reference, frame)
+    frame_number = selected_frame_number(measurement, frame)
+    with clock("check"), naming_frame_in_errors(measurement, frame_number):
+        check_same_setup(imaged_frame, reference_frame)
         if not as_is:
-            frame_data = mask_spikes(frame_data, reference_frame)
+            imaged_frame = mask_spikes(imaged_frame, reference_frame)
             reference_frame = replace(
-                reference_frame, mask=as_array(np.asarray(reference_frame.mask) & np.asarray(frame_data.mask))
+                reference_frame, mask=as_array(np.asarray(reference_frame.mask) & np.asarray(imaged_frame.mask))
             )
-        (quality,) = assess(frame_data, reference_frame)
-        domain, electrodes = body_of(frame_data, reference_frame)
+        (quality,) = assess(imaged_frame, reference_frame)
+        domain, electrodes = body_of(imaged_frame, reference_frame)
         reference_frame = (
             reference_frame
-            if frame_data.uncertainty is None
-            else replace(reference_frame, uncertainty=frame_data.uncertainty)
+            if imaged_frame.uncertainty is None
+            else replace(reference_frame, uncertainty=imaged_frame.uncertainty)
         )
-        usable = np.asarray(frame_data.mask)[0] & np.asarray(reference_frame.mask)[0]
-        difference = as_array(
-            np.where(usable, np.asarray(frame_data.voltages)[0] - np.asarray(reference_frame.voltages)[0], 0)
+        usable_channels = np.asarray(imaged_frame.mask)[0] & np.asarray(reference_frame.mask)[0]
+        voltage_difference = as_array(
+            np.where(usable_channels, np.asarray(imaged_frame.voltages)[0] - np.asarray(reference_frame.voltages)[0], 0)
         )
-        if not as_is and (exchange_message := exchanges_message(frame_data, reference_frame)):
-            raise ValueError(f"'{frame_data.name}' does not fit its reference: {exchange_message}")
+        if not as_is and (exchange_message := exchanges_message(imaged_frame, reference_frame)):
+            raise ValueError(f"'{imaged_frame.name}' does not fit its reference: {exchange_message}")
     with clock("mesh"):
         model = described_model(domain, electrodes, reference_frame.protocol, num_points)
     with clock("wiring"):
@@ -353,20 +360,20 @@ def prepare_difference(
         if wiring.explanation or quality.imageable:
             check_wiring(wiring, reference_frame, as_is)
         if not quality.imageable:
-            with naming_frame_in_errors(measurement, number):
-                raise ValueError(f"'{frame_data.name}' cannot be imaged: {quality.reason}")
+            with naming_frame_in_errors(measurement, frame_number):
+                raise ValueError(f"'{imaged_frame.name}' cannot be imaged: {quality.reason}")
     calibration, contact_method = calibrated_model(model, reference_frame, contact=contact, clock=clock)
     prepared = PreparedDifference(
-        frame_data,
+        imaged_frame,
         reference_frame,
         quality,
         domain,
         contact_method,
         wiring,
         calibration,
-        difference,
-        usable,
-        number,
+        voltage_difference,
+        usable_channels,
+        frame_number,
         measurement.num_frames,
     )
     return prepared if as_is else prepared.without_electrode_change()
@@ -400,8 +407,8 @@ def select_frames(
         _, reference = measurement.split_reference()
     if "reference" in reference.frame_names and reference.num_frames > 1:
         _, reference = reference.split_reference()
-    frame_data = measurement.frame(selected_frame_number(measurement, frame))
-    return frame_data, converted_to_protocol(reference.mean_frame(), frame_data)
+    imaged_frame = measurement.frame(selected_frame_number(measurement, frame))
+    return imaged_frame, converted_to_protocol(reference.mean_frame(), imaged_frame)
 
 
 def check_measurement(name: str, given: Measurement) -> None:
@@ -430,11 +437,11 @@ def body_of(measurement: Measurement, reference: Measurement) -> tuple[Body, Abs
             f"'{measurement.name}' does not say what it was measured on: give a description with {missing_table} "
             "(a TOML file beside the data, or description=)."
         )
-    position = (measurement.uncertainty or reference.uncertainty or Uncertainty()).position
+    position_deviation = (measurement.uncertainty or reference.uncertainty or Uncertainty()).position
     x_min, x_max, y_min, y_max = domain.extent
-    if position is not None and position >= (width := max(x_max - x_min, y_max - y_min)):
+    if position_deviation is not None and position_deviation >= (body_width := max(x_max - x_min, y_max - y_min)):
         raise ValueError(
-            f"'{measurement.name}': [uncertainty] position is {position:.3g} m, and the body is {width:.3g} m wide; "
-            "give the standard deviation of the electrodes' positions, in metres."
+            f"'{measurement.name}': [uncertainty] position is {position_deviation:.3g} m, and the body is "
+            f"{body_width:.3g} m wide; give the standard deviation of the electrodes' positions, in metres."
         )
     return domain, electrodes

@@ -39,13 +39,14 @@ from jeit.mesh import Mesh
 from jeit_solvers.engines import as_array
 
 # Number of frames imaged at once, and number of bytes of a stored value.
-_FRAMES_PER_BATCH, _VALUE_BYTES = 256, 4
-# Minimum share of the frames with a valid value of a channel for the channel to be used.
-_MIN_FRAME_SHARE = 0.5
-# Number of frames, those that differ most from the reference, among which one that can be imaged is searched.
-_NUM_CANDIDATE_FRAMES = 10
-# Number of frames, those that differ most from the reference, among which moved electrodes are searched for.
-_NUM_SEARCHED_FRAMES = 1000
+_FRAMES_PER_BATCH, _BYTES_PER_VALUE = 256, 4
+# Minimum share of the frames in which a channel must be valid for the channel to be used.
+_MIN_USABLE_FRAME_SHARE = 0.5
+# Maximum number of frames that are assessed, in order of decreasing difference from the reference, until one can be
+# imaged.
+_MAX_ASSESSED_FRAMES = 10
+# Maximum number of frames, those that differ most from the reference, in which moved electrodes are searched for.
+_MAX_SEARCHED_FRAMES = 1000
 
 
 @dataclass(frozen=True)
@@ -117,11 +118,12 @@ def image_sequence(
     - `progress`: function called with the name of each step when the step begins.
 
     Spikes in single channels are replaced by values that other channels determine (`jeit.data.mask_spikes`). Channels
-    missing in more than half of the frames are not used; frames that lack any of the used channels are refused. So are
-    frames whose noise hides every change or is that of one electrode, as by `jeit.inverse.stream`, and frames that
-    cannot be imaged (`jeit.data.check_imageable`) and differ more from the reference than all that can. The images need
-    four bytes per cell and frame. Raises `ValueError` in the same cases as `image_difference`, for a measurement with
-    one frame, for an iterative method, and for images that would not fit in memory.
+    missing in more than half of the frames are not used; frames that lack any of the used channels are refused. Frames
+    whose noise hides every change or is caused by one electrode are also refused, as by `jeit.inverse.stream`. So are
+    frames that cannot be imaged (`jeit.data.check_imageable`) and differ more from the reference than all frames that
+    can be imaged. The images need four bytes per cell and frame. Raises `ValueError` in the same cases as
+    `image_difference`, for a measurement with one frame, for an iterative method, and for images that would not fit in
+    memory.
 
     **Example:**
 
@@ -133,59 +135,68 @@ def image_sequence(
     check_real(measurement)
     if measurement.num_frames < 2:
         raise ValueError(f"'{measurement.name}' has {measurement.num_frames} frame; a series takes two at least.")
-    times = np.arange(measurement.num_frames) if measurement.times is None else np.asarray(measurement.times)
+    frame_times = np.arange(measurement.num_frames) if measurement.times is None else np.asarray(measurement.times)
     settings = as_settings(settings)
     if settings.method == AUTO:
         settings = replace(settings, method="one-step")
-    clock = StepTimer(progress)
+    step_timer = StepTimer(progress)
     if reference is None and "reference" not in measurement.frame_names:
         reference = measurement.mean_frame()
-    _, base = select_frames(measurement, reference)
-    check_same_setup(measurement, base)
+    _, reference_frame = select_frames(measurement, reference)
+    check_same_setup(measurement, reference_frame)
     if not settings.as_is:
-        measurement = mask_spikes(measurement, base, fill=True)
-    voltages, mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
-    expected_voltages = np.asarray(base.voltages)[0]
-    is_in_most_frames = (mask.mean(axis=0) >= _MIN_FRAME_SHARE) & np.asarray(base.mask)[0]
-    is_refused_frame = np.asarray(~mask[:, is_in_most_frames].all(axis=1))
-    reasons = dict.fromkeys(map(int, np.flatnonzero(is_refused_frame)), "It lacks channels that most frames have.")
-    if not is_in_most_frames.any() or is_refused_frame.all():
+        measurement = mask_spikes(measurement, reference_frame, fill=True)
+    measured_voltages, usable_channels = np.asarray(measurement.voltages), np.asarray(measurement.mask)
+    reference_voltages = np.asarray(reference_frame.voltages)[0]
+    usable_in_most_frames = (usable_channels.mean(axis=0) >= _MIN_USABLE_FRAME_SHARE) & np.asarray(
+        reference_frame.mask
+    )[0]
+    is_refused_frame = np.asarray(~usable_channels[:, usable_in_most_frames].all(axis=1))
+    refusal_reasons = dict.fromkeys(
+        map(int, np.flatnonzero(is_refused_frame)), "It lacks channels that most frames have."
+    )
+    if not usable_in_most_frames.any() or is_refused_frame.all():
         raise ValueError(f"'{measurement.name}': no channel is usable in most frames, or none has all of them.")
     if not settings.as_is:
-        noisy_frames = _noisy_frames(voltages - expected_voltages, is_in_most_frames & mask, base)
-        if len(reasons | noisy_frames) < measurement.num_frames:  # otherwise the error of the strongest frame is raised
-            reasons |= noisy_frames
-            is_refused_frame[list(reasons)] = True
-    total_change = np.abs(np.where(is_in_most_frames, voltages - expected_voltages, 0)).sum(axis=1)
-    if not is_in_most_frames.all():
-        measurement = measurement.masked(is_in_most_frames, "they are missing in most frames, or in the reference.")
-    frames_by_change = np.argsort(np.where(is_refused_frame, 1.0, -total_change), kind="stable")[
+        faulty_frames = _noisy_frames(
+            measured_voltages - reference_voltages, usable_in_most_frames & usable_channels, reference_frame
+        )
+        # If all frames are refused, the error of the frame with the largest change is raised later.
+        if len(refusal_reasons | faulty_frames) < measurement.num_frames:
+            refusal_reasons |= faulty_frames
+            is_refused_frame[list(refusal_reasons)] = True
+    total_voltage_change = np.abs(np.where(usable_in_most_frames, measured_voltages - reference_voltages, 0)).sum(
+        axis=1
+    )
+    if not usable_in_most_frames.all():
+        measurement = measurement.masked(usable_in_most_frames, "they are missing in most frames, or in the reference.")
+    frames_by_change = np.argsort(np.where(is_refused_frame, 1.0, -total_voltage_change), kind="stable")[
         : (~is_refused_frame).sum()
     ]
-    noisy_frames = {}
-    for number, frame_index in enumerate(map(int, frames_by_change[:_NUM_CANDIDATE_FRAMES])):
-        if not (reason := assess(measurement.frame(frame_index), base)[0].reason):
-            is_refused_frame[list(noisy_frames)] = True
-            reasons |= noisy_frames
-            frames_by_change = frames_by_change[number:]
+    faulty_frames = {}
+    for change_rank, frame_index in enumerate(map(int, frames_by_change[:_MAX_ASSESSED_FRAMES])):
+        if not (refusal_reason := assess(measurement.frame(frame_index), reference_frame)[0].reason):
+            is_refused_frame[list(faulty_frames)] = True
+            refusal_reasons |= faulty_frames
+            frames_by_change = frames_by_change[change_rank:]
             break
-        noisy_frames[frame_index] = f"{reason[0].upper()}{reason[1:]}"
+        faulty_frames[frame_index] = f"{refusal_reason[0].upper()}{refusal_reason[1:]}"
     largest_change_frame = int(frames_by_change[0])
     prepared = prepare_difference(
         measurement,
-        base,
+        reference_frame,
         frame=largest_change_frame,
         contact=settings.contact,
         num_points=settings.num_points,
         as_is=settings.as_is,
-        clock=clock,
+        clock=step_timer,
     )
     region_masks = {name: region(prepared.mesh) for name, region in (regions or {}).items()}
     num_frames, num_cells = measurement.num_frames, prepared.mesh.num_cells
     check_memory(
-        f"the images of '{measurement.name}', {num_frames} frames,", float(_VALUE_BYTES * num_frames * num_cells)
+        f"the images of '{measurement.name}', {num_frames} frames,", float(_BYTES_PER_VALUE * num_frames * num_cells)
     )
-    with clock("image"):
+    with step_timer("image"):
         reconstruction, _ = METHODS[settings.method].image(
             prepared, MethodOptions(settings.prior, settings.hyperparameter)
         )
@@ -193,48 +204,61 @@ def image_sequence(
             raise ValueError(
                 f"method: {settings.method} images frame by frame; take a linear one, or `jeit.inverse.stream`."
             )
-        changes, has_moved_electrodes = np.full((num_frames, num_cells), np.nan, np.float32), np.zeros(num_frames, bool)
-        changes_of_electrodes = None if settings.as_is else prepared.electrode_changes
-        raw_differences = np.where(
-            is_in_most_frames, voltages[frames_by_change[:_NUM_SEARCHED_FRAMES]] - expected_voltages, 0
+        conductivity_changes, has_moved_electrodes = (
+            np.full((num_frames, num_cells), np.nan, np.float32),
+            np.zeros(num_frames, bool),
         )
-        estimator = changes_of_electrodes and changes_of_electrodes.estimator_for(raw_differences)
+        electrode_changes = None if settings.as_is else prepared.electrode_changes
+        voltage_differences = np.where(
+            usable_in_most_frames, measured_voltages[frames_by_change[:_MAX_SEARCHED_FRAMES]] - reference_voltages, 0
+        )
+        change_estimator = electrode_changes and electrode_changes.estimator_for(voltage_differences)
         imaged_frames = np.flatnonzero(~is_refused_frame)
-        for start in range(0, len(imaged_frames), _FRAMES_PER_BATCH):
-            batch = imaged_frames[start : start + _FRAMES_PER_BATCH]
-            difference = np.where(is_in_most_frames, voltages[batch] - expected_voltages, 0)
-            if changes_of_electrodes is not None and estimator is not None:
-                change_due_to_electrodes = changes_of_electrodes.voltages(difference, estimator)
-                has_moved_electrodes[batch] = change_due_to_electrodes.any(axis=1)
-                difference = difference - change_due_to_electrodes
-            changes[batch] = np.asarray(reconstruction.image(as_array(difference)))
-    background = float(np.real(prepared.calibration.conductivity))
-    series = ImageSeries(prepared.mesh, changes, times, background, timed=measurement.times is not None)
+        for batch_start in range(0, len(imaged_frames), _FRAMES_PER_BATCH):
+            batch_frames = imaged_frames[batch_start : batch_start + _FRAMES_PER_BATCH]
+            batch_differences = np.where(usable_in_most_frames, measured_voltages[batch_frames] - reference_voltages, 0)
+            if electrode_changes is not None and change_estimator is not None:
+                change_due_to_electrodes = electrode_changes.voltages(batch_differences, change_estimator)
+                has_moved_electrodes[batch_frames] = change_due_to_electrodes.any(axis=1)
+                batch_differences = batch_differences - change_due_to_electrodes
+            conductivity_changes[batch_frames] = np.asarray(reconstruction.image(as_array(batch_differences)))
+    background_conductivity = float(np.real(prepared.calibration.conductivity))
+    series = ImageSeries(
+        prepared.mesh, conductivity_changes, frame_times, background_conductivity, timed=measurement.times is not None
+    )
     return ImagedSequence(
-        series, prepared, reconstruction, is_refused_frame, region_masks, has_moved_electrodes, reasons
+        series, prepared, reconstruction, is_refused_frame, region_masks, has_moved_electrodes, refusal_reasons
     )
 
 
 def _noisy_frames(
-    changes: Float[np.ndarray, "F M"], usable: Bool[np.ndarray, "F M"], reference: Measurement
+    voltage_changes: Float[np.ndarray, "F M"], usable_channels: Bool[np.ndarray, "F M"], reference: Measurement
 ) -> dict[int, str]:
-    """Numbers of the frames, from their changes (F, M) in volts, whose noise hides every change or is that of one
-    electrode, each with the reason to refuse it."""
-    protocol, expected_voltages = reference.protocol, np.asarray(reference.voltages)[0]
-    touching = np.array([protocol.channels_touching(electrode) for electrode in range(protocol.num_electrodes)])
-    pairs, ratios = map(np.asarray, protocol.reciprocal_pairs())
-    is_used = usable.any(axis=0)
-    noise = np.asarray(relative_noise(expected_voltages, as_array(is_used)))
-    check = FrameCheck(is_used, expected_voltages, touching, (pairs.reshape(-1, 2), ratios), noise)
+    """Find the frames whose noise hides every change or is caused by one electrode, from their `voltage_changes` (F, M)
+    in volts. Returns the number of each such frame with the reason to refuse it."""
+    protocol, reference_voltages = reference.protocol, np.asarray(reference.voltages)[0]
+    channels_at_electrodes = np.array(
+        [protocol.channels_touching(electrode) for electrode in range(protocol.num_electrodes)]
+    )
+    reciprocal_pairs, reciprocal_ratios = map(np.asarray, protocol.reciprocal_pairs())
+    is_used_channel = usable_channels.any(axis=0)
+    channel_noise = np.asarray(relative_noise(reference_voltages, as_array(is_used_channel)))
+    frame_check = FrameCheck(
+        is_used_channel,
+        reference_voltages,
+        channels_at_electrodes,
+        (reciprocal_pairs.reshape(-1, 2), reciprocal_ratios),
+        channel_noise,
+    )
     noise_judgements = (
-        check.check_noise_by_reciprocity(np.where(is_used, change, 0), is_used)
-        for change, is_used in zip(changes, usable, strict=True)
+        frame_check.check_noise_by_reciprocity(np.where(is_used_channel, voltage_change, 0), is_used_channel)
+        for voltage_change, is_used_channel in zip(voltage_changes, usable_channels, strict=True)
     )
     faulty_statuses = FrameStatus.REFUSED, FrameStatus.PARTIAL
     return {
-        number: reason.removesuffix(" Its channels are left out.")
-        for number, (_, status, reason) in enumerate(noise_judgements)
-        if status in faulty_statuses
+        frame_number: refusal_reason.removesuffix(" Its channels are left out.")
+        for frame_number, (_, frame_status, refusal_reason) in enumerate(noise_judgements)
+        if frame_status in faulty_statuses
     }
 
 
@@ -289,14 +313,16 @@ def image_frequencies(
     """
     check_measurement("second", second)
     check_measurement("first", first)
-    frame_data = second.frame(0 if frame is None else frame)
-    reference = first.mean_frame()
-    weight = frequency_weight(frame_data, reference) if weighted else 1.0
-    voltages = as_array(weight * np.asarray(reference.voltages))
+    second_frame = second.frame(0 if frame is None else frame)
+    first_frame = first.mean_frame()
+    voltage_weight = frequency_weight(second_frame, first_frame) if weighted else 1.0
+    scaled_voltages = as_array(voltage_weight * np.asarray(first_frame.voltages))
     scaled_reference = replace(
-        reference, voltages=voltages, name=f"{_weight_text(weight)} × {reference.name}" if weighted else reference.name
+        first_frame,
+        voltages=scaled_voltages,
+        name=f"{_weight_text(voltage_weight)} × {first_frame.name}" if weighted else first_frame.name,
     )
-    return ImagedFrequencies(image_difference(frame_data, scaled_reference, settings), complex(weight))
+    return ImagedFrequencies(image_difference(second_frame, scaled_reference, settings), complex(voltage_weight))
 
 
 def frequency_weight(second: Measurement, first: Measurement) -> float | complex:
@@ -321,17 +347,21 @@ def frequency_weight(second: Measurement, first: Measurement) -> float | complex
             f"second has {second_voltages.size} channels and first {first_voltages.size}; measure both with one "
             "protocol."
         )
-    is_used = np.asarray(second.mask)[0] & np.asarray(first.mask)[0]
-    weight = np.vdot(first_voltages[is_used], second_voltages[is_used]) / np.vdot(
-        first_voltages[is_used], first_voltages[is_used]
+    usable_channels = np.asarray(second.mask)[0] & np.asarray(first.mask)[0]
+    voltage_weight = np.vdot(first_voltages[usable_channels], second_voltages[usable_channels]) / np.vdot(
+        first_voltages[usable_channels], first_voltages[usable_channels]
     )
-    if not (np.isfinite(weight) and weight.real > 0):
+    if not (np.isfinite(voltage_weight) and voltage_weight.real > 0):
         raise ValueError(
-            f"second and first have nothing in common (α = {weight:.3g}); are they the same body at two frequencies, "
-            "with the polarity of the one that of the other?"
+            f"second and first have nothing in common (α = {voltage_weight:.3g}); are they the same body at two "
+            "frequencies, with the polarity of the one that of the other?"
         )
-    return weight.item()
+    return voltage_weight.item()
 
 
-def _weight_text(weight: float | complex) -> str:
-    return f"{weight.real:.3g}{weight.imag:+.3g}i" if isinstance(weight, complex) else f"{weight:.3g}"
+def _weight_text(voltage_weight: float | complex) -> str:
+    return (
+        f"{voltage_weight.real:.3g}{voltage_weight.imag:+.3g}i"
+        if isinstance(voltage_weight, complex)
+        else f"{voltage_weight:.3g}"
+    )

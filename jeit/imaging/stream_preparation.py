@@ -107,26 +107,29 @@ def prepare_imager(
     settings = StreamSettings() if settings is None else settings
     check_kind("settings", settings, StreamSettings, "StreamSettings, such as StreamSettings(solver='one-step')")
     check_measurement("reference", reference)
-    measured = reference if measurement is None else measurement
-    _, base = select_frames(measured, reference)
-    if not base.protocol.same_patterns(measured.protocol):
-        raise ValueError(f"'{measured.name}' was measured with another protocol than the reference '{base.name}'.")
-    check_real(measured)
-    check_real(base)
-    domain, electrodes = body_of(measured, base)
-    clock = StepTimer(progress)
-    with clock("mesh"):
+    imaged_measurement = reference if measurement is None else measurement
+    _, reference_frame = select_frames(imaged_measurement, reference)
+    if not reference_frame.protocol.same_patterns(imaged_measurement.protocol):
+        raise ValueError(
+            f"'{imaged_measurement.name}' was measured with another protocol than the reference "
+            f"'{reference_frame.name}'."
+        )
+    check_real(imaged_measurement)
+    check_real(reference_frame)
+    domain, electrodes = body_of(imaged_measurement, reference_frame)
+    step_timer = StepTimer(progress)
+    with step_timer("mesh"):
         mesh = imaging_mesh(domain, electrodes, settings.num_points, usual=DEFAULT_STREAM_NUM_POINTS)
-        model = ForwardModel(mesh, electrodes, base.protocol)
-    with clock("wiring"):
-        check_wiring(find_wiring(model, base), base, settings.as_is)
-    calibration, _ = calibrated_model(model, base, contact=settings.contact, clock=clock)
-    with clock("prepare"):
+        model = ForwardModel(mesh, electrodes, reference_frame.protocol)
+    with step_timer("wiring"):
+        check_wiring(find_wiring(model, reference_frame), reference_frame, settings.as_is)
+    calibration, _ = calibrated_model(model, reference_frame, contact=settings.contact, clock=step_timer)
+    with step_timer("prepare"):
         imager = Imager.create(
             calibration.model,
             calibration.conductivity,
-            reference=base.filled()[0],
-            mask=base.mask[0],
+            reference=reference_frame.filled()[0],
+            mask=reference_frame.mask[0],
             solver=settings.solver,
             prior=prior_for(settings.prior, domain),
             hyperparameter=settings.hyperparameter,
@@ -139,37 +142,45 @@ class ElectrodeChangeFilter:
     """Subtracts from the frames of a stream the part of their difference from the reference that moved electrodes
     explain.
 
-    Electrodes that moved are searched for in the first suspicious frame, in the second, the fourth, and so on, since a
-    search takes up to a second. Once they are found, their part is subtracted from every frame of which it explains
-    much. The other suspicious frames are searched further, as electrodes may move again.
+    Moved electrodes are searched for in the first, the second, the fourth suspicious frame and so on, since a search
+    takes up to a second. Once they are found, the voltage change that they explain is subtracted from every frame in
+    which it is a large part of the difference. The search continues in the other suspicious frames, as electrodes may
+    move again.
 
     `imager`, `calibration`: see `prepare_imager`.
     """
 
     def __init__(self, imager: Imager, calibration: Calibration):
-        noise, mask = np.asarray(imager.noise), np.asarray(imager.mask)
-        self._changes = ElectrodeChanges.on_edge(calibration.model, float(calibration.conductivity), noise, mask)
-        self._estimator: Float[np.ndarray, "p M"] | None = None
-        self._num_suspicious = 0
+        channel_noise, channel_mask = np.asarray(imager.noise), np.asarray(imager.mask)
+        self._electrode_changes = ElectrodeChanges.on_edge(
+            calibration.model, float(calibration.conductivity), channel_noise, channel_mask
+        )
+        self._change_estimator: Float[np.ndarray, "p M"] | None = None
+        self._num_suspicious_frames = 0
 
     def rest(self, state: StreamState, frame: Any) -> tuple[Any, ElectrodeChange | None]:
         """Return a `frame` without what moved electrodes explain of its difference from the reference of the `state`,
         and the change of the electrodes if it was found in this frame. A frame with a fault is returned as it is."""
-        changes, difference = self._changes, None if self._changes is None else _ordinary_change(state, frame)
-        if changes is None or difference is None:
+        electrode_changes, voltage_difference = (
+            self._electrode_changes,
+            None if self._electrode_changes is None else _fault_free_difference(state, frame),
+        )
+        if electrode_changes is None or voltage_difference is None:
             return frame, None
-        change_due_to_electrodes, change = np.zeros(len(difference)), None
-        if self._estimator is not None:
-            change_due_to_electrodes = changes.voltages(difference[None], self._estimator)[0]
-        if not change_due_to_electrodes.any() and changes.are_suspicious(difference[None])[0]:
-            self._num_suspicious += 1
-            is_power_of_two = self._num_suspicious.bit_count() == 1
-            new_estimator = changes.estimator(difference) if is_power_of_two else None
-            change = None if new_estimator is None else changes.find(difference, new_estimator)
-            if new_estimator is not None and change is not None:
-                self._estimator = new_estimator
-                change_due_to_electrodes = changes.voltages(difference[None], new_estimator)[0]
-        return np.asarray(frame) - change_due_to_electrodes, change
+        change_due_to_electrodes, electrode_change = np.zeros(len(voltage_difference)), None
+        if self._change_estimator is not None:
+            change_due_to_electrodes = electrode_changes.voltages(voltage_difference[None], self._change_estimator)[0]
+        if not change_due_to_electrodes.any() and electrode_changes.are_suspicious(voltage_difference[None])[0]:
+            self._num_suspicious_frames += 1
+            is_power_of_two = self._num_suspicious_frames.bit_count() == 1
+            new_estimator = electrode_changes.estimator(voltage_difference) if is_power_of_two else None
+            electrode_change = (
+                None if new_estimator is None else electrode_changes.find(voltage_difference, new_estimator)
+            )
+            if new_estimator is not None and electrode_change is not None:
+                self._change_estimator = new_estimator
+                change_due_to_electrodes = electrode_changes.voltages(voltage_difference[None], new_estimator)[0]
+        return np.asarray(frame) - change_due_to_electrodes, electrode_change
 
 
 def image_stream(
@@ -184,22 +195,22 @@ def image_stream(
     `imager`, `calibration`: see `prepare_imager`; `frames`: see `jeit.inverse.stream`; `found`: function called with
     the number of a frame and a change of the electrodes when it is found.
     """
-    state, electrode_changes = StreamState(imager), ElectrodeChangeFilter(imager, calibration)
-    for number, frame in enumerate(frames):
+    state, change_filter = StreamState(imager), ElectrodeChangeFilter(imager, calibration)
+    for frame_number, frame in enumerate(frames):
         start_time = time.perf_counter()
-        rest, change = electrode_changes.rest(state, frame)
-        if change is not None:
-            found(number, change)
-        seconds = time.perf_counter() - start_time
-        image = state.image(number, rest)
-        yield replace(image, latency=image.latency + seconds)
+        frame_without_change, electrode_change = change_filter.rest(state, frame)
+        if electrode_change is not None:
+            found(frame_number, electrode_change)
+        filter_seconds = time.perf_counter() - start_time
+        frame_image = state.image(frame_number, frame_without_change)
+        yield replace(frame_image, latency=frame_image.latency + filter_seconds)
 
 
-def _ordinary_change(state: StreamState, frame: object) -> Float[np.ndarray, " M"] | None:
+def _fault_free_difference(state: StreamState, frame: object) -> Float[np.ndarray, " M"] | None:
     """Change (M,) of a frame since the reference, volts, 0 in masked channels; None if the frame has a fault."""
-    values, usable, status, _ = state.check(frame)
-    is_fault_free = status == FrameStatus.IMAGED and usable is state.mask
-    return np.where(state.mask, values - state.expected, 0.0) if is_fault_free else None
+    frame_voltages, usable_channels, frame_status, _ = state.check(frame)
+    is_fault_free = frame_status == FrameStatus.IMAGED and usable_channels is state.mask
+    return np.where(state.mask, frame_voltages - state.expected, 0.0) if is_fault_free else None
 
 
 def described_reference(
@@ -213,8 +224,14 @@ def described_reference(
     """
     protocol = description.protocol(description.origin)
     if protocol is None or description.domain is None or description.electrodes is None:
-        sections = {"geometry": description.domain, "electrodes": description.electrodes, "protocol": protocol}
-        missing_sections = ", ".join(f"[{section}]" for section, value in sections.items() if value is None)
+        description_sections = {
+            "geometry": description.domain,
+            "electrodes": description.electrodes,
+            "protocol": protocol,
+        }
+        missing_sections = ", ".join(
+            f"[{section_name}]" for section_name, section_value in description_sections.items() if section_value is None
+        )
         raise ValueError(f"{description.origin}: images need {missing_sections} too; describe it.")
     return screen(
         frames,
@@ -246,11 +263,15 @@ def parse_frames(lines: Iterable[str]) -> Iterator[object]:
     """Parse a frame from each line that is not empty: voltages separated by spaces, commas or semicolons. A line that
     does not contain numbers is returned as text, and refused later."""
     for line in lines:
-        cells = line.strip().rstrip(",;").replace(";", ",").split(",")
-        words = line.split() if len(cells) == 1 else [cell.strip() or "nan" for cell in cells]
+        separated_values = line.strip().rstrip(",;").replace(";", ",").split(",")
+        value_texts = (
+            line.split()
+            if len(separated_values) == 1
+            else [separated_value.strip() or "nan" for separated_value in separated_values]
+        )
         if not line.strip():
             continue
         try:
-            yield [float(word) for word in words]
+            yield [float(value_text) for value_text in value_texts]
         except ValueError:
             yield line

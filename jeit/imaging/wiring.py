@@ -28,75 +28,79 @@ from jeit_solvers.engines import on_host
 
 # Maximum ratio of the difference between frame and reference after an exchange to the difference before, for each
 # exchange and for all reported exchanges together; and maximum number of exchanges.
-_MAX_EXCHANGE_RATIO, _MAX_TOTAL_EXCHANGE_RATIO, _MAX_EXCHANGES = 0.9, 0.5, 4
+_MAX_DIFFERENCE_RATIO_PER_EXCHANGE, _MAX_DIFFERENCE_RATIO, _MAX_ROW_EXCHANGES = 0.9, 0.5, 4
 
 
 def exchanges_message(frame: Measurement, reference: Measurement) -> str:
     """Describe in a sentence which drives, or which measurements of every drive, seem exchanged in a frame, numbered
     from 1. The sentence is empty if no exchanges halve the frame's difference from the reference, or if not all drives
     have the same measurements."""
-    channel_indices = _channel_index(frame)
-    if channel_indices is None:
+    channel_matrix = _channel_matrix(frame)
+    if channel_matrix is None:
         return ""
-    usable = (np.asarray(frame.mask)[0] & np.asarray(reference.mask)[0])[channel_indices]
+    usable_channels = (np.asarray(frame.mask)[0] & np.asarray(reference.mask)[0])[channel_matrix]
     frame_values, reference_values = (
-        np.where(usable, np.asarray(measurement.filled())[0][channel_indices], 0) for measurement in (frame, reference)
+        np.where(usable_channels, np.asarray(measurement.filled())[0][channel_matrix], 0)
+        for measurement in (frame, reference)
     )
-    described_norm = float(np.linalg.norm(frame_values - reference_values))
-    candidates = [
-        (*_exchanges(frame_values, reference_values), "drives"),
-        (*_exchanges(frame_values.T, reference_values.T), "measurements of every drive"),
+    difference_norm = float(np.linalg.norm(frame_values - reference_values))
+    exchange_candidates = [
+        (*_best_row_exchanges(frame_values, reference_values), "drives"),
+        (*_best_row_exchanges(frame_values.T, reference_values.T), "measurements of every drive"),
     ]
-    remaining_norm, pairs, kind_of_exchange = min(candidates, key=lambda candidate: candidate[0])
-    if not pairs or remaining_norm > _MAX_TOTAL_EXCHANGE_RATIO * described_norm:
+    remaining_norm, exchanged_pairs, kind_of_exchange = min(exchange_candidates, key=lambda candidate: candidate[0])
+    if not exchanged_pairs or remaining_norm > _MAX_DIFFERENCE_RATIO * difference_norm:
         return ""
     reference_norm = float(np.linalg.norm(reference_values))
-    pair_text = ", ".join(
-        f"{first_electrode + 1} and {second_electrode + 1}" for first_electrode, second_electrode in pairs
-    )
+    pair_text = ", ".join(f"{first_row + 1} and {second_row + 1}" for first_row, second_row in exchanged_pairs)
     return (
         f"{kind_of_exchange} {pair_text} look exchanged in it, and not in its reference: so taken it differs from that "
-        f"by {percent(remaining_norm / reference_norm)}, as it is by {percent(described_norm / reference_norm)}. Mend "
+        f"by {percent(remaining_norm / reference_norm)}, as it is by {percent(difference_norm / reference_norm)}. Mend "
         "its order; or go on as it is (as_is=True, --as-is)."
     )
 
 
-def _channel_index(frame: Measurement) -> np.ndarray | None:
-    """Index of the channel of each drive and measurement, (drives, measurements); None if a drive lacks a
-    measurement."""
-    drive, measurement = (np.asarray(index) for index in (frame.protocol.drive_index, frame.protocol.measurement_index))
-    shape = int(drive.max()) + 1, int(measurement.max()) + 1
-    channel_indices = np.full(shape, -1)
-    channel_indices[drive, measurement] = np.arange(len(drive))
-    return None if (channel_indices < 0).any() else channel_indices
+def _channel_matrix(frame: Measurement) -> np.ndarray | None:
+    """Return the index of the channel of each drive and measurement pattern, (drives, measurements); None if a drive
+    lacks a measurement."""
+    drive_index, measurement_index = (
+        np.asarray(pattern_index) for pattern_index in (frame.protocol.drive_index, frame.protocol.measurement_index)
+    )
+    matrix_shape = int(drive_index.max()) + 1, int(measurement_index.max()) + 1
+    channel_matrix = np.full(matrix_shape, -1)
+    channel_matrix[drive_index, measurement_index] = np.arange(len(drive_index))
+    return None if (channel_matrix < 0).any() else channel_matrix
 
 
-def _exchanges(
-    measured: Inexact[np.ndarray, "n k"], reference: Inexact[np.ndarray, "n k"]
+def _best_row_exchanges(
+    frame_rows: Inexact[np.ndarray, "n k"], reference_rows: Inexact[np.ndarray, "n k"]
 ) -> tuple[float, list[tuple[int, int]]]:
     """Norm of the difference between two matrices after exchanges of rows, and the exchanges, most effective first."""
-    squared_norms = np.sum(np.abs(measured) ** 2, axis=1)[:, None] + np.sum(np.abs(reference) ** 2, axis=1)
+    squared_norms = np.sum(np.abs(frame_rows) ** 2, axis=1)[:, None] + np.sum(np.abs(reference_rows) ** 2, axis=1)
     squared_distances: Float[np.ndarray, "n n"] = np.maximum(
-        squared_norms - 2 * np.real(measured @ reference.conj().T), 0
+        squared_norms - 2 * np.real(frame_rows @ reference_rows.conj().T), 0
     )
-    total, pairs = float(np.trace(squared_distances)), []
-    for _ in range(_MAX_EXCHANGES):
-        diagonal = np.diag(squared_distances)
-        gain = diagonal[:, None] + diagonal - squared_distances - squared_distances.T
-        first_electrode, second_electrode = np.unravel_index(np.argmax(gain), gain.shape)
-        if total - gain[first_electrode, second_electrode] > _MAX_EXCHANGE_RATIO**2 * total:
+    squared_difference, exchanged_rows = float(np.trace(squared_distances)), []
+    for _ in range(_MAX_ROW_EXCHANGES):
+        diagonal_distances = np.diag(squared_distances)
+        squared_reduction = diagonal_distances[:, None] + diagonal_distances - squared_distances - squared_distances.T
+        first_row, second_row = np.unravel_index(np.argmax(squared_reduction), squared_reduction.shape)
+        if (
+            squared_difference - squared_reduction[first_row, second_row]
+            > _MAX_DIFFERENCE_RATIO_PER_EXCHANGE**2 * squared_difference
+        ):
             break
-        total = max(total - float(gain[first_electrode, second_electrode]), 0.0)
-        pairs.append((int(min(first_electrode, second_electrode)), int(max(first_electrode, second_electrode))))
-        squared_distances[[first_electrode, second_electrode]] = squared_distances[[second_electrode, first_electrode]]
-    return float(np.sqrt(total)), pairs
+        squared_difference = max(squared_difference - float(squared_reduction[first_row, second_row]), 0.0)
+        exchanged_rows.append((int(min(first_row, second_row)), int(max(first_row, second_row))))
+        squared_distances[[first_row, second_row]] = squared_distances[[second_row, first_row]]
+    return float(np.sqrt(squared_difference)), exchanged_rows
 
 
 MAX_WIRING_MISFIT = 0.15
 """Relative misfit of a uniform body to a frame of the empty body above which a wiring error is suspected."""
 # Maximum ratio of the misfit with a changed wiring to the misfit before the change: for each exchange, and for the
 # reported wiring relative to the described wiring.
-_MAX_MISFIT_RATIO_PER_EXCHANGE, _MAX_WIRING_RATIO = 0.85, 0.6
+_MAX_MISFIT_RATIO_PER_EXCHANGE, _MAX_WIRING_MISFIT_RATIO = 0.85, 0.6
 _MAX_ELECTRODE_EXCHANGES = 4
 # Relative misfit of the empty body above which imaging is refused even if no other wiring explains the frame.
 _MAX_EMPTY_BODY_MISFIT = 0.5
@@ -143,16 +147,16 @@ class Wiring:
     @property
     def explanation(self) -> str:
         """The estimated wiring, in a sentence, with electrodes numbered from 1; empty for the described wiring."""
-        faults = [_exchange_text(self.places, self._exchange_cycles())]
-        faults.append(self.order and f"the channels look ordered {self.order}")
-        faults.append(
+        wiring_faults = [_exchange_text(self.places, self._exchange_cycles())]
+        wiring_faults.append(self.order and f"the channels look ordered {self.order}")
+        wiring_faults.append(
             'all voltages look to have the opposite sign ([data] polarity = "reversed")' if self.reversed_signs else ""
         )
-        faults.append("the voltages look to be magnitudes, without signs" if self.magnitudes else "")
-        description = ", and ".join(fault for fault in faults if fault)
+        wiring_faults.append("the voltages look to be magnitudes, without signs" if self.magnitudes else "")
+        faults_text = ", and ".join(wiring_fault for wiring_fault in wiring_faults if wiring_fault)
         return (
-            description
-            and f"{description}: so taken the misfit is {percent(self.misfit)}, as described {percent(self.described)}."
+            faults_text
+            and f"{faults_text}: so taken the misfit is {percent(self.misfit)}, as described {percent(self.described)}."
         )
 
     def _exchange_cycles(self) -> list[list[int]]:
@@ -182,7 +186,7 @@ def find_wiring(
     `impedances`: those of the model (see `uniform_impedances`), which are the same for all protocols; computed here if
     not given.
     """
-    num_electrodes, orders = model.protocol.num_electrodes, channel_orders(model.protocol)
+    num_electrodes, orders_by_name = model.protocol.num_electrodes, channel_orders(model.protocol)
     described_wiring = Wiring(tuple(range(num_electrodes)))
     if not np.any(np.asarray(measurement.filled())[0]):
         return replace(
@@ -190,21 +194,25 @@ def find_wiring(
         )  # a frame without signal does not determine the wiring
     impedances = uniform_impedances(model) if impedances is None else impedances
     protocol = on_host(model.protocol)
-    compute_misfit = _create_comparison(protocol, impedances, measurement, orders)
+    compute_misfit = _create_misfit_function(protocol, impedances, measurement, orders_by_name)
     compared_wiring = compute_misfit(described_wiring)
     described_misfit = 1.0 if compared_wiring.reversed_signs else compared_wiring.misfit
     if compared_wiring.misfit < MAX_WIRING_MISFIT:  # as described, except possibly for the sign
         return replace(compared_wiring, described=described_misfit)
-    best_wiring = _better_wiring(compute_misfit, described_wiring, compared_wiring, orders)
+    best_wiring = _better_wiring(compute_misfit, described_wiring, compared_wiring, orders_by_name)
     expected_voltages = np.asarray(select_channels(protocol, impedances[0]))
     if (has_one_sign := _has_one_sign(expected_voltages, measurement)) is not None:
-        compute_misfit = _create_comparison(protocol, impedances, measurement, orders, compares_signs=False)
-        unsigned_wiring = _better_wiring(compute_misfit, described_wiring, compute_misfit(described_wiring), orders)
+        compute_misfit = _create_misfit_function(
+            protocol, impedances, measurement, orders_by_name, compares_signs=False
+        )
+        unsigned_wiring = _better_wiring(
+            compute_misfit, described_wiring, compute_misfit(described_wiring), orders_by_name
+        )
         if unsigned_wiring.misfit < _MAX_MISFIT_RATIO_PER_EXCHANGE * best_wiring.misfit:
             best_wiring = replace(unsigned_wiring, magnitudes=has_one_sign)
     best_wiring = (
         replace(described_wiring, misfit=described_misfit)
-        if best_wiring.misfit > _MAX_WIRING_RATIO * described_misfit
+        if best_wiring.misfit > _MAX_WIRING_MISFIT_RATIO * described_misfit
         else best_wiring
     )
     return replace(best_wiring, described=described_misfit)
@@ -214,13 +222,13 @@ def _better_wiring(
     compute_misfit: Callable[[Wiring], Wiring],
     described_wiring: Wiring,
     best_wiring: Wiring,
-    orders_of_channels: Iterable[str],
+    order_names: Iterable[str],
 ) -> Wiring:
     """Return the wiring that explains a frame far better than `best_wiring`, the described wiring with its misfit, or
     `best_wiring` if no wiring does."""
     num_electrodes = len(described_wiring.places)
 
-    def choose_best(wirings: Iterable[Wiring], previous_wiring: Wiring) -> Wiring:
+    def choose_best_wiring(wirings: Iterable[Wiring], previous_wiring: Wiring) -> Wiring:
         # Misfits are rounded so that the first of equivalent wirings is chosen, for example of orders that are
         # equivalent by reciprocity.
         best_wiring = min((compute_misfit(wiring) for wiring in wirings), key=lambda wiring: round(wiring.misfit, 9))
@@ -232,10 +240,13 @@ def _better_wiring(
 
     def improve_by_exchanges(best_wiring: Wiring) -> Wiring:
         for _ in range(_MAX_ELECTRODE_EXCHANGES):
-            pairs = combinations(range(num_electrodes), 2)
+            electrode_pairs = combinations(range(num_electrodes), 2)
             previous_wiring = best_wiring
-            best_wiring = choose_best(
-                [replace(best_wiring, places=_exchange_places(best_wiring.places, *pair)) for pair in pairs],
+            best_wiring = choose_best_wiring(
+                [
+                    replace(best_wiring, places=_exchange_places(best_wiring.places, *electrode_pair))
+                    for electrode_pair in electrode_pairs
+                ],
                 best_wiring,
             )
             if best_wiring is previous_wiring:
@@ -243,86 +254,88 @@ def _better_wiring(
         return best_wiring
 
     best_wiring = improve_by_exchanges(
-        choose_best([replace(described_wiring, order=order) for order in orders_of_channels], best_wiring)
+        choose_best_wiring([replace(described_wiring, order=order_name) for order_name in order_names], best_wiring)
     )
     rotated_wirings = [
-        Wiring(places, order) for places in _rotated_places(num_electrodes) for order in orders_of_channels
+        Wiring(places, order_name) for places in _rotated_places(num_electrodes) for order_name in order_names
     ]
-    return choose_best(
-        [improve_by_exchanges(choose_best(rotated_wirings, compute_misfit(described_wiring)))], best_wiring
+    return choose_best_wiring(
+        [improve_by_exchanges(choose_best_wiring(rotated_wirings, compute_misfit(described_wiring)))], best_wiring
     )
 
 
 def _has_one_sign(expected_voltages: Float[np.ndarray, " M"], measurement: Measurement) -> bool | None:
-    """True if all voltages have one sign; False if all signs equal, or all oppose, those of the `expected_voltages`
-    voltages of a uniform body with the described wiring (which are assigned to magnitudes when their file is read);
-    None for other signs."""
+    """True if all voltages have one sign; False if all signs equal, or all oppose, those of the `expected_voltages` of
+    a uniform body with the described wiring (which are assigned to magnitudes when their file is read); None for other
+    signs."""
     is_used = np.asarray(measurement.mask)[0]
-    signs = np.sign(np.real(np.asarray(measurement.filled())[0]))[is_used]
-    if abs(signs.sum()) == np.count_nonzero(signs):
+    voltage_signs = np.sign(np.real(np.asarray(measurement.filled())[0]))[is_used]
+    if abs(voltage_signs.sum()) == np.count_nonzero(voltage_signs):
         return True
-    products = signs * np.sign(expected_voltages)[is_used]
-    return False if (products >= 0).all() or (products <= 0).all() else None
+    sign_products = voltage_signs * np.sign(expected_voltages)[is_used]
+    return False if (sign_products >= 0).all() or (sign_products <= 0).all() else None
 
 
 def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
     """Possible orders of the channels in a file, by name: index in the file (M,) of each channel of the protocol. The
     first order has an empty name and is that of the protocol."""
-    drive, measurement = np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)
-    channels = np.arange(len(drive))
-    positive_electrodes = np.asarray(protocol.measurement).argmax(axis=1)[measurement]
+    drive_of_channel, measurement_of_channel = np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)
+    channel_numbers = np.arange(len(drive_of_channel))
+    positive_electrodes = np.asarray(protocol.measurement).argmax(axis=1)[measurement_of_channel]
     source_electrode, sink_electrode = (
-        choose(np.asarray(protocol.drive), axis=1)[drive] for choose in (np.argmax, np.argmin)
+        extreme_index(np.asarray(protocol.drive), axis=1)[drive_of_channel] for extreme_index in (np.argmax, np.argmin)
     )
     sort_keys = {
-        'from electrode 1 on in every drive (order = "fixed")': (positive_electrodes, drive),
+        'from electrode 1 on in every drive (order = "fixed")': (positive_electrodes, drive_of_channel),
         'from the driven electrodes on in every drive (order = "rotating")': (
             (positive_electrodes - source_electrode) % protocol.num_electrodes,
-            drive,
+            drive_of_channel,
         ),
         "from the second driven electrode on in every drive (rotating)": (
             (positive_electrodes - sink_electrode) % protocol.num_electrodes,
-            drive,
+            drive_of_channel,
         ),
-        "measurement by measurement, not drive by drive": (drive, positive_electrodes),
+        "measurement by measurement, not drive by drive": (drive_of_channel, positive_electrodes),
     }
-    orders = {"": channels}
-    for name, keys in sort_keys.items():
-        channel_order = np.empty_like(channels)
-        channel_order[np.lexsort(keys)] = channels
-        if not any(np.array_equal(channel_order, estimated_order) for estimated_order in orders.values()):
-            orders[name] = channel_order
-    return orders
+    orders_by_name = {"": channel_numbers}
+    for order_name, order_keys in sort_keys.items():
+        channel_order = np.empty_like(channel_numbers)
+        channel_order[np.lexsort(order_keys)] = channel_numbers
+        if not any(np.array_equal(channel_order, known_order) for known_order in orders_by_name.values()):
+            orders_by_name[order_name] = channel_order
+    return orders_by_name
 
 
-def _create_comparison(
+def _create_misfit_function(
     protocol: Protocol,
     impedances: Sequence[Float[np.ndarray, "L L"]],
     measurement: Measurement,
-    orders,
+    orders_by_name,
     *,
     compares_signs: bool = True,
 ) -> Callable[[Wiring], Wiring]:
     """Return a function that computes the misfit of a wiring to the first frame of `measurement`, and the sign of the
-    voltages. Without `compares_signs`, only magnitudes of voltages are compared."""
-    voltages, mask = np.real(np.asarray(measurement.filled())[0]), np.asarray(measurement.mask)[0]
-    voltages = voltages if compares_signs else np.abs(voltages)
+    voltages. If `compares_signs` is False, only magnitudes of voltages are compared."""
+    measured_voltages, usable_channels = np.real(np.asarray(measurement.filled())[0]), np.asarray(measurement.mask)[0]
+    measured_voltages = measured_voltages if compares_signs else np.abs(measured_voltages)
 
-    stacked_impedances = np.stack([np.asarray(impedance) for impedance in impedances])
+    stacked_impedances = np.stack([np.asarray(transfer_impedance) for transfer_impedance in impedances])
 
     def compute_misfit(wiring: Wiring) -> Wiring:
-        electrode_places, channel_order = np.array(wiring.places), orders[wiring.order]
-        measured, is_used = voltages[channel_order], mask[channel_order]
+        electrode_places, channel_order = np.array(wiring.places), orders_by_name[wiring.order]
+        reordered_voltages, is_used_channel = measured_voltages[channel_order], usable_channels[channel_order]
         exchanged_impedances = stacked_impedances[:, electrode_places[:, None], electrode_places]
         expected_voltages = np.where(
-            is_used, [select_channels(protocol, impedance) for impedance in exchanged_impedances], 0
+            is_used_channel,
+            [select_channels(protocol, transfer_impedance) for transfer_impedance in exchanged_impedances],
+            0,
         )
         expected_voltages = expected_voltages if compares_signs else np.abs(expected_voltages)
-        scale_factors = expected_voltages @ measured / np.sum(expected_voltages**2, axis=1)
-        residual_norms = np.linalg.norm(measured - scale_factors[:, None] * expected_voltages, axis=1)
-        best = int(np.argmin(residual_norms))
-        misfit = float(residual_norms[best] / np.linalg.norm(measured))
-        return replace(wiring, misfit=misfit, reversed_signs=bool(scale_factors[best] < 0))
+        scale_factors = expected_voltages @ reordered_voltages / np.sum(expected_voltages**2, axis=1)
+        residual_norms = np.linalg.norm(reordered_voltages - scale_factors[:, None] * expected_voltages, axis=1)
+        best_impedance = int(np.argmin(residual_norms))
+        misfit = float(residual_norms[best_impedance] / np.linalg.norm(reordered_voltages))
+        return replace(wiring, misfit=misfit, reversed_signs=bool(scale_factors[best_impedance] < 0))
 
     return compute_misfit
 
@@ -333,13 +346,15 @@ def uniform_impedances(model: ForwardModel) -> list[Float[np.ndarray, "L L"]]:
     electrodes = model.electrodes
     if electrodes.is_point:
         return [np.asarray(model.transfer_impedance(1.0))]
-    size = np.ptp(np.asarray(model.mesh.points), axis=0).max()
-    relative = np.asarray(electrodes.contact_impedance) / np.mean(electrodes.contact_impedance)
-    models = (
-        model.with_electrodes(electrodes.with_contact_impedance(contact * size * relative))
-        for contact in _RELATIVE_CONTACT_IMPEDANCES
+    body_size = np.ptp(np.asarray(model.mesh.points), axis=0).max()
+    relative_contact_impedances = np.asarray(electrodes.contact_impedance) / np.mean(electrodes.contact_impedance)
+    models_by_contact = (
+        model.with_electrodes(
+            electrodes.with_contact_impedance(trial_impedance * body_size * relative_contact_impedances)
+        )
+        for trial_impedance in _RELATIVE_CONTACT_IMPEDANCES
     )
-    return [np.asarray(model.transfer_impedance(1.0)) for model in models]
+    return [np.asarray(model.transfer_impedance(1.0)) for model in models_by_contact]
 
 
 def _rotated_places(num_electrodes: int) -> Iterator[tuple[int, ...]]:
@@ -363,21 +378,21 @@ def _exchange_places(places: tuple[int, ...], first_electrode: int, second_elect
 def _exchange_text(places: tuple[int, ...], exchange_cycles: list[list[int]]) -> str:
     """Description of exchanged electrodes, in words."""
     if exchange_cycles and places in _rotated_places(len(places)):
-        direction = "from another one" if (places[1] - places[0]) % len(places) == 1 else "the other way round"
-        first_text = f", electrode 1 standing where {places[0] + 1} should" if places[0] else ""
-        return f"the electrodes look counted {direction}{first_text}"
-    pairs = [
-        f"{first_text + 1} and {second + 1}"
-        for first_text, second in (cycle for cycle in exchange_cycles if len(cycle) == 2)
+        counting_direction = "from another one" if (places[1] - places[0]) % len(places) == 1 else "the other way round"
+        first_electrode_text = f", electrode 1 standing where {places[0] + 1} should" if places[0] else ""
+        return f"the electrodes look counted {counting_direction}{first_electrode_text}"
+    exchanged_pairs = [
+        f"{first_electrode + 1} and {second_electrode + 1}"
+        for first_electrode, second_electrode in (cycle for cycle in exchange_cycles if len(cycle) == 2)
     ]
-    descriptions = [f"electrodes {', '.join(pairs)} look exchanged"] if pairs else []
-    descriptions += [
+    exchange_texts = [f"electrodes {', '.join(exchanged_pairs)} look exchanged"] if exchanged_pairs else []
+    exchange_texts += [
         f"electrodes {' → '.join(str(k + 1) for k in [*cycle, cycle[0]])} each look as if they stood where the next "
         "one should"
         for cycle in exchange_cycles
         if len(cycle) > 2
     ]
-    return ", and ".join(descriptions)
+    return ", and ".join(exchange_texts)
 
 
 def check_wiring(wiring: Wiring, reference: Measurement, as_is: bool) -> None:
@@ -385,8 +400,8 @@ def check_wiring(wiring: Wiring, reference: Measurement, as_is: bool) -> None:
     the reference too poorly (see `Wiring.fault`), unless `as_is`."""
     if wiring.fault and not as_is:
         # Voltages of the opposite sign cannot be calibrated, even with `as_is`.
-        remedy = "" if wiring.reversed_signs else "; or go on as it is (as_is=True, --as-is)"
+        suggested_remedy = "" if wiring.reversed_signs else "; or go on as it is (as_is=True, --as-is)"
         raise ValueError(
             f"'{reference.name}' does not fit its description: {wiring.fault} Mend the wires or the description"
-            f"{remedy}."
+            f"{suggested_remedy}."
         )

@@ -50,12 +50,12 @@ def test_labels_of_a_solid_are_those_at_half_height():
     def ball(z):
         return Ellipsoid(1, np.array([0.0, 0.0, z]), 0.03 * np.eye(3), 1e-4, np.zeros(3), 1.0, False, False, 10.0)
 
-    middle = difference._labels(mesh, [ball(0.05)], raster)
+    middle = difference._label_body_pixels(mesh, [ball(0.05)], raster)
     left, right, low, high = raster.extent
     pixel = (right - left) * (high - low) / middle.size
     assert middle.max() == CONDUCTIVE
     assert (middle > 0).sum() * pixel == pytest.approx(np.pi * 0.03**2, rel=0.1)
-    assert not difference._labels(mesh, [ball(0.01)], raster).any()
+    assert not difference._label_body_pixels(mesh, [ball(0.01)], raster).any()
 
 
 @pytest.mark.slow
@@ -129,7 +129,7 @@ def test_bodies_are_searched_in_solids_where_data_can_determine_them(monkeypatch
 
     monkeypatch.setitem(automatic.METHODS, "gauss-newton", SimpleNamespace(image=image, hyperparameter=5.0))
     data, change = prepared(dimension, strongest, noise)
-    assert automatic._bodies_in_solid(data, method.MethodOptions("gaussian"), change) is None
+    assert automatic._fit_bodies_in_solid(data, method.MethodOptions("gaussian"), change) is None
     assert bool(asked) == looks
 
 

@@ -16,7 +16,7 @@ from jeit.cli import main
 from jeit.cli.commands.describe import _body_tables
 from jeit.data.description import TableLayout, parse_description
 from jeit.data.formats.text import frames_in_table
-from jeit.imaging.describe import Findings, _compute_misfit, find_description
+from jeit.imaging.describe import Findings, _fit_wiring, find_description
 from jeit.imaging.possible_protocols import Candidate
 from jeit.imaging.wiring import Wiring
 from jeit.layout import ring
@@ -80,7 +80,7 @@ def test_the_protocol_is_found(kind, tmp_path):
     assert best.misfit < 0.05
     # An order that a uniform body explains after a permutation is not explained without it.
     models: dict = {}
-    others = [_compute_misfit(one, models) for one in found.candidates[1:12]]
+    others = [_fit_wiring(one, models) for one in found.candidates[1:12]]
     turned = [one for one in others if one.wiring is not None and one.wiring.order]
     assert all(one.misfit > 0.2 for one in turned)
     assert turned or kind["kind"] == "two_terminal"

@@ -209,7 +209,7 @@ def test_the_evidence_is_that_of_a_dense_covariance():
     data, level, columns = ((weight * values.T[..., channels]).T for values in (difference, reference, patterns))
     size, reciprocal = np.sqrt(np.mean(data**2)), basis[:, :6] @ basis[:, :6].T
     level, columns = reciprocal @ level, reciprocal @ columns
-    level *= electrode_changes._MAX_COMMON_CONTACT_FACTOR * size * np.sqrt(9) / np.linalg.norm(level)
+    level *= electrode_changes._MAX_COMMON_VOLTAGE_FACTOR * size * np.sqrt(9) / np.linalg.norm(level)
     for logarithms in ([-0.5, -2.0, -2.5], [-0.5, -2.0, -2.5, -1.0], [0.2, -1.0, -3.5, 0.4]):
         conductivity, noise, error = np.exp(2 * np.array(logarithms[:3])) * size**2
         covariance = conductivity * (basis * eigenvalues) @ basis.T * 9 / eigenvalues.sum() + noise * np.eye(9)
@@ -292,6 +292,6 @@ def test_one_body_is_preferred_to_several_that_explain_as_much():
 def test_an_implausible_displacement_of_one_electrode_is_not_taken_for_it():
     prepared = prepare_difference(frame("none", 1.0), frame("none", 0.0, seed=2), num_points=600, as_is=True)
     changes = prepared.electrode_changes
-    pattern = changes._patterns[:, 5]
-    assert np.flatnonzero(changes._single_estimator(2.5 * pattern).any(axis=1)).tolist() == [5]
-    assert changes._single_estimator(3.5 * pattern) is None
+    pattern = changes._derivatives[:, 5]
+    assert np.flatnonzero(changes._single_electrode_estimator(2.5 * pattern).any(axis=1)).tolist() == [5]
+    assert changes._single_electrode_estimator(3.5 * pattern) is None

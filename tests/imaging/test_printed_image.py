@@ -12,7 +12,7 @@ from jeit.cli.commands.reconstruct import print_imaging_result
 from jeit.cli.console import plain_console
 from jeit.image import Inclusion, Raster
 from jeit.imaging import ImagingSettings, calibration, image_difference
-from jeit.imaging.difference import _region_labels
+from jeit.imaging.difference import _label_region_pixels
 from jeit.imaging.wiring import Wiring
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes import Ellipsoid, Star
@@ -207,7 +207,7 @@ def test_every_pixel_of_a_region_is_labelled_by_its_sign():
     grid, cells = Raster.create(MODEL.mesh, shape=(32, 32)), np.asarray(centroids(MODEL.mesh))
     whole, left = np.ones(len(cells), bool), cells[:, 0] < 0
     conductive, resistive = (Inclusion(sign, (0.0, 0.0), 1e-4, sign * 1e-3) for sign in (1, -1))
-    labels = _region_labels([(conductive, whole), (resistive, left)], grid)
+    labels = _label_region_pixels([(conductive, whole), (resistive, left)], grid)
     x, y = np.moveaxis(grid.pixel_centres(), -1, 0)
     inside, size = np.hypot(x, y) < 0.0495, 0.004
     np.testing.assert_array_equal(labels[inside & (x > size)], 2)
