@@ -159,18 +159,17 @@ def format_with_unit(value: float | None, unit: str) -> str:
 
 
 def detectable_text(report: dict[str, Any]) -> str:
-    """Text that states the diameters of the smallest insulating bodies that can be detected, from their entry in a
-    report."""
-    reported_diameters = report["diameter_almost_everywhere"], report["diameter_in_half_of_the_domain"]
-    almost_everywhere, median_diameter = (
-        diameter if diameter and math.isfinite(diameter) else None for diameter in reported_diameters
-    )
-    if median_diameter is None:
+    """Text on the smallest insulating bodies that can be detected, from their entry in a report."""
+    if "not_known_because" in report:
+        return f"not known: {report['not_known_because']}"
+    diameters = report["diameter_almost_everywhere"], report["diameter_in_half_of_the_domain"]
+    almost_everywhere, median = (diameter if diameter and math.isfinite(diameter) else None for diameter in diameters)
+    if median is None:
         return "none: the noise exceeds the voltages of an insulating body in half of the domain"
-    almost_everywhere_text = "none" if almost_everywhere is None else f"{1e3 * almost_everywhere:.2g} mm"
+    others = "none at most others" if almost_everywhere is None else f"one of {1e3 * almost_everywhere:.2g} mm at 95 %"
     return (
-        f"insulating, {1e3 * median_diameter:.2g} mm across in half of the domain, "
-        f"{almost_everywhere_text} almost everywhere"
+        f"an insulating body {1e3 * median:.2g} mm across is detected at half of all places, {others}; limited by "
+        f"{report['limited_by']}"
     )
 
 

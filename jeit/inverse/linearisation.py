@@ -19,7 +19,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Inexact, Int
 
-from jeit.arguments import check_has_values
+from jeit.arguments import check_has_values, describe
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model, evaluate, field_products, fields_and_impedance_of, jacobian_blocks
 from jeit.forward.system import check_conductivity
@@ -223,18 +223,34 @@ def used_channels(model: ForwardModel, noise, mask) -> tuple[np.ndarray, Float[A
     volts. Raises `ValueError` for an invalid mask or noise."""
     check_mask(mask)
     num_channels = model.protocol.num_measurements
-    is_used_channel = np.ones(num_channels, bool) if mask is None else np.asarray(mask, bool)
-    if is_used_channel.shape != (num_channels,) or not is_used_channel.any():
-        raise ValueError(f"mask must be ({num_channels},) booleans with at least one True: one for each channel.")
-    noise_deviation = np.asarray(noise, float) if has_values(noise) else jnp.asarray(noise, float)
-    if noise_deviation.shape not in ((), (num_channels,)):
+    is_used_channel = np.ones(num_channels, bool) if mask is None else np.asarray(mask)
+    if is_used_channel.shape != (num_channels,) or is_used_channel.dtype != bool or not is_used_channel.any():
         raise ValueError(
-            f"noise has shape {noise_deviation.shape}; give one number, or one for each channel: ({num_channels},)."
+            f"mask must be ({num_channels},) booleans with at least one True: one for each channel; got "
+            f"{describe(mask)}."
         )
-    noise_deviation = namespace(noise_deviation).broadcast_to(noise_deviation, (num_channels,))[is_used_channel]
-    if has_values(noise_deviation) and not (np.isfinite(noise_deviation) & (noise_deviation > 0)).all():
-        raise ValueError("noise must be positive and finite for every channel in use.")
-    return np.flatnonzero(is_used_channel), 1 / noise_deviation
+    noise_deviation = np.asarray(noise) if has_values(noise) else jnp.asarray(noise)
+    if noise_deviation.shape not in ((), (num_channels,)) or noise_deviation.dtype.kind not in "iuf":
+        raise ValueError(
+            f"noise: give one real number of volts, or one for each channel, ({num_channels},); got {describe(noise)}."
+        )
+    noise_deviation = namespace(noise_deviation).broadcast_to(noise_deviation, (num_channels,)).astype(float)
+    check_positive_noise(noise_deviation, is_used_channel)
+    return np.flatnonzero(is_used_channel), 1 / noise_deviation[is_used_channel]
+
+
+def check_positive_noise(noise_deviation: Float[Array, " M"], is_used_channel: Bool[np.ndarray, " M"]) -> None:
+    """Raise `ValueError` if the standard deviation of a channel in use is not positive and finite."""
+    if not has_values(noise_deviation):
+        return
+    noise_values = np.asarray(noise_deviation)
+    is_invalid = is_used_channel & ~(np.isfinite(noise_values) & (noise_values > 0))
+    if is_invalid.any():
+        channel = int(np.argmax(is_invalid))
+        raise ValueError(
+            "noise must be positive and finite for every channel in use, in volts; channel "
+            f"{channel} (numbered from 0) has {noise_values[channel]:g}."
+        )
 
 
 def check_mask(mask) -> None:

@@ -34,7 +34,7 @@ import scipy.special
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from jeit.arguments import check_has_values, check_key, check_kind
+from jeit.arguments import check_has_values, check_key, check_kind, describe
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model, evaluate, fields_and_impedance_of, jacobian_blocks
 from jeit.inverse.linearisation import used_channels
@@ -149,8 +149,14 @@ def _check_cells(cells: ArrayLike, num_cells: int) -> np.ndarray:
     traced cells."""
     check_has_values("cells", cells, "the region is made of", "choose them outside")
     selected = np.asarray(cells)
-    if (selected.dtype == bool and selected.shape != (num_cells,)) or selected.dtype.kind not in "iub":
-        raise ValueError(f"cells must be booleans ({num_cells},), or indices of cells.")
+    if selected.shape == (0,):
+        selected = selected.astype(int)
+    if (
+        selected.ndim != 1
+        or (selected.dtype == bool and selected.shape != (num_cells,))
+        or selected.dtype.kind not in "iub"
+    ):
+        raise ValueError(f"cells must be booleans ({num_cells},), or indices (k,) of cells; got {describe(cells)}.")
     if selected.dtype != bool and selected.size and (selected.min() < 0 or selected.max() >= num_cells):
         raise ValueError(f"cells must be indices from 0 to {num_cells - 1}.")
     if not (selected.any() if selected.dtype == bool else selected.size):
@@ -357,7 +363,8 @@ def detectable_strength(
     ```
     """
     check_model(model)
-    check_has_values("detectable_strength", (model, background, noise), "it is computed from", "call it outside")
+    arguments = "model, background or noise"
+    check_has_values(arguments, (model, background, noise), "a detectable strength is computed from", "call it outside")
     conductivity = np.asarray(check_background(model, background))
     channel_indices, inverse_noise = used_channels(model, noise, mask)
     fields = evaluate(model, fields_and_impedance_of, conductivity)[0]

@@ -125,7 +125,7 @@ def cut(mesh: Mesh, level: Callable[[Float[np.ndarray, "n s"]], Float[np.ndarray
     - `level`: function of points (n, s), metres, that returns one number per point (n,), negative on one side of the
       surface and positive on the other.
 
-    Raises `ValueError` if `level` does not return one finite number per point.
+    Raises `ValueError` if `level` does not return one finite number per point, or has one sign at all nodes.
 
     **Example:**
 
@@ -227,8 +227,16 @@ def _move_nodes_onto_level(split_mesh: _SplitMesh, level_function) -> tuple[_Spl
         raise ValueError(
             f"level must give one finite number per point; of {len(points)} points it gave {describe(node_levels)}."
         )
+    if node_levels.min() >= 0 or node_levels.max() <= 0:
+        raise ValueError(
+            f"level has one sign at all nodes of the mesh, {describe(node_levels)}: there is nothing to cut. Is the "
+            "body inside the mesh, and larger than a cell? If it is small, refine the mesh there by bisect first."
+        )
     sign_of_level = np.sign(node_levels)[cells]
-    crossed_edges, _, _ = _edges_of_simplices(points, cells[sign_of_level.min(axis=1) * sign_of_level.max(axis=1) < 0])
+    is_crossed_cell = sign_of_level.min(axis=1) * sign_of_level.max(axis=1) < 0
+    if not is_crossed_cell.any():  # the surface consists of facets of the mesh
+        return split_mesh, node_levels
+    crossed_edges, _, _ = _edges_of_simplices(points, cells[is_crossed_cell])
     crossed_edges = crossed_edges[np.prod(np.sign(node_levels)[crossed_edges], axis=1) < 0]
     crossing_points = _find_zeros_on_edges(points[crossed_edges], node_levels[crossed_edges[:, 0]], level_function)
     relative_distances = (

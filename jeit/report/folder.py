@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.files import atomically_written_files
 from jeit.inverse import DetectableDiameters
 from jeit.mesh import Body
+
+if TYPE_CHECKING:
+    from jeit.imaging import ImagedDifference
 
 # Error handler of `str.encode` for characters that cannot be encoded, such as invalid bytes in the names of files.
 _ENCODING_ERRORS = "backslashreplace"
@@ -91,16 +94,24 @@ def describe_electrodes(electrodes: AbstractElectrodes | None) -> dict[str, Any]
     return to_plain_values(electrodes.describe())
 
 
-def describe_detectable(diameters: DetectableDiameters | None) -> dict[str, Any] | None:
-    """Describe the smallest insulating bodies that can be detected by their diameters in metres. A diameter is None if
-    it exceeds the domain; the description is None if `diameters` is None."""
-    if diameters is None:
-        return None
+def describe_detectable(diameters: DetectableDiameters, limited_by: str) -> dict[str, Any]:
+    """Describe the smallest insulating bodies that can be detected by their diameters in metres, which are None if they
+    exceed the domain, and by what they are `limited_by`, such as the noise."""
     return {
         "diameter_in_half_of_the_domain": diameters.median,
         "diameter_almost_everywhere": diameters.almost_everywhere,
         "unit": "m",
+        "limited_by": limited_by,
     }
+
+
+def describe_detectable_in_image(imaged: "ImagedDifference") -> dict[str, Any] | None:
+    """Describe the smallest insulating bodies that can be detected in a frame; None if they are not known."""
+    if (diameters := imaged.detectable_diameters) is None:
+        return None
+    is_noise_known = imaged.quality.difference_noise is not None or imaged.quality.noise_share is not None
+    noise_text = "noise" if is_noise_known else "noise, which is assumed,"
+    return describe_detectable(diameters, f"{noise_text} and model error of this frame")
 
 
 def package_version(package: str) -> str | None:

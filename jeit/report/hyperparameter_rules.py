@@ -7,6 +7,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jeit.arguments import counted, percent
 from jeit.data import Measurement, estimate_noise, impossible_signs, reciprocity_error
@@ -30,6 +31,8 @@ from jeit.report.folder import (
 
 # Approximate number of nodes of the mesh on which wirings are compared and detectable diameters are computed.
 _NUM_MESH_NODES = 1000
+# Standard deviation of the noise relative to the largest voltage below which voltages are taken for computed ones.
+_MIN_RELATIVE_NOISE = 1e-10
 
 
 def report_measurement(measurement: Measurement) -> dict[str, Any]:
@@ -66,11 +69,7 @@ def report_measurement(measurement: Measurement) -> dict[str, Any]:
         "electrodes": {**describe_electrodes(measurement.electrodes), "number": protocol.num_electrodes},
         "reciprocity_error": reciprocity_error(measurement),
         "noise": noise,
-        "smallest_detectable_body": _report_detectable_diameters(model, measurement, noise)
-        if model
-        and noise
-        and (impossible_sign_shares is None or impossible_sign_shares.max() <= MAX_IMPOSSIBLE_SIGN_SHARE)
-        else None,
+        "smallest_detectable_body": _report_detectable_diameters(model, measurement, noise, impossible_sign_shares),
         "impossible_signs": None if impossible_sign_shares is None else float(impossible_sign_shares.max()),
         "wiring": model and _describe_wiring(model, measurement),
     }
@@ -105,22 +104,38 @@ def _reference_frame(measurement: Measurement) -> Measurement:
 
 
 def _report_detectable_diameters(
-    model: ForwardModel, measurement: Measurement, noise: dict[str, Any]
-) -> dict[str, Any] | None:
+    model: ForwardModel | None,
+    measurement: Measurement,
+    noise: dict[str, Any] | None,
+    impossible_sign_shares: Float[np.ndarray, " F"] | None,
+) -> dict[str, Any]:
     """Report the diameters of the smallest insulating bodies that can be detected in the difference of two frames of
-    the file. The `noise` of the voltages is assumed to be larger for larger voltages, see `relative_noise`. Returns
-    None for complex voltages, and if no voltage of the reference frame is usable."""
+    the file, or the reason why they are not known. The `noise` of the voltages is assumed to be larger for larger
+    voltages, see `relative_noise`."""
     reference = _reference_frame(measurement)
-    voltages, usable_channels = np.asarray(reference.voltages)[0], np.asarray(reference.mask)[0]
-    if np.iscomplexobj(voltages) or not usable_channels.any() or not noise["standard_deviation"]:
-        return None
-    channel_noise = np.asarray(relative_noise(voltages, usable_channels))
-    channel_noise = np.sqrt(2) * noise["standard_deviation"] * channel_noise / np.median(channel_noise[usable_channels])
+    has_used_channels = np.asarray(reference.mask).any(axis=1)
+    if model is None:
+        return {"not_known_because": "the file does not say where electrodes are"}
+    if not has_used_channels.any():
+        return {"not_known_because": "no voltage can be used"}
+    first_frame = int(np.argmax(has_used_channels))
+    voltages, usable_channels = np.asarray(reference.voltages)[first_frame], np.asarray(reference.mask)[first_frame]
+    if np.iscomplexobj(voltages):
+        return {"not_known_because": "it is computed for real voltages only"}
+    if noise is None:
+        return {"not_known_because": "the noise is not known; two frames of the same state show it"}
+    if noise["standard_deviation"] <= _MIN_RELATIVE_NOISE * np.abs(voltages[usable_channels]).max():
+        return {"not_known_because": "the voltages have no noise, as computed ones"}
+    if impossible_sign_shares is not None and impossible_sign_shares.max() > MAX_IMPOSSIBLE_SIGN_SHARE:
+        return {"not_known_because": "too many voltages have a sign that the body described cannot give"}
     # Voltages across contact impedances, which the description does not determine, hardly change the median.
     resistivity = np.median(np.abs(voltages / np.asarray(model.voltages(1.0)))[usable_channels])
     if not (np.isfinite(resistivity) and resistivity > 0):
-        return None
-    return describe_detectable(detectable_diameters(model, 1 / resistivity, channel_noise, usable_channels))
+        return {"not_known_because": "most voltages are zero"}
+    channel_noise = np.asarray(relative_noise(voltages, usable_channels))
+    channel_noise = np.sqrt(2) * noise["standard_deviation"] * channel_noise / np.median(channel_noise[usable_channels])
+    diameters = detectable_diameters(model, 1 / resistivity, channel_noise, usable_channels)
+    return describe_detectable(diameters, f"the noise, from {noise['method']}")
 
 
 def _describe_wiring(model: ForwardModel, measurement: Measurement) -> str:

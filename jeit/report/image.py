@@ -20,7 +20,7 @@ from jeit.inverse.shapes import Ellipsoid, Star
 from jeit.mesh import Mesh
 from jeit.protocol import Protocol
 from jeit.report.folder import (
-    describe_detectable,
+    describe_detectable_in_image,
     describe_domain,
     describe_electrodes,
     describe_measurement,
@@ -247,7 +247,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
         "doubts": list(result.doubts),
         "inclusions": [_inclusion_report(result, inclusion) for inclusion in result.inclusions],
         "shapes": _shapes_report(result),
-        "smallest_detectable_body": describe_detectable(result.detectable_diameters),
+        "smallest_detectable_body": describe_detectable_in_image(result),
         "inclusion_settings": {"level": result.level, "least_peak": settings.least_peak},
         "timings": {**result.timings, "unit": "s"},
         "versions": {name: package_version(name) for name in _REPORTED_PACKAGES},

@@ -35,7 +35,7 @@ def test_the_smallest_detectable_body_is_printed_and_reported(tank, run, tmp_pat
         tank.write(name, voltages + 1e-3 * np.abs(voltages) * draw)
     status, printed, _ = run("info", tank.folder / "touched.csv")
     assert status == 0
-    (words,) = re.findall(r"smallest body +insulating, ([0-9.]+) mm across in half", " ".join(printed.split()))
+    (words,) = re.findall(r"smallest body +an insulating body ([0-9.]+) mm across is", " ".join(printed.split()))
     status, printed, error = run(
         "reconstruct", tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv",
         "--output", tmp_path / "out", "--method", "one-step", "--hyperparameter", 1,
@@ -45,7 +45,7 @@ def test_the_smallest_detectable_body_is_printed_and_reported(tank, run, tmp_pat
     report = json.loads((tmp_path / "out" / "report.json").read_text("utf-8"))["smallest_detectable_body"]
     median, almost_everywhere = report["diameter_in_half_of_the_domain"], report["diameter_almost_everywhere"]
     assert 0 < median < almost_everywhere
-    assert f"insulating, {1e3 * median:.2g} mm across" in " ".join(printed.split())
+    assert f"an insulating body {1e3 * median:.2g} mm across is detected" in " ".join(printed.split())
     # Both are those of noise, which is estimated from each file alone or from the difference.
     assert 1e-3 * float(words) == pytest.approx(median, rel=0.5)
 

@@ -318,8 +318,43 @@ def test_rounding_deviation_is_that_of_the_rounded_voltages(to):
 def test_rounding_is_reported_as_noise_where_reciprocity_does_not_show_it(tank):
     chosen = protocol.adjacent(16)
     seen = 1e-5 * np.round(tank(chosen) / 1e-5)
-    noise = report_measurement(data.screen(seen, chosen))["noise"]
+    report = report_measurement(data.screen(seen, chosen))
+    assert "where electrodes are" in report["smallest_detectable_body"]["not_known_because"]
+    noise = report["noise"]
     assert noise == {"standard_deviation": pytest.approx(1e-5 / np.sqrt(12)), "method": "rounding"}
+
+
+def test_the_smallest_detectable_body_is_that_of_a_frame_with_usable_voltages(tank, setup):
+    chosen, draws = protocol.adjacent(16), np.random.default_rng(0).normal(size=(2, 208))
+    clean = tank(chosen)
+    noisy = clean * (1 + 1e-4 * draws)
+
+    def smallest_body(voltages, **described):
+        return report_measurement(data.screen(voltages, chosen, **described))["smallest_detectable_body"]
+
+    described = setup(16)
+    found = smallest_body(noisy, **described)
+    assert 0 < found["diameter_in_half_of_the_domain"] < found["diameter_almost_everywhere"]
+    assert found["limited_by"].startswith("the noise, from ")
+    with_empty_frame = np.stack([np.full(208, np.nan), *noisy])
+    without_first = smallest_body(with_empty_frame, **described)
+    assert without_first["diameter_almost_everywhere"] == pytest.approx(found["diameter_almost_everywhere"], rel=0.5)
+    without_reference = smallest_body(with_empty_frame, frame_names=("reference", "left", "right"), **described)
+    assert without_reference == {"not_known_because": "no voltage can be used"}
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda clean: clean, "the voltages have no noise"),
+        (lambda clean: clean * np.random.default_rng(0).choice([-1, 1], 208), "a sign that the body described cannot give"),
+        (lambda clean: clean * (1 + 1e-4j), "real voltages only"),
+    ],
+)
+def test_reasons_for_which_the_smallest_detectable_body_is_not_known(change, reason, tank, setup):
+    chosen = protocol.adjacent(16)
+    report = report_measurement(data.screen(change(tank(chosen)), chosen, **setup(16)))
+    assert reason in report["smallest_detectable_body"]["not_known_because"]
 
 
 def test_masked_voltages_do_not_hide_rounding():

@@ -100,11 +100,18 @@ def test_of_many_channels_the_root_mean_square_is_that_of_the_noise():
         ({"background": -1.0}, "background must be positive"),
         ({"background": 1 + 1j}, "background must be one real"),
         ({"noise": 0.0}, "noise must be positive"),
-        ({"noise": np.ones(3)}, "noise has shape"),
+        ({"noise": np.where(np.arange(40) == 3, np.nan, 1e-6)}, r"in volts; channel 3 .* has nan"),
+        ({"noise": np.ones(3)}, "noise: give one real number of volts"),
+        ({"noise": 1e-6 + 1e-6j}, "noise: give one real number of volts"),
+        ({"noise": "1e-6"}, "noise: give one real number of volts"),
+        ({"noise": True}, "noise: give one real number of volts"),
         ({"mask": np.zeros(40, bool)}, "mask must be"),
+        ({"mask": np.full(40, np.nan)}, r"mask must be \(40,\) booleans .* got"),
         ({"cells": [10**6]}, "cells must be indices from 0"),
         ({"cells": [0.5]}, "cells must be booleans"),
-        ({"cells": []}, "cells must be booleans"),
+        ({"cells": []}, "cells: none is chosen"),
+        ({"cells": 0}, "cells must be booleans"),
+        ({"cells": [[0, 1]]}, "cells must be booleans"),
         ({"model": 3}, "model must be a ForwardModel"),
     ],
 )
@@ -119,5 +126,5 @@ def test_anything_but_a_model_is_refused():
 
 
 def test_traced_noise_is_refused(disk):
-    with pytest.raises(ValueError, match=r"detectable_strength is traced.*call it outside"):
+    with pytest.raises(ValueError, match=r"background or noise is traced.*call it outside"):
         jax.jit(lambda noise: detectable_strength(disk[0], BACKGROUND, noise))(NOISE)

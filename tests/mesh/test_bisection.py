@@ -83,6 +83,16 @@ def test_surfaces_may_extend_beyond_the_body():
     assert np.asarray(measures(found))[within].sum() == pytest.approx(0.61 - 0.15, rel=1e-6)
 
 
+def test_a_mesh_whose_facets_form_the_surface_is_left_as_it_is():
+    def level(points):
+        return np.round(points[:, 0] - 0.11, 8)
+
+    once = cut(MESHES["disk"], level)
+    again = cut(once, level)
+    np.testing.assert_array_equal(again.points, once.points)
+    np.testing.assert_array_equal(again.cells, once.cells)
+
+
 @pytest.mark.parametrize("surface", [sphere(1.0, num_points=400), tube(0.5, 1.5, num_points=400)], ids=["ball", "tube"])
 def test_meshes_of_surfaces_in_space_are_refined_and_cut(surface):
     edge = 0.08
@@ -108,5 +118,8 @@ def test_invalid_input_is_refused():
     for wrong in (0.1, np.zeros(mesh.num_cells), np.full(mesh.num_cells, np.nan)):
         with pytest.raises(ValueError, match=r"size must give one number per cell, metres, above zero"):
             bisect(mesh, lambda corners, wrong=wrong: wrong)
+    for sign in (-1.0, 1.0):
+        with pytest.raises(ValueError, match=r"level has one sign at all nodes .* larger than a cell\?"):
+            cut(mesh, lambda points, sign=sign: np.full(len(points), sign))
     with pytest.raises(ValueError, match=r"level must give one finite number per point"):
         cut(mesh, lambda points: np.full(len(points), np.nan))

@@ -14,7 +14,7 @@ def demo(
     x: Annotated[float, typer.Option(help="Where to press, metres from the middle.")] = 0.02,
     y: Annotated[float, typer.Option(help="Where to press, metres from the middle.")] = 0.012,
     noise: Annotated[float, typer.Option(help="Noise, relative to the voltages.")] = 1e-4,
-    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
+    seed: Annotated[int, typer.Option(help="Of the noise.", min=0, max=2**32 - 1)] = 0,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the picture and the report.")] = Path(
         "jeit-demo"
     ),

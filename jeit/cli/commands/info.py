@@ -46,7 +46,7 @@ def info(
         ("electrodes", f"{report['electrodes']['number']}, {report['electrodes']['kind']}"),
         ("reciprocity error", percent(report["reciprocity_error"])),
         ("noise", noise_text or "not known"),
-        ("smallest body", "not known" if smallest_body is None else detectable_text(smallest_body)),
+        ("smallest body", detectable_text(smallest_body)),
         ("impossible signs", percent(report["impossible_signs"])),
     ]
     if (report["impossible_signs"] or 0) > MAX_IMPOSSIBLE_SIGN_SHARE:

@@ -169,6 +169,22 @@ def reconstruct(
 _MIN_REPORTED_ROUNDING_ERROR = 2e-3
 
 
+def _assumed_noise_text(result: "ImagedDifference") -> str:
+    """Text on the noise of a frame whose noise was not measured: the noise that was assumed relative to the difference
+    from the reference, both as root mean squares over the usable channels."""
+    import numpy as np
+
+    from jeit.arguments import percent
+
+    if result.noise is None:
+        return "not known"
+    usable_channels = np.asarray(result.measurement.mask)[0] & np.asarray(result.reference.mask)[0]
+    reference_voltages = np.asarray(result.reference.voltages)[0][usable_channels]
+    difference_norm = result.quality.difference * np.linalg.norm(reference_voltages)
+    assumed_share = np.linalg.norm(np.asarray(result.noise)[usable_channels]) / difference_norm
+    return f"not measured; {percent(assumed_share)} is assumed, model error included"
+
+
 def print_imaging_result(console, result: "ImagedDifference", *, frame_given: bool = False) -> None:
     """Print the result of imaging. `frame_given` states whether the user selected the frame."""
     import numpy as np
@@ -182,7 +198,7 @@ def print_imaging_result(console, result: "ImagedDifference", *, frame_given: bo
         quantity_table,
     )
     from jeit.inverse.nonlinear.reconstruct import Reconstruction
-    from jeit.report.folder import describe_detectable
+    from jeit.report.folder import describe_detectable_in_image
     from jeit_solvers import Status
 
     calibration, reconstruction = result.calibration, result.reconstruction
@@ -195,8 +211,10 @@ def print_imaging_result(console, result: "ImagedDifference", *, frame_given: bo
     background_text += (
         f" and {format_with_unit(background.imag, unit)} of susceptivity" if isinstance(background, complex) else ""
     )
-    noise_text = "not known" if noise is None else f"{percent(noise.relative)}, from {noise.method}"
-    noise_text = noise_text if noise_share is None else f"{percent(noise_share)}, from {result.quality.noise_source}"
+    if noise_share is not None:
+        noise_text = f"{percent(noise_share)}, from {result.quality.noise_source}"
+    else:
+        noise_text = _assumed_noise_text(result) if noise is None else f"{percent(noise.relative)}, from {noise.method}"
     noise_text += "" if result.electrode_change is None else "; of the rest that moved electrodes leave"
     table_rows = [
         ("background", f"{background_text}, misfit {percent(float(calibration.misfit))}"),
@@ -205,7 +223,7 @@ def print_imaging_result(console, result: "ImagedDifference", *, frame_given: bo
         ("method", f"{result.settings.method}, hyperparameter {hyperparameter_text}"),
         ("mesh", f"{counted(result.mesh.num_points, 'node')}, {counted(result.mesh.num_cells, 'cell')}"),
     ]
-    if (detectable_report := describe_detectable(result.detectable_diameters)) is not None:
+    if (detectable_report := describe_detectable_in_image(result)) is not None:
         table_rows.insert(3, ("smallest body", detectable_text(detectable_report)))
     if result.quality.rounding > _MIN_REPORTED_ROUNDING_ERROR:
         table_rows.insert(

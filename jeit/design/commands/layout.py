@@ -157,7 +157,7 @@ def optimise(
     sizes: Annotated[bool, typer.Option("--sizes", help="Change sizes too, between half and twice.")] = False,
     starts: Annotated[int, typer.Option(help="The layout, and random ones.")] = 1,
     steps: Annotated[int, typer.Option(help="At most.")] = defaults.STEPS,
-    seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
+    seed: Annotated[int, typer.Option(help="Of the random starts.", min=0, max=2**32 - 1)] = 0,
     thickness: ThicknessOption = 1e3 * defaults.THICKNESS,
     conductivity: ConductivityOption = defaults.CONDUCTIVITY,
     contact_impedance: Annotated[
@@ -310,7 +310,7 @@ def compare(
     ] = defaults.CONTRAST,
     cell: Annotated[float, typer.Option("--cell-mm", help="Size of the mesh's cells, millimetres.")] = 1e3
     * defaults.CELL_SIZE,
-    seed: Annotated[int, typer.Option(help="Of the taxels' k-means.")] = 0,
+    seed: Annotated[int, typer.Option(help="Of the taxels' k-means.", min=0, max=2**32 - 1)] = 0,
     width: WidthOption = 1e3 * defaults.SIDE,
     height: HeightOption = 1e3 * defaults.SIDE,
     quiet: QuietOption = False,

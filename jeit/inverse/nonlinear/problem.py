@@ -32,7 +32,7 @@ from jeit.forward.model import (
     voltages_of,
 )
 from jeit.inverse.channels import Data, IndependentChannels, relative_noise
-from jeit.inverse.linearisation import check_mask
+from jeit.inverse.linearisation import check_mask, check_positive_noise
 from jeit.inverse.nonlinear.parametrisation import AbstractLink, AbstractUnknown
 from jeit.inverse.prior.bases import AbstractBasis, DenseBasis, expand_rows
 from jeit.inverse.prior.penalties import AbstractPenalty
@@ -115,11 +115,7 @@ def check_noise(noise, measured: Float[Array, " M"], is_used: np.ndarray) -> Flo
         if noise is None
         else xp.broadcast_to(standard_deviation, measured.shape)
     )
-    if (
-        has_values(noise_deviation)
-        and not (np.isfinite(noise_deviation)[is_used] & (np.asarray(noise_deviation)[is_used] > 0)).all()
-    ):
-        raise ValueError("noise must be positive and finite for every channel in use.")
+    check_positive_noise(noise_deviation, is_used)
     return xp.where(is_used, noise_deviation, 1)
 
 

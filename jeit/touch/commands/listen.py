@@ -145,7 +145,12 @@ def fit(
         int | None, typer.Option(help="Maximum number of batches for which a network is trained (default 1500).")
     ] = None,
     seed: Annotated[
-        int, typer.Option(help="Seed of the random numbers for the initial weights and the training of networks.")
+        int,
+        typer.Option(
+            help="Seed of the random numbers for the initial weights and the training of networks.",
+            min=0,
+            max=2**32 - 1,
+        ),
     ] = 0,
     quiet: QuietOption = False,
 ) -> None:

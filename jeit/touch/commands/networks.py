@@ -236,7 +236,9 @@ def image(
         int | None,
         typer.Option(help="Number of simulated touches in the training set (default: that of the preset).", min=1),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the random touches and of the initial weights.", min=0)] = 0,
+    seed: Annotated[
+        int, typer.Option(help="Seed of the random touches and of the initial weights.", min=0, max=2**32 - 1)
+    ] = 0,
     scheduler: Annotated[
         str | None,
         typer.Option(help="Address of a dask scheduler whose workers simulate the touches (default: this process)."),
