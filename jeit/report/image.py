@@ -38,7 +38,7 @@ _LETTERS_PER_INCH, _DOUBT_COLOUR = 16, "#a3350f"
 _REPORTED_PACKAGES = ("jeit", "jax", "numpy", "scipy", "equinox", "lineax", "optimistix", "matplotlib")
 
 
-def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[float, float] | None = None) -> None:
+def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[float, ...] | None = None) -> None:
     """Write `image.png`, `image.npz`, `report.json` and, for a solid, `image.vtu` to a folder.
 
     Arrays of `image.npz`:
@@ -60,7 +60,8 @@ def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[fl
 
     - `result`: the image.
     - `folder`: folder of the files, created if needed.
-    - `truth` (x, y): a known position in metres, marked in the picture of a sheet.
+    - `truth` (x, y) or (x, y, radius): the true place of a contact and its radius, metres, drawn into the picture of a
+      sheet.
 
     **Example:**
 
@@ -103,14 +104,15 @@ def _drawn_values(result: ImagedDifference) -> np.ndarray:
     return np.asarray(result.departure) / (math.log(10) if result.iterative else 1)
 
 
-def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = None):
+def draw_image(result: ImagedDifference, *, truth: tuple[float, ...] | None = None):
     """Draw an imaged difference, and return a matplotlib `Figure` that needs no display. For an image of admittivity,
     the real and imaginary part are drawn.
 
     **Arguments:**
 
     - `result`: the image.
-    - `truth` (x, y): a known position in metres, marked in the picture of a sheet.
+    - `truth` (x, y) or (x, y, radius): the true place of a contact and its radius, metres, drawn into the picture of a
+      sheet.
 
     **Example:**
 
@@ -155,14 +157,13 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
         ax=figure.subplots(),
     )
     if truth is not None:
-        truth_marker_style = {
-            "marker": "o",
-            "markersize": 15,
-            "markerfacecolor": "none",
-            "markeredgewidth": 2,
-            "linestyle": "none",
-        }
-        ax.plot(*truth, color="#157f3b", label="pressed here", **truth_marker_style)
+        x, y, radius = (*truth, 0.0)[:3]
+        pressed_style: dict[str, Any] = {"color": "#157f3b", "linewidth": 2, "label": "pressed here"}
+        if radius:
+            angles = np.linspace(0, 2 * np.pi, 100)
+            ax.plot(x + radius * np.cos(angles), y + radius * np.sin(angles), **pressed_style)
+        else:
+            ax.plot(x, y, marker="+", markersize=15, linestyle="none", **pressed_style)
     if result.labels is not None:
         draw_labels(result.labels, result.extent, ax=ax)
     elif result.shapes is not None:

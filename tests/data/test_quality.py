@@ -347,7 +347,10 @@ def test_the_smallest_detectable_body_is_that_of_a_frame_with_usable_voltages(ta
     ("change", "reason"),
     [
         (lambda clean: clean, "the voltages have no noise"),
-        (lambda clean: clean * np.random.default_rng(0).choice([-1, 1], 208), "a sign that the body described cannot give"),
+        (
+            lambda clean: clean * np.random.default_rng(0).choice([-1, 1], 208),
+            "a sign that the body described cannot give",
+        ),
         (lambda clean: clean * (1 + 1e-4j), "real voltages only"),
     ],
 )

@@ -215,3 +215,11 @@ def test_every_pixel_of_a_region_is_labelled_by_its_sign():
     np.testing.assert_array_equal(labels[inside & (x < -size)], 1)
     np.testing.assert_array_equal(labels[np.hypot(x, y) > 0.0501], 0)
     assert set(labels[inside].tolist()) == {1, 2}
+
+
+@pytest.mark.parametrize("truth", [(0.02, -0.01), (0.02, -0.01, 0.005)])
+def test_the_true_contact_is_drawn_at_its_place_with_its_radius(truth, imaged):
+    (ax, *_) = draw_image(imaged, truth=truth).axes
+    (line,) = [line for line in ax.lines if line.get_label() == "pressed here"]
+    distances = np.hypot(*(np.array(line.get_data()).reshape(2, -1) - np.array([[0.02], [-0.01]])))
+    np.testing.assert_allclose(distances, truth[2] if len(truth) > 2 else 0, atol=1e-12)

@@ -9,6 +9,9 @@ import typer
 
 from jeit.cli.options import QuietOption, make_folder, naming_options_in_errors
 
+# Radius of the area that is pressed, metres.
+_CONTACT_RADIUS = 0.008
+
 
 def demo(
     x: Annotated[float, typer.Option(help="Where to press, metres from the middle.")] = 0.02,
@@ -36,10 +39,10 @@ def demo(
     with Steps(console, quiet=quiet) as step:
         step("simulate a press")
         with naming_options_in_errors({"position": "--x and --y"}):
-            pressed, reference = simulate_press(skin, jax.random.key(seed), (x, y), noise=noise)
+            pressed, reference = simulate_press(skin, jax.random.key(seed), (x, y), radius=_CONTACT_RADIUS, noise=noise)
         result = image_difference(pressed, reference, progress=step)
         step("write")
-        write_image(result, output, truth=(x, y))
+        write_image(result, output, truth=(x, y, _CONTACT_RADIUS))
     if not result.inclusions:
         raise ValueError("the press was not found in the image; try less --noise.")
     if quiet:
