@@ -190,10 +190,10 @@ def _recognise_format(file: Path, description: str | Path | None, similar_measur
                     f"{missing_variables[0]}: add it, or put a description beside the file."
                 )
         listed_names = names_text(sorted(variable_names))
+        known_kinds = "; ".join(kind.DESCRIPTION.split(" (")[0] for kind in (Kit4, Ktc2023, eidors))
         raise ValueError(
             f"{file.name} is a .mat file of no known kind; it holds {listed_names}. `jeit describe {file.name}` finds "
-            f"out what it can, and writes a description. Known: {Kit4.DESCRIPTION}; {Ktc2023.DESCRIPTION}; "
-            f"{eidors.DESCRIPTION}."
+            f"out what it can, and writes a description. Known: {known_kinds}."
         )
     file_suffix = file.suffix.lower()
     if known_formats := [name for name, candidate_format in FORMATS.items() if file_suffix in candidate_format.endings]:
