@@ -158,11 +158,17 @@ def read_pair(
     """Read DATA and its reference. `frames`: range of the frames that are used as reference, from the reference file
     or, without such a file, from DATA. `keys`: names of the arrays of voltages in DATA and in the reference file."""
     key, reference_key = keys
+    is_same_data = reference is not None and reference.resolve() == data.resolve() and key == reference_key
     reference = data if reference is None and reference_key is not None else reference
     reference_measurement = (
         None if reference is None else read_file("--reference", reference, format, description, key=reference_key)
     )
     measurement = read_file("DATA", data, format, description, like=reference_measurement, key=key)
+    if is_same_data and frames is None and measurement.num_frames > 1:
+        raise ValueError(
+            "--reference: it is the file of DATA itself. Give a file of the undisturbed body, or the frames of DATA in "
+            "which it was undisturbed, such as --reference-frames 0-9."
+        )
     reference_source = measurement if reference_measurement is None else reference_measurement
     return measurement, reference_measurement if frames is None else reference_of_frames(reference_source, frames)
 
@@ -211,6 +217,12 @@ def check_at_least(options: dict[str, tuple[int | None, int]]) -> None:
     for name, (value, minimum) in options.items():
         if value is not None and value < minimum:
             raise ValueError(f"{name} must be at least {minimum}; it is {value}.")
+
+
+def check_seed(seed: int) -> None:
+    """Raise `ValueError` for a seed that random numbers do not take."""
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"--seed must be at least 0 and less than 2³²; it is {seed}.")
 
 
 def check_within(name: str, value: float, minimum: float, maximum: float, unit: str = "") -> None:

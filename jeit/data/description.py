@@ -212,7 +212,8 @@ def load_description(which: str | Path) -> Description:
     path = Path(which)
     if not path.is_file():
         raise ValueError(
-            f"description {path}: there is no such file. Give a TOML file, or one of {', '.join(BUNDLED_DESCRIPTIONS)}."
+            f"description {path}: there is no such file. Give a TOML file, or the name of a description that "
+            f"jeit has: {', '.join(BUNDLED_DESCRIPTIONS)}."
         )
     return parse_description(read_toml(path), path.name, path.parent)
 

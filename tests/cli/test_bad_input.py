@@ -355,6 +355,7 @@ COMMANDS = {
         "does not say its skin is read with --width-mm and --height-mm",
     ),
     "no file of a study": (lambda t: ["study", "status", "a.toml"], "study: there is no file"),
+    "seed too large": (lambda t: ["demo", "--seed", str(10**23)], "--seed must be at least 0 and less than 2³²"),
     "noise below zero": (lambda t: ["demo", "--noise", "-1"], "zero or positive"),
     "info on nothing": (lambda t: ["info", "absent.csv"], "jeit: DATA: there is no file"),
     "info on a folder": (lambda t: ["info", t.folder], "is a folder"),

@@ -21,6 +21,8 @@ def test_reference_is_the_mean_of_frames_of_the_data_or_of_the_given_file(tank, 
     assert measurement.num_frames == 3
     assert base is not None
     np.testing.assert_allclose(base.voltages, voltages[:2])
+    with pytest.raises(ValueError, match=r"--reference: it is the file of DATA itself.*--reference-frames 0-9"):
+        read_pair(recording, recording.parent / "." / recording.name, None, None, None)
     _, base = read_pair(tank.folder / "touched.csv", recording, "1", None, None)
     assert base is not None
     np.testing.assert_allclose(base.voltages, voltages[1:2])

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from jeit.cli.options import QuietOption, make_folder, naming_options_in_errors
+from jeit.cli.options import QuietOption, check_seed, make_folder, naming_options_in_errors
 
 # Radius of the area that is pressed, metres.
 _CONTACT_RADIUS = 0.008
@@ -17,7 +17,7 @@ def demo(
     x: Annotated[float, typer.Option(help="Where to press, metres from the middle.")] = 0.02,
     y: Annotated[float, typer.Option(help="Where to press, metres from the middle.")] = 0.012,
     noise: Annotated[float, typer.Option(help="Noise, relative to the voltages.")] = 1e-4,
-    seed: Annotated[int, typer.Option(help="Of the noise.", min=0, max=2**32 - 1)] = 0,
+    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the picture and the report.")] = Path(
         "jeit-demo"
     ),
@@ -33,6 +33,7 @@ def demo(
     from jeit.imaging import image_difference
     from jeit.report import write_image
 
+    check_seed(seed)
     make_folder(output)
     console = plain_console()
     skin = RoundSkin()

@@ -12,6 +12,7 @@ from jeit.cli.options import (
     QuietOption,
     check_at_least,
     check_positive,
+    check_seed,
     check_within,
     make_folder,
     naming_options_in_errors,
@@ -157,7 +158,7 @@ def optimise(
     sizes: Annotated[bool, typer.Option("--sizes", help="Change sizes too, between half and twice.")] = False,
     starts: Annotated[int, typer.Option(help="The layout, and random ones.")] = 1,
     steps: Annotated[int, typer.Option(help="At most.")] = defaults.STEPS,
-    seed: Annotated[int, typer.Option(help="Of the random starts.", min=0, max=2**32 - 1)] = 0,
+    seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
     thickness: ThicknessOption = 1e3 * defaults.THICKNESS,
     conductivity: ConductivityOption = defaults.CONDUCTIVITY,
     contact_impedance: Annotated[
@@ -182,7 +183,8 @@ def optimise(
     check_positive({"--noise": noise})
     if contact_impedance is not None:
         check_positive({"--contact-impedance": contact_impedance})
-    check_at_least({"--starts": (starts, 1), "--steps": (steps, 1), "--seed": (seed, 0)})
+    check_at_least({"--starts": (starts, 1), "--steps": (steps, 1)})
+    check_seed(seed)
     if not 0 <= minimum_spacing < float("inf"):
         raise ValueError(f"--minimum-spacing-mm must not be negative; it is {minimum_spacing:g}.")
     check_within("--num-points", num_points, _MIN_MESH_NODES, _MAX_MESH_NODES)
@@ -310,7 +312,7 @@ def compare(
     ] = defaults.CONTRAST,
     cell: Annotated[float, typer.Option("--cell-mm", help="Size of the mesh's cells, millimetres.")] = 1e3
     * defaults.CELL_SIZE,
-    seed: Annotated[int, typer.Option(help="Of the taxels' k-means.", min=0, max=2**32 - 1)] = 0,
+    seed: Annotated[int, typer.Option(help="Of the taxels' k-means.")] = 0,
     width: WidthOption = 1e3 * defaults.SIDE,
     height: HeightOption = 1e3 * defaults.SIDE,
     quiet: QuietOption = False,
@@ -326,7 +328,8 @@ def compare(
     _check_layer_options(thickness, conductivity)
     check_positive({"--cell-mm": cell})
     check_within("--places", places, 2, _MAX_POSITIONS_PER_SIDE)
-    check_at_least({"--pairs": (pairs, 0), "--taxels": (taxels, 1), "--seed": (seed, 0)})
+    check_at_least({"--pairs": (pairs, 0), "--taxels": (taxels, 1)})
+    check_seed(seed)
     if not 0 <= margin < float("inf"):
         raise ValueError(f"--margin-mm must not be negative; it is {margin:g}.")
     layouts = [_read_layout_with_outline(layout_name, width, height) for layout_name in (first, second)]

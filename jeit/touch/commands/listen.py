@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from jeit.cli.options import QuietOption, check_at_least, make_folder, naming_options_in_errors
+from jeit.cli.options import QuietOption, check_at_least, check_seed, make_folder, naming_options_in_errors
 
 if TYPE_CHECKING:
     from jeit.touch.listening import SoundLabels
@@ -173,7 +173,8 @@ def fit(
     require_extra("learn", "training a classifier of sounds")
     if loudness not in _LOUDNESS_CHOICES:
         raise ValueError(f"--loudness must be one of {', '.join(_LOUDNESS_CHOICES)}; it is '{loudness}'.")
-    check_at_least({"--batches": (batches, 1), "--seed": (seed, 0)})
+    check_at_least({"--batches": (batches, 1)})
+    check_seed(seed)
     if batches is not None and method in ("trees", "spectrum", "linear"):
         raise ValueError(f"--batches applies to networks only, not to --method {method}; leave one out.")
     if clips.resolve() in output.resolve().parents or clips.resolve() == output.resolve():
