@@ -37,7 +37,7 @@ _MAP_SHAPE = (200, 200)
 
 
 class Touch(Module):
-    """One touch in a track: its times, frames and length.
+    """One touch in a track: its times, its frames and the length of its path.
 
     **Fields**: `onset`, `offset`: times in seconds of the middles of the touch's first and last frame; `first`, `last`:
     indices of these frames, both part of the touch; `length`: length of the touch's path in metres.

@@ -158,7 +158,7 @@ def format_with_unit(value: float | None, unit: str) -> str:
     return f"{value:.3g} {unit}"
 
 
-def detectable_text(report: dict[str, Any]) -> str:
+def smallest_body_text(report: dict[str, Any]) -> str:
     """Text on the smallest insulating bodies that can be detected, from their entry in a report."""
     if "not_known_because" in report:
         return f"not known: {report['not_known_because']}"

@@ -35,7 +35,7 @@ MAX_NOISE_SHARE = MAX_RECIPROCITY_ERROR / np.sqrt(2)
 # Share of a common factor in the power of the difference above which it is drift of the bath or of a gain. In simulated
 # tanks it was 0.82 to 0.99 with 3 to 100 % drift, and at most 0.55 without drift, even if half of the tank resists.
 _MAX_COMMON_FACTOR_SHARE = 0.7
-# Maximum fraction of the noise that is left without the channels of an electrode that explains the noise.
+# An electrode is reported as the cause of the noise if at most this fraction of it remains without its channels.
 _MAX_REMAINING_NOISE_SHARE = 0.5
 # Minimum evidence that a difference contains more than noise, in standard deviations (`signal_evidence`). Bodies are
 # found reliably where noise exceeds the signal, because a body alters many channels in a pattern.

@@ -216,8 +216,8 @@ def comparison_figures(first_response: SkinResponse, second_response: SkinRespon
     - `taxel_overlap`: mean number of taxels that cover a position; `two_point_mm`: mean diameter of the taxels.
     """
     return [
-        _score_figures(*response_pair)
-        for response_pair in ((first_response, second_response), (second_response, first_response))
+        _score_figures(*responses_to_compare)
+        for responses_to_compare in ((first_response, second_response), (second_response, first_response))
     ]
 
 

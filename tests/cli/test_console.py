@@ -13,11 +13,11 @@ from jeit.cli import console as console_room
 from jeit.cli.commands.reconstruct import bodies_text
 from jeit.cli.console import (
     Steps,
-    detectable_text,
     format_in_one_unit,
     format_with_unit,
     inclusion_table,
     quantity_table,
+    smallest_body_text,
 )
 from jeit.image import Inclusion, SolidForm
 
@@ -147,13 +147,13 @@ def test_values_have_the_prefix_that_suits_them():
 def test_smallest_bodies_that_are_not_detected_have_no_size():
     def text(median, almost_everywhere):
         names = "diameter_in_half_of_the_domain", "diameter_almost_everywhere"
-        return detectable_text({**dict(zip(names, (median, almost_everywhere), strict=True)), "limited_by": "noise"})
+        return smallest_body_text({**dict(zip(names, (median, almost_everywhere), strict=True)), "limited_by": "noise"})
 
     found = "an insulating body 12 mm across is detected at half of all places, "
     assert text(0.0123, 0.02) == found + "one of 20 mm at 95 %; limited by noise"
     assert text(0.0123, None) == text(0.0123, float("inf")) == found + "none at most others; limited by noise"
     assert text(float("inf"), None).startswith("none: the noise exceeds")
-    assert detectable_text({"not_known_because": "no noise"}) == "not known: no noise"
+    assert smallest_body_text({"not_known_because": "no noise"}) == "not known: no noise"
 
 
 def test_the_time_left_is_estimated_where_parts_are_known(monkeypatch):

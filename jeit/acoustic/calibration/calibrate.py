@@ -354,5 +354,9 @@ def _calibration_fit(
 
 def _strength_range(tap_strengths: np.ndarray) -> tuple[float, float] | None:
     """Strengths of the weakest and the strongest tap; None if no strength is known."""
-    positive_strengths = tap_strengths[tap_strengths > 0]
-    return (float(positive_strengths.min()), float(positive_strengths.max())) if positive_strengths.size else None
+    positive_tap_strengths = tap_strengths[tap_strengths > 0]
+    return (
+        (float(positive_tap_strengths.min()), float(positive_tap_strengths.max()))
+        if positive_tap_strengths.size
+        else None
+    )

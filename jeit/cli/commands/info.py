@@ -25,7 +25,7 @@ def info(
 ) -> None:
     """Print what DATA contains: frames, electrodes, protocol, noise, assumptions, and masked voltages."""
     from jeit.arguments import counted, percent
-    from jeit.cli.console import detectable_text, format_with_unit, name_value_table, plain_console
+    from jeit.cli.console import format_with_unit, name_value_table, plain_console, smallest_body_text
     from jeit.data.frame_checks import MAX_IMPOSSIBLE_SIGN_SHARE
     from jeit.report import report_measurement
 
@@ -46,7 +46,7 @@ def info(
         ("electrodes", f"{report['electrodes']['number']}, {report['electrodes']['kind']}"),
         ("reciprocity error", percent(report["reciprocity_error"])),
         ("noise", noise_text or "not known"),
-        ("smallest body", detectable_text(smallest_body)),
+        ("smallest body", smallest_body_text(smallest_body)),
         ("impossible signs", percent(report["impossible_signs"])),
     ]
     if (report["impossible_signs"] or 0) > MAX_IMPOSSIBLE_SIGN_SHARE:

@@ -191,11 +191,11 @@ def print_imaging_result(console, result: "ImagedDifference", *, frame_given: bo
 
     from jeit.arguments import counted, percent
     from jeit.cli.console import (
-        detectable_text,
         format_with_unit,
         inclusion_table,
         name_value_table,
         quantity_table,
+        smallest_body_text,
     )
     from jeit.inverse.nonlinear.reconstruct import Reconstruction
     from jeit.report.folder import describe_detectable_in_image
@@ -224,7 +224,7 @@ def print_imaging_result(console, result: "ImagedDifference", *, frame_given: bo
         ("mesh", f"{counted(result.mesh.num_points, 'node')}, {counted(result.mesh.num_cells, 'cell')}"),
     ]
     if (detectable_report := describe_detectable_in_image(result)) is not None:
-        table_rows.insert(3, ("smallest body", detectable_text(detectable_report)))
+        table_rows.insert(3, ("smallest body", smallest_body_text(detectable_report)))
     if result.quality.rounding > _MIN_REPORTED_ROUNDING_ERROR:
         table_rows.insert(
             3, ("rounding", f"{percent(result.quality.rounding)} of the difference: voltages have few digits")

@@ -357,10 +357,10 @@ def _distances_across_sides(
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         distance_through_start = np.sqrt(x**2 + y**2) + start_distance
         distance_through_end = np.sqrt((side_length - x) ** 2 + y**2) + end_distance
-        source_x, source_depth, squared_depth = _virtual_source(start_distance, end_distance, side_length)
+        source_x, source_depth, squared_source_depth = _virtual_source(start_distance, end_distance, side_length)
         crossing_position = (source_x * y + x * source_depth) / np.where(source_depth + y > 0, source_depth + y, 1.0)
         is_crossing_side = (
-            (squared_depth >= 0)
+            (squared_source_depth >= 0)
             & (crossing_position >= 0)
             & (crossing_position <= side_length)
             & same_source
@@ -368,9 +368,9 @@ def _distances_across_sides(
         )
         straight_distance = np.sqrt((x - source_x) ** 2 + (y + source_depth) ** 2)
         # Sagitta of the wave front at the crossing, minus the sagitta of a wave front in the plane.
-        squared_length = (crossing_position - source_x) ** 2 + squared_depth
+        squared_length = (crossing_position - source_x) ** 2 + squared_source_depth
         front_curvature = np.where(
-            squared_length > 0, squared_depth / np.where(squared_length > 0, squared_length, 1.0), 0.0
+            squared_length > 0, squared_source_depth / np.where(squared_length > 0, squared_length, 1.0), 0.0
         )
         straight_distance += (
             0.5
@@ -389,8 +389,8 @@ def _virtual_source(start_distance, end_distance, side_length):
     coordinate along the side, its distance from the line of the side, and the square of this distance, which is
     negative if no point in the plane has both distances."""
     source_x = (start_distance**2 - end_distance**2 + side_length**2) / (2 * side_length)
-    squared_depth = start_distance**2 - source_x**2
-    return source_x, np.sqrt(np.maximum(squared_depth, 0.0)), squared_depth
+    squared_source_depth = start_distance**2 - source_x**2
+    return source_x, np.sqrt(np.maximum(squared_source_depth, 0.0)), squared_source_depth
 
 
 def _front_flattening(curvature, path_length):

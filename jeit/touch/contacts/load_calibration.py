@@ -179,11 +179,11 @@ class LoadCalibration(Module):
         # Derivatives of log F with respect to log peak: 1 / (1 − saturation); with respect to log s, b and c: −1 / (1 −
         # saturation), times the derivative of log peak; with respect to log F½: 1.
         load_sensitivity = 1 / (1 - saturation)
-        log_load_derivatives = np.array(
+        derivatives_of_log_load = np.array(
             [-load_sensitivity, -load_sensitivity * relative_distance**2, -load_sensitivity * relative_distance**4, 1.0]
         )
         log_load_variance = (
-            log_load_derivatives @ self.covariance @ log_load_derivatives + (load_sensitivity * self.scatter) ** 2
+            derivatives_of_log_load @ self.covariance @ derivatives_of_log_load + (load_sensitivity * self.scatter) ** 2
         )
         return LoadEstimate(force, force * float(np.sqrt(log_load_variance)))
 

@@ -56,14 +56,14 @@ class Manner:
     @property
     def medians(self) -> Float[np.ndarray, " 5"]:
         """Medians (5,) of the parameters `TRAITS` among people, in SI units; speed and path may be 0."""
-        return np.array([*(word_parameters[0] for word_parameters in self._word_parameters), self.speed, self.path])
+        return np.array([*(median_and_spread[0] for median_and_spread in self._word_parameters), self.speed, self.path])
 
     @property
     def spread(self) -> Float[np.ndarray, " 5"]:
         """Standard deviations (5,) of the logarithms of the parameters `TRAITS` among people."""
         return np.array(
             [
-                *(word_parameters[1] for word_parameters in self._word_parameters),
+                *(median_and_spread[1] for median_and_spread in self._word_parameters),
                 _PATH_LOG_DEVIATION,
                 _PATH_LOG_DEVIATION,
             ]
