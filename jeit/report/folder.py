@@ -111,7 +111,7 @@ def describe_detectable_in_image(imaged: "ImagedDifference") -> dict[str, Any] |
         return None
     is_noise_known = imaged.quality.difference_noise is not None or imaged.quality.noise_share is not None
     noise_text = "noise" if is_noise_known else "noise, which is assumed,"
-    return describe_detectable(diameters, f"{noise_text} and model error of this frame")
+    return describe_detectable(diameters, f"{noise_text} and model error")
 
 
 def package_version(package: str) -> str | None:

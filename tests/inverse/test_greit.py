@@ -213,7 +213,7 @@ def test_default_radius_suits_other_numbers_of_electrodes():
         ({"hyperparameter": "gcv"}, "takes a number or 'noise-figure'"),
         ({"noise_figure": np.nan}, "noise_figure must be positive"),
         ({"noise": 0.0}, "noise must be positive"),
-        ({"noise": np.ones(7)}, "noise has shape"),
+        ({"noise": np.ones(7)}, "noise: give one real number"),
         ({"mask": np.ones(7, bool)}, "mask must be"),
         ({"mask": np.zeros(208, bool)}, "mask must be"),
         ({"conductivity": 1 + 1j}, "complex"),

@@ -200,22 +200,23 @@ def test_changes_of_electrodes_are_errors_of_the_channels_and_are_estimated():
     assert changes is not None
     assert MovedElectrodes.create(problem, 0.0) is None
     assert changes.jacobian.shape == (len(data.weight), 16)
-    position, angle = np.array(points), np.arctan2(*points[2][::-1]) + 2e-3
+    position, angle = np.array(points), np.arctan2(*points[2][::-1]) + 2e-4
     position[2] = 0.1 * np.cos(angle), 0.1 * np.sin(angle)
-    for number, share, changed in (
-        (2, 0.15, eqx.tree_at(lambda one: one.position, electrodes, position)),
-        (8 + 5, 0.02, electrodes.with_contact_impedance(0.01 * np.exp(0.03 * (np.arange(8) == 5)))),
+    for number, step, share, changed in (
+        (2, 0.01, 0.1, eqx.tree_at(lambda one: one.position, electrodes, position)),
+        (8 + 5, 0.1, 0.02, electrodes.with_contact_impedance(0.01 * np.exp(0.03 * (np.arange(8) == 5)))),
     ):
         moved = np.asarray(model.with_electrodes(changed).voltages(SIGMA))
-        # A tenth of a standard deviation: 0.2 mm counter-clockwise, or 3 % of an impedance.
-        expected = 0.1 * np.asarray(changes.jacobian)[:, number]
+        # Small parts of a standard deviation: 0.02 mm counter-clockwise, or 3 % of an impedance.
+        expected = step * np.asarray(changes.jacobian)[:, number]
         measured = independent_data(model, moved, np.full(len(rest), True), 1e-4 * np.abs(rest), at_once=True)[1]
         difference = np.asarray(data.weight) * (np.asarray(measured.voltages) - np.asarray(data.voltages))
         assert np.linalg.norm(difference - expected) < share * np.linalg.norm(difference)
         fit: Any = SimpleNamespace(rows=(-difference, None))
         estimate = changes.voltages(1.0, fit, model.protocol)
         assert np.linalg.norm(estimate - (moved - rest)) < share * np.linalg.norm(moved - rest)
-        assert changes.most_likely_level(fit) > 0
+        tenth: Any = SimpleNamespace(rows=(-0.1 / step * difference, None))  # of a standard deviation
+        assert changes.most_likely_level(tenth) > 0
     assert changes.most_likely_level(SimpleNamespace(rows=(np.zeros(len(data.weight)), None))) == 0  # pyright: ignore
 
 
