@@ -260,11 +260,11 @@ def calibrate(
         raise ValueError(f"voltages are {measured_voltages.dtype}; give numbers, in volts.")
     measured_voltages = measured_voltages.astype(number_type)
     frame_shape = (model.protocol.num_measurements,)
-    is_used = np.ones(frame_shape, bool) if mask is None else np.asarray(mask, bool)
-    if measured_voltages.shape != frame_shape or is_used.shape != frame_shape:
+    is_used = np.ones(frame_shape, bool) if mask is None else np.asarray(mask)
+    if measured_voltages.shape != frame_shape or is_used.shape != frame_shape or is_used.dtype != bool:
         raise ValueError(
-            f"voltages has shape {measured_voltages.shape} and mask {is_used.shape}; protocol '{model.protocol.name}' "
-            f"has {frame_shape}."
+            f"voltages has shape {measured_voltages.shape} and mask {is_used.shape} of {is_used.dtype}; protocol "
+            f"'{model.protocol.name}' has {frame_shape}, and the mask must be booleans."
         )
     check_name("contact", contact, ("common", "each", "fixed"))
     max_steps = check_steps("max_steps", max_steps)

@@ -221,14 +221,8 @@ def combined_jacobian(
 def used_channels(model: ForwardModel, noise, mask) -> tuple[np.ndarray, Float[Array, " K"]]:
     """Indices (K,) of the channels in use, and the reciprocals (K,) of the standard deviations of their noise, 1 /
     volts. Raises `ValueError` for an invalid mask or noise."""
-    check_mask(mask)
     num_channels = model.protocol.num_measurements
-    is_used_channel = np.ones(num_channels, bool) if mask is None else np.asarray(mask)
-    if is_used_channel.shape != (num_channels,) or is_used_channel.dtype != bool or not is_used_channel.any():
-        raise ValueError(
-            f"mask must be ({num_channels},) booleans with at least one True: one for each channel; got "
-            f"{describe(mask)}."
-        )
+    is_used_channel = channel_mask(mask, num_channels)
     noise_deviation = np.asarray(noise) if has_values(noise) else jnp.asarray(noise)
     if noise_deviation.shape not in ((), (num_channels,)) or noise_deviation.dtype.kind not in "iuf":
         raise ValueError(
@@ -237,6 +231,19 @@ def used_channels(model: ForwardModel, noise, mask) -> tuple[np.ndarray, Float[A
     noise_deviation = namespace(noise_deviation).broadcast_to(noise_deviation, (num_channels,)).astype(float)
     check_positive_noise(noise_deviation, is_used_channel)
     return np.flatnonzero(is_used_channel), 1 / noise_deviation[is_used_channel]
+
+
+def channel_mask(mask, num_channels: int) -> Bool[np.ndarray, " M"]:
+    """True (M,) for the channels in use; all if `mask` is None. Raises `ValueError` unless the mask has a boolean
+    for each channel and at least one True."""
+    check_mask(mask)
+    is_used_channel = np.ones(num_channels, bool) if mask is None else np.asarray(mask)
+    if is_used_channel.shape != (num_channels,) or is_used_channel.dtype != bool or not is_used_channel.any():
+        raise ValueError(
+            f"mask must be ({num_channels},) booleans with at least one True: one for each channel; got "
+            f"{describe(mask)}."
+        )
+    return is_used_channel
 
 
 def check_positive_noise(noise_deviation: Float[Array, " M"], is_used_channel: Bool[np.ndarray, " M"]) -> None:

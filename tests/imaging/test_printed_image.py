@@ -69,7 +69,10 @@ def test_faults_have_rows_of_their_own(imaged, printed):
     assert "at 3 (2.5 times): what reads them counts less" in text
     text, rows = printed(quality=replace(imaged.quality, rounding=0.012, difference_noise=None, noise_share=None))
     assert rows == [*USUAL[:3], "rounding", *USUAL[3:]]
-    assert re.search(r"noise in it not measured; [0-9.]+ % is assumed, model error included", text)
+    (stated,) = re.findall(r"noise in it not measured; ([0-9.]+) % is assumed, model error included", text)
+    difference = np.asarray(imaged.measurement.voltages - imaged.reference.voltages)
+    assumed = np.linalg.norm(imaged.noise) / np.linalg.norm(difference)
+    assert float(stated) == pytest.approx(100 * assumed, rel=0.06)  # two digits
     assert "1.2 % of the difference: voltages have few digits" in text
 
 

@@ -49,6 +49,8 @@ def test_channels_without_use_do_not_count_and_noise_scales(disk):
     masked = detectable_strength(model, BACKGROUND, NOISE, mask)
     noisy = detectable_strength(model, BACKGROUND, np.where(mask, NOISE, 1e6))
     np.testing.assert_allclose(masked, noisy, rtol=1e-9)
+    without_noise = detectable_strength(model, BACKGROUND, np.where(mask, NOISE, np.nan), mask)
+    np.testing.assert_allclose(without_noise, masked)
     assert (masked > detectable_strength(model, BACKGROUND, NOISE)).all()
     assert strength_at(model, place, noise=3 * NOISE) == pytest.approx(3 * strength_at(model, place))
 

@@ -8,7 +8,17 @@ import pytest
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import find_inclusions
-from jeit.inverse import RULES, Gaussian, Laplace, LinearReconstruction, Noser, Tikhonov, back_projection, one_step
+from jeit.inverse import (
+    RULES,
+    Gaussian,
+    Laplace,
+    LinearReconstruction,
+    Noser,
+    Tikhonov,
+    back_projection,
+    calibrate,
+    one_step,
+)
 from jeit.layout import ring
 from jeit.mesh import centroids, disk
 from jeit.protocol import adjacent
@@ -123,6 +133,17 @@ def test_back_projection_images_the_inclusion(model, difference, filtered):
     strongest = find_inclusions(model.mesh, image)[0]
     assert strongest.sign == 1
     assert np.linalg.norm(np.array(strongest.centroid) - [0.05, 0.02]) < 0.03
+
+
+def _calibrate(model, mask):
+    return calibrate(model, np.ones(model.protocol.num_measurements), mask=mask)
+
+
+@pytest.mark.parametrize("image", [lambda model, mask: back_projection(model, 1.0, mask=mask), _calibrate])
+def test_a_mask_of_numbers_is_refused(image, model):
+    """NaN would be taken for True."""
+    with pytest.raises(ValueError, match=r"mask .*booleans"):
+        image(model, np.full(model.protocol.num_measurements, np.nan))
 
 
 def test_back_projection_of_a_uniform_change(model):

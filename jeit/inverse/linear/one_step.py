@@ -17,7 +17,7 @@ from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
 from jeit.inverse.hyperparameter.choice import DEFAULT_RULE, Choice
 from jeit.inverse.hyperparameter.rules import Rule, choose
-from jeit.inverse.linearisation import Linearisation
+from jeit.inverse.linearisation import Linearisation, channel_mask
 from jeit.inverse.prior.priors import AbstractPrior
 from jeit.inverse.spectrum import Spectrum
 from jeit.mesh import Mesh
@@ -381,9 +381,7 @@ def back_projection(
     )
     check_has_values("model or conductivity", (model, conductivity), "its bands are drawn from", advice_to_user)
     protocol = model.protocol
-    is_used_channel = np.ones(protocol.num_measurements, bool) if mask is None else np.asarray(mask, bool)
-    if is_used_channel.shape != (protocol.num_measurements,) or not is_used_channel.any():
-        raise ValueError(f"mask must be ({protocol.num_measurements},) booleans with at least one True.")
+    is_used_channel = channel_mask(mask, protocol.num_measurements)
     measurement_patterns = np.asarray(protocol.measurement)
     if (np.count_nonzero(measurement_patterns, axis=1) != 2).any():
         raise ValueError(

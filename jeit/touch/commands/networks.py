@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from jeit.cli.options import NETWORK_METHOD, QuietOption, make_folder, naming_options_in_errors
+from jeit.cli.options import NETWORK_METHOD, QuietOption, check_seed, make_folder, naming_options_in_errors
 
 if TYPE_CHECKING:
     import numpy as np
@@ -236,9 +236,7 @@ def image(
         int | None,
         typer.Option(help="Number of simulated touches in the training set (default: that of the preset).", min=1),
     ] = None,
-    seed: Annotated[
-        int, typer.Option(help="Seed of the random touches and of the initial weights.", min=0, max=2**32 - 1)
-    ] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the random touches and of the initial weights.")] = 0,
     scheduler: Annotated[
         str | None,
         typer.Option(help="Address of a dask scheduler whose workers simulate the touches (default: this process)."),
@@ -259,6 +257,7 @@ def image(
     from jeit.touch.networks import learn_images
     from jeit.touch.reports.image_network import LEARNT_FILES, write_learnt_images
 
+    check_seed(seed)
     require_extra("learn", "a network that images touches")
     require_extra("cluster", "a store of simulated touches")
     make_folder(output, LEARNT_FILES)
